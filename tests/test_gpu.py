@@ -8,6 +8,7 @@ from cortado import Problem, Simulation, gradients, losses
 from cortado.device.launching import sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.particles.cells import CellSort, Grid
+from cortado.scene.motions import told
 from scenes import HONEY, plane, plane_of_three, scene, splash, thrown, two_layers
 from test_neighbours import CLOUDS, check_same, lists
 
@@ -18,9 +19,11 @@ EXACT = gradients.Exact()
 TOLERANT = {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 1e-3}
 
 
-def moves(made):
-    """Whether solids of a scene move, where there is no derivative with respect to the time step."""
-    return any(solid.moves for solid in made.solid)
+def over_time(point, steps):
+    """Parameters, of which those of the paths of solids grow in each step."""
+    grows = 0.0003 * np.arange(1, steps + 1)
+    ends = (".displacement", ".turn")
+    return {k: np.multiply.outer(grows, 1.0 + v) if k.endswith(ends) else v for k, v in point.items()}
 
 
 def evaluate(made, device, precision="float64", steps=60, estimator=EXACT):
@@ -30,8 +33,7 @@ def evaluate(made, device, precision="float64", steps=60, estimator=EXACT):
     problem = Problem(simulation, steps, losses.FinalPositions(simulation.positions))
     point = {**simulation.parameters(), **thrown(simulation), "gravity": GRAVITY[: simulation.dimension]}
     point.pop("colours")
-    if moves(made):
-        point.pop("time_step")
+    point = over_time(point, steps)
     for _ in range(3):  # the second time captures graphs, the third replays them
         loss, gradient = problem.value_and_gradient(point, estimator)
     tangent = problem.tangent(point, {"gravity": np.ones(simulation.dimension)})
@@ -74,7 +76,7 @@ SCENES = {
             {
                 "name": "ball",
                 "shape": "sphere",
-                "centre": [0.2, 0.55],
+                "centre": [0.2, 0.45],
                 "radius": 0.08,
                 "motion": "path",
                 "velocity": [0.3, -1.0],
@@ -100,6 +102,45 @@ SCENES = {
         ],
         solver={"kind": "projection", "time_step": 0.0021},
     ),
+    "free bodies in the plane": plane(
+        solid=[
+            {
+                "name": "raft",
+                "shape": "box",
+                "lower": [0.1, 0.42],
+                "upper": [0.3, 0.56],
+                "rotation": 0.1,
+                "motion": "free",
+                "density": 500.0,
+            },
+            {
+                "name": "ball",
+                "shape": "sphere",
+                "centre": [0.36, 0.5],
+                "radius": 0.06,
+                "motion": "free",
+                "density": 300.0,
+                "velocity": [-0.3, 0.0],
+            },
+        ],
+        solver={"kind": "projection", "time_step": 0.002},
+    ),
+    "a free body in space": scene(
+        solid=[
+            {
+                "name": "brick",
+                "shape": "box",
+                "lower": [0.05, 0.1, 0.05],
+                "upper": [0.15, 0.25, 0.2],
+                "rotation": [0.1, 0.2, 0.0],
+                "motion": "free",
+                "density": 500.0,
+                "velocity": [0.2, 0.1, 0.0],
+                "angular_velocity": [0.0, 3.0, 1.0],
+            }
+        ],
+        solver={"kind": "projection", "time_step": 0.0021},
+    ),
     "surface tension": plane(
         phase=[HONEY],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
@@ -109,7 +150,7 @@ SCENES = {
 BATCHED = {
     "tolerance": splash(**TOLERANT),
     **{name: SCENES[name] for name in ("two fluids", "plane", "shifting", "projection", "projection in the plane")},
-    **{name: SCENES[name] for name in ("solids in the plane", "solids in space")},
+    **{name: SCENES[name] for name in ("solids in the plane", "solids in space", "free bodies in the plane")},
 }
 
 
@@ -193,7 +234,7 @@ def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(made, precision):
     gravity = np.random.default_rng(1).normal(-3.0, 6.0, (7, 1, single.dimension))
     loss = losses.FinalPositions(single.positions)
     problem, alone = Problem(many, 40, loss), Problem(single, 40, loss)
-    also = {} if moves(made) else {"time_step": 0.002}
+    also = {} if told(made.solid) else {"time_step": 0.002}
     for _ in range(3):
         found, gradient = problem.value_and_gradient({"gravity": gravity, **also})
     for b in range(7):
