@@ -272,9 +272,11 @@ def case(scene, loss: str, precision: str = "float64"):
     if phases > 1:
         fractions = 0.2 + random.random((shape[0], phases))
         point["mass_fractions"] = fractions / fractions.sum(axis=1, keepdims=True)
-    for solid in scene.solid:  # else they stay in the frames of space
+    for solid in scene.solid:  # else they stay in the frames of space; what is free begins as it touches others
         angles = () if shape[1] == 2 else (3,)
-        point[f"{solid.name}.rotation"] = 0.3 + 0.1 * random.standard_normal(angles)
+        free = solid.motion == "free"
+        begun = np.reshape(solid.rotation, angles) if free and solid.rotation else 0.0 if free else 0.3
+        point[f"{solid.name}.rotation"] = begun + (0.001 if free else 0.1) * random.standard_normal(angles)
     if scene.emitter is not None:
         point["nozzle_path"] = scene.emitter.outlet + 0.1 * spacing * random.standard_normal((STEPS, shape[1]))
     target = simulation.positions + 0.1 * random.standard_normal(shape)

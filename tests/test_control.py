@@ -20,6 +20,8 @@ from finite_differences import decades, distance
 
 SHORT = {
     "carry": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
+    "carry_cup": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
+    "pour_jug": {"turning": 12, "blocks": 4, "turn": 0.02},
     "splash": {"blocks": 4, "repeats": 3},
     "splash_projection": {"blocks": 4, "repeats": 3},
     "latte": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
@@ -63,7 +65,7 @@ def test_controls_are_bounded(name, size):
     assert np.abs(chosen.known).max() <= 1.0 and np.abs(chosen.baseline).max() <= 0.5
     assert chosen.known.shape == (chosen.controls.numbers,)
     (parameter,) = chosen.controls.parameters(chosen.known).values()
-    assert parameter.shape == (chosen.steps, chosen.scene.dimension)
+    assert parameter.shape == ((chosen.steps,) if name == "pour_jug" else (chosen.steps, chosen.scene.dimension))
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -80,6 +82,14 @@ def test_a_tank_always_arrives_and_stands(blocks):
     velocities = chosen.time_step * np.cumsum(accelerations)
     assert abs(velocities[-1]) < 1e-12 and not accelerations[chosen.moving :].any()
     assert chosen.time_step * velocities.sum() == pytest.approx(chosen.distance)
+
+
+def test_a_cup_always_arrives_and_stands():
+    chosen = task("carry_cup", "small")
+    u = np.random.default_rng(0).uniform(-1.0, 1.0, chosen.controls.numbers)
+    path = chosen.controls.parameters(u)["cup.displacement"]
+    np.testing.assert_allclose(path[chosen.moving - 1 :], [[chosen.distance, 0.0]] * (chosen.standing + 1), atol=1e-12)
+    assert np.abs(path[0]).max() < 1e-3 and np.ptp(path[:, 0]) > 0.1
 
 
 def test_a_nozzle_stays_in_its_reach():

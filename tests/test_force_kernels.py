@@ -298,6 +298,10 @@ ELSEWHERE = {
     "velocity_kernels": "the same",
     "shift_kernels": "the same",
     "moving_kernels": "the same",
+    "free_kernels": "of bodies that are free: whole steps in tests/test_free_bodies.py",
+    "motion_kernels": "the same",
+    "contact_kernels": "the same",
+    "strength_kernels": "the same",
     "place_kernels": "of PCISPH with shifting: whole steps in tests/test_shifting.py",
     "repair_kernels": "the same",
     "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
@@ -325,4 +329,4 @@ def of_an_adjoint(function):
 
 
 OF_FORCES = {"body_kernels", "pair_kernels"}
-"""Made by `OfOneFunction.force`."""
+"""Made by `OfOneFunction.force`; those of this name in the projection are checked in tests/test_free_bodies.py."""

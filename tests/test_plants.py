@@ -32,6 +32,8 @@ UNNAMED = {
         *("projection_sums.divergence_back", "projection_sums.push_back", "projection_sums.crowding_back"),
     },
     "solvers.projection.beside": {"beside_sums.beside_back", "_work.beside_work"},
+    "solvers.projection.body_kernels": {"body_kernels.push_back"},
+    "solvers.projection.body_motion": {"motion_kernels.slower"},
     "solvers.pcisph.pressure_force": {"_work.pressure_work"},
     "particles.solid_shares": {"solid_kernel.share"},
     "sph.rotations": {"rotations.back", "rotations.back_about_z"},
@@ -54,9 +56,11 @@ SHARED = {
     "losses.matching": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
+    "solvers.contact_strength": {"strength_kernels.part"},
     "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
     "sph.curvature_functions": {"curvature_functions.rise", "curvature_functions.curvature_back"},
+    "sph.free_functions": {"free_functions.twist", "free_functions.write_twist"},
     "sph.rotations": {"rotations.further_about_z"},
     "sph.surface_normals": {"normal_kernels.change"},
     "sph.surface_stress": {"tension_functions.pull_derivative"},
@@ -111,6 +115,42 @@ PLATE = {
     "surface_velocity": [0.3, -0.2, 0.5],
     "slip": "no",
 }
+RAFT = {
+    "name": "raft",
+    "shape": "box",
+    "lower": [0.2, -0.002],
+    "upper": [0.45, 0.18],
+    "rotation": 0.01,
+    "motion": "free",
+    "density": 500.0,
+    "velocity": [0.1, -0.3],
+    "angular_velocity": 0.5,
+}
+BUOY = {
+    "name": "buoy",
+    "shape": "sphere",
+    "centre": [0.52, 0.14],
+    "radius": 0.08,
+    "motion": "free",
+    "density": 300.0,
+    "velocity": [-0.3, 0.1],
+    "angular_velocity": -1.0,
+}
+ARM = {
+    "name": "arm",
+    "shape": "box",
+    "lower": [0.3, 0.175],
+    "upper": [0.36, 0.3],
+    "motion": "path",
+    "velocity": [0.0, -0.2],
+}
+"""They touch: the raft the floor, the buoy the raft, and the arm, which has a path, the raft."""
+IN_SPACE = {
+    "raft": {"lower": [0.1, -0.002, 0.05], "upper": [0.25, 0.12, 0.2], "velocity": [0.1, -0.3, 0.1]},
+    "buoy": {"centre": [0.18, 0.2, 0.12], "radius": 0.085, "velocity": [0.1, -0.4, 0.1]},
+}
+TURNS = {"raft": {"rotation": [0.01, 0.02, 0.01], "angular_velocity": [1.0, 2.0, -3.0]}}
+TURNS["buoy"] = {"rotation": [0.2, 0.1, -0.3], "angular_velocity": [2.0, -1.0, 1.0]}
 THICK = {
     "name": "paste",
     "rest_density": 1000.0,
@@ -181,6 +221,28 @@ SCENES = {
             forces={"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"},
             solver=SOLVER,
             solid=[PLATE],
+        ),
+        "positions",
+    ),
+    "free bodies that touch": (
+        plane(
+            phase=[HONEY],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "honey"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+            forces={"gravity": [1.0, -9.81]},
+            solver={"kind": "projection", "time_step": 0.001},
+            solid=[RAFT, BUOY, ARM],
+        ),
+        "positions",
+    ),
+    "free bodies that touch in space": (
+        scene(
+            phase=[HONEY],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.35, 0.3, 0.25], "phase": "honey"}],
+            container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.5, 0.6, 0.25]},
+            forces={"gravity": [1.0, -9.81, 0.5]},
+            solver={"kind": "projection", "time_step": 0.001},
+            solid=[{**one, **IN_SPACE[one["name"]], **TURNS[one["name"]]} for one in (RAFT, BUOY)],
         ),
         "positions",
     ),

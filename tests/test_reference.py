@@ -344,6 +344,12 @@ def test_an_observer_may_stop_a_run():
 # ---- mistakes ------------------------------------------------------------------------------------------------------
 
 
+def stirred(motion, **changes):
+    """The splash with a block below it that moves."""
+    block = {"name": "block", "shape": "box", "lower": [0.25, 0.0, 0.05], "upper": [0.4, 0.1, 0.2], "motion": motion}
+    return scene(solid=[{**block, **changes}], solver={"kind": "projection", "time_step": 0.001})
+
+
 @pytest.mark.parametrize(
     "call, sentence",
     [
@@ -364,6 +370,18 @@ def test_an_observer_may_stop_a_run():
         (lambda s: reference.Simulation(splash(), threads=0), "threads is 0"),
         (lambda s: reference.Simulation(3), "must be a cortado.Scene or the path of a scene file"),
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
+        (
+            lambda s: reference.Simulation(stirred("path", velocity=[0.1, 0.0, 0.0])),
+            r"solid\[0\], which moves, but must",
+        ),
+        (
+            lambda s: reference.Simulation(stirred("fixed", surface_velocity=[0.1, 0.0, 0.0])),
+            r"solid\[0\], which moves",
+        ),
+        (
+            lambda s: reference.Simulation(stirred("free", density=500.0)),
+            r"solid\[0\], which moves, but must have",
+        ),
         (lambda s: reference.Simulation(splash(shifting=True)), "solver.shifting is true, but must be left out"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),

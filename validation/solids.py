@@ -13,6 +13,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
+from floating_bodies import added_mass, floating_box
 from held_water import MESHES, cup_turned, meshes, stirred
 from piston_waves import piston
 
@@ -80,6 +81,9 @@ CASES = {
     **{f"meshes, 500 steps, {name}": lambda name=name: meshes(500, name) for name in MESHES},
     "piston, kd = 1.5, 20 deep": lambda: piston(20, 1.5, 0.03),
     "piston, kd = 1.5, 30 deep": lambda: piston(30, 1.5, 0.03),
+    "floating-box, 16 particles long": lambda: floating_box(16),
+    "floating-box, 32 particles long": lambda: floating_box(32),
+    "added-mass, a sphere 8 particles across, 20 deep": lambda: added_mass(8, 20, 200),
 }
 
 

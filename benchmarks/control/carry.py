@@ -6,7 +6,7 @@ controls are accelerations in blocks of time, projected so that the tank always 
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -31,6 +31,8 @@ class Carry(Task):
     """Water of so many particles, moved over a distance by the first steps; for the others the tank stands."""
 
     name = "carry"
+    spill: ClassVar[float] = 1.0
+    """Weight of the water above the rim."""
     cells: tuple[int, int]
     spacing: float
     time_step: float
@@ -92,13 +94,24 @@ class Carry(Task):
         return self.distance / (self._arrival[1] @ signs) * signs
 
     @cached_property
-    def controls(self) -> Controls:
+    def accelerations(self) -> Affine:
+        """(steps,) along x [m/s2], of which each brings the tank to rest where it shall be."""
         free = np.eye(self.blocks) - np.linalg.pinv(self._arrival) @ self._arrival
+        greatest = GREATEST * np.abs(self._full_throttle).max()
+        return Affine(self._along @ self._full_throttle, greatest * self._along @ free)
+
+    @property
+    def _along(self) -> np.ndarray:
+        """(steps, blocks) which block a step is in, none while the tank stands."""
         along = np.zeros((self.steps, self.blocks))
         along[: self.moving] = blocks_of(self.moving, self.blocks)
+        return along
+
+    @property
+    def controls(self) -> Controls:
         base, matrix = np.zeros((self.steps, 2)), np.zeros((self.steps, 2, self.blocks))
-        base[:, 0], base[:, 1] = -along @ self._full_throttle, -GRAVITY
-        matrix[:, 0] = -GREATEST * np.abs(self._full_throttle).max() * along @ free
+        base[:, 0], base[:, 1] = -self.accelerations.base, -GRAVITY
+        matrix[:, 0] = -self.accelerations.matrix
         return Controls("gravity", Affine(base, matrix))
 
     @cached_property
@@ -110,16 +123,14 @@ class Carry(Task):
         constraints = np.concatenate([self._arrival, self.time_step * waves])
         wanted = np.concatenate([[0.0, self.distance], np.zeros(len(waves))])
         accelerations = np.linalg.lstsq(constraints, wanted, rcond=None)[0]
-        gravity = self.controls.mapping.base.copy()
-        gravity[: self.moving, 0] = -blocks_of(self.moving, self.blocks) @ accelerations
-        return self.controls.mapping.coordinate(gravity)
+        return self.accelerations.coordinate(self._along @ accelerations)
 
     @property
     def frames(self) -> dict[int, "Slosh"]:
         """What is measured, by the number of steps before it."""
         moving = np.linspace(0, self.moving, FRAMES, endpoint=False).astype(int)[1:]
         standing = np.linspace(self.moving, self.steps, FRAMES + 1).astype(int)[1:]
-        spill, energy = 1.0 / (len(moving) + len(standing)), 1.0 / len(standing)
+        spill, energy = self.spill / (len(moving) + len(standing)), 1.0 / len(standing)
         on_the_way = {int(step): Slosh(self.depth, self.rim, 0.0, spill) for step in moving}
         return on_the_way | {int(step): Slosh(self.depth, self.rim, energy, spill) for step in standing}
 

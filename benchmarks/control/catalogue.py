@@ -3,12 +3,16 @@
 from cortado import InputError
 
 from .carry import Carry
+from .carry_cup import CarryCup
 from .latte import Latte, LatteDense
 from .mix import Mix
+from .pour_jug import PourJug
 from .splash import Splash, SplashProjection
 from .task import Task
 
-TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Splash, SplashProjection, Latte, LatteDense, Mix)}
+TASKS: dict[str, type[Task]] = {
+    one.name: one for one in (Carry, CarryCup, Splash, SplashProjection, Latte, LatteDense, Mix, PourJug)
+}
 SIZES = ("small", "large")
 
 

@@ -32,6 +32,11 @@ def check_scene(scene: Scene) -> None:
         raise InputError("scene has phase[0].rheology, but must leave it out for the reference engine.")
     if scene.force:
         raise InputError("scene has [[force]], but must leave it out for the reference engine.")
+    moving = [k for k, solid in enumerate(scene.solid) if solid.moves]
+    if moving:
+        raise InputError(
+            f"scene has solid[{moving[0]}], which moves, but must have solids at rest alone for the reference engine."
+        )
     walls = [*scene.solid, *([scene.container] if scene.container.extent() is not None else [])]
     if len({wall.sticks for wall in walls}) > 1:
         raise InputError("scene has walls with and without slip, but must have one kind for the reference engine.")

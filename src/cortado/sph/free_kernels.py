@@ -46,6 +46,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
     twist, write_twist = of_body.twist, of_body.write_twist
     module = free_module(precision)
     moving, bars = bundle(V=vector, W=vector, L=vector), bundle(V_bar=vector, W_bar=vector, L_bar=vector)
+    moving_dots = bundle(V_dot=vector, W_dot=vector, L_dot=vector)
     axes = dict.fromkeys(("turn_x_new", "turn_y_new", "turn_z_new"), vector)
     after = bundle(**axes, position_new=vector, rotation_new=angle, velocity_new=vector, angular_velocity_new=angle)
 
@@ -90,9 +91,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         turned_before_dot: wp.array2d(dtype=vector),
         after_dot: wp.array2d(dtype=vector),
         turned_dot: wp.array2d(dtype=vector),
-        V_dot: wp.array(dtype=vector),
-        W_dot: wp.array(dtype=vector),
-        L_dot: wp.array(dtype=vector),
+        moved_dot: moving_dots,
     ):
         b = wp.tid()
         Q, dt, dt_dot = attitude(b, of), time_step[b], time_step_dot[b]
@@ -102,11 +101,11 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         turned_before_dot[b, number] = turned
         after_dot[b, number] = dot.position[b] + dt * dot.velocity[b] + dt_dot * of.velocity[b]
         turned_dot[b, number] = further(dt * w, dt * w_dot + dt_dot * w) + rotation(dt * w) * turned
-        V_dot[b] = dot.velocity[b]
-        W_dot[b] = w_dot
+        moved_dot.V_dot[b] = dot.velocity[b]
+        moved_dot.W_dot[b] = w_dot
         whole = rate(R, inertia, w)
         change = wp.cross(turned, whole) + rate(R, inertia, w_dot - wp.cross(turned, w))
-        L_dot[b] = density_dot[b] * whole + density[b] * change
+        moved_dot.L_dot[b] = density_dot[b] * whole + density[b] * change
 
     @wp.kernel(module=module, enable_backward=False)
     def predict_adjoint(
@@ -182,7 +181,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         density_dot: wp.array(dtype=real),
         inverse: matrix,
         moved: moving,
-        moved_dot: bundle(V_dot=vector, W_dot=vector, L_dot=vector),
+        moved_dot: moving_dots,
         # in and out: at first of the state before, at last of that after the step
         dot: state,
     ):

@@ -1,0 +1,138 @@
+"""`pour_jug`: a jug turns, and its water shall be in a glass.
+
+After PourWater of SoftGym (Lin et al. 2020). The controls are by how much faster or slower than steadily the jug turns
+in blocks of time; it may turn back.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from cortado import Problem, Scene, Simulation
+from cortado.losses import Frames
+from cortado.losses.loss import Adjoint, Snapshot
+from cortado.optimisation.transforms import Affine
+from cortado.scene.parameters.values import Arrays
+
+from .task import WATER, Controls, Score, Task, blocks_of, scene_of
+
+WALL = 4.0
+"""Thickness of the jug and of the glass [spacings]."""
+VISCOSITY = 0.3
+"""Thick enough not to splash out of the glass [Pa s]."""
+FRAMES = 5
+"""States, at the end of the run, in which water is looked for."""
+GREATEST = 2.0
+"""How far the jug's angular velocity may be from the steady one, in that one."""
+
+
+@dataclass(frozen=True)
+class PourJug(Task):
+    """Lengths in spacings, but for the spacing [m]."""
+
+    name = "pour_jug"
+    spacing: float
+    time_step: float
+    turning: int
+    """Steps."""
+    blocks: int
+    jug: tuple[int, int] = (12, 12)
+    """Width and depth of its water."""
+    turn: float = 2.0
+    """By which the jug is turned, clockwise, if nothing is searched [rad]."""
+
+    @classmethod
+    def small(cls) -> Self:
+        return cls(0.0125, 0.002, 500, blocks=50)
+
+    @classmethod
+    def large(cls) -> Self:
+        return cls(0.005, 0.001, 1000, blocks=100, jug=(36, 36))
+
+    @property
+    def steps(self) -> int:
+        return self.turning
+
+    @cached_property
+    def glass(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of what is inside of it, (2,) each [m]."""
+        width, depth = self.spacing * np.array(self.jug)
+        left = 1.7 * width
+        return np.array([left, -1.9 * depth]), np.array([left + 1.3 * width, -0.8 * depth])
+
+    @property
+    def scene(self) -> Scene:
+        width, depth = (float(size) for size in self.spacing * np.array(self.jug))
+        (lower, upper), wall = self.glass, WALL * self.spacing
+        cup = {"shape": "cup", "thickness": wall}
+        jug = {"base": [0.5 * width, -wall], "radius": 0.5 * width, "height": wall + 1.3 * depth}
+        glass = {"base": [float(0.5 * (lower[0] + upper[0])), float(lower[1]) - wall]}
+        glass |= {"radius": float(0.5 * (upper[0] - lower[0])), "height": wall + float(upper[1] - lower[1])}
+        floor = float(lower[1]) - wall
+        return scene_of(
+            "pour_jug",
+            self.spacing,
+            self.time_step,
+            {"shape": "box", "lower": [-1.0 * width, floor], "upper": [3.8 * width, 2.0 * depth]},
+            discretisation={"spacing": self.spacing},
+            phase=[{**WATER, "viscosity": VISCOSITY}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, depth], "phase": "water"}],
+            solid=[
+                {**cup, **jug, "name": "jug", "motion": "path", "angular_velocity": 0.0},
+                {**cup, **glass, "name": "glass"},
+            ],
+            solver={"kind": "projection", "time_step": self.time_step},
+            render={"view": "plane", "resolution": [192, 192]},
+        )
+
+    @cached_property
+    def controls(self) -> Controls:
+        steady = -self.turn / self.steps
+        so_far = np.tril(np.ones((self.steps, self.steps)))
+        steadily = steady * np.arange(1, self.steps + 1)
+        return Controls("jug.turn", Affine(steadily, GREATEST * steady * so_far @ blocks_of(self.steps, self.blocks)))
+
+    @property
+    def known(self) -> np.ndarray:
+        """Made by hand: faster, and then slower, as far as without a search."""
+        return 0.4 * np.sign(0.5 * (self.blocks - 1) - np.arange(self.blocks))
+
+    def loss(self, simulation: Simulation) -> Frames:
+        at = np.linspace(self.steps, 0.8 * self.steps, FRAMES).astype(int)
+        return Frames({int(step): Outside(*self.glass, 1.0 / FRAMES) for step in at})
+
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
+        lower, upper = self.glass
+        end = problem.end(parameters).positions
+        return {"outside": 1.0 - float(((end > lower) & (end < upper)).all(axis=1).mean())}
+
+
+@dataclass(frozen=True)
+class Outside:
+    """Mean squared distance of the water to the inside of a glass, over its squared width."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    weight: float
+
+    @property
+    def fingerprint(self) -> str:
+        return repr(self)
+
+    def value(self, end: Snapshot) -> float:
+        return self.weight * float((self._apart(end) ** 2).sum(axis=1).mean())
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        bar = 2.0 * self.weight / (len(end.positions) * self._width) * self._apart(end)
+        return self.value(end), (bar, np.zeros_like(end.velocities))
+
+    @property
+    def _width(self) -> float:
+        return float(self.upper[0] - self.lower[0])
+
+    def _apart(self, end: Snapshot) -> np.ndarray:
+        """(n, 2) from the nearest point of the inside, over the width."""
+        x = end.positions
+        return (x - np.clip(x, self.lower, self.upper)) / self._width

@@ -1,0 +1,90 @@
+"""How deep does a body float, and how much water goes along with one that gets faster?"""
+
+import numpy as np
+
+from cortado import Scene, Simulation
+
+STEP = 0.001
+"""Of the time in which a sphere gets faster [s]."""
+
+
+def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
+    """A box of half the density of water, half as high as it is long, that is let go at the height at which it should
+    float: its draft over that, the mean of the second half of a run. ``long``: its particles along; ``duration`` in
+    seconds, for a box of 0.4 m."""
+    spacing, density, sides = 0.4 / long, 500.0, np.array([0.4, 0.2])
+    wanted = density / 1000.0 * sides[1]
+    step = 0.04 * spacing
+    scene = Scene(
+        dimension=2,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+        solid=[
+            {
+                "name": "box",
+                "shape": "box",
+                "lower": [0.3, 0.4 - wanted],
+                "upper": [0.7, 0.4 - wanted + sides[1]],
+                "motion": "free",
+                "density": density,
+            }
+        ],
+        solver={"kind": "projection", "time_step": step},
+    )
+    simulation = Simulation(scene)
+    steps = int(duration / step)
+    run = simulation.run(steps, record_every=max(steps // 20, 1))
+    level = len(simulation.positions) * spacing**2 + density / 1000.0 * np.prod(sides)
+    drafts = level - (run.solids["box"].positions[:, 1] - 0.5 * sides[1])
+    return {"particles": len(simulation.positions), "draft over the exact one": float(drafts[10:].mean() / wanted)}
+
+
+def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
+    """A sphere so many particles across in the middle of water at rest, as wide as it is deep, between periodic sides:
+    the mass of water that goes along with it over that of the water in its place.
+
+    The water comes to rest, for ``settling`` steps, around a sphere of its own density. From there on the sphere has
+    another one, and gets faster in one step by g (rho - rho_0) / (rho + C rho_0) dt more than it would otherwise: of
+    water without end C is 0.5."""
+    spacing = 0.02
+    side = deep * spacing
+    middle = [0.5 * side] * 3
+    scene = Scene(
+        dimension=3,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
+        fluid=[{"shape": "box", "lower": [0.0] * 3, "upper": [side] * 3, "phase": "water"}],
+        container={
+            "shape": "box",
+            "lower": [0.0] * 3,
+            "upper": [side, side + 6.0 * spacing, side],
+            "periodic": [True, False, True],
+        },
+        solid=[
+            {
+                "name": "ball",
+                "shape": "sphere",
+                "centre": middle,
+                "radius": 0.5 * across * spacing,
+                "motion": "free",
+                "density": 1000.0,
+            }
+        ],
+        solver={"kind": "projection", "time_step": STEP, "iterations": 32},
+    )
+    simulation = Simulation(scene)
+    settled = simulation.run(settling, record_every=settling).last_state
+
+    def faster(density: float) -> float:
+        ball = simulation.run(1, controls={"ball.density": density}, state=settled).solids["ball"]
+        return float(np.diff(ball.velocities[:, 1].astype(np.float64))[0] / STEP)
+
+    alone = faster(1000.0)
+    found: dict[str, float] = {"particles": len(simulation.positions)}
+    for density in (500.0, 3000.0, 8000.0):
+        # C is nearly the one that is looked for in the small part of the acceleration that is not the density's.
+        more = faster(density) - alone * 1500.0 / (density + 500.0)
+        found[f"at {density:g} kg/m3"] = (-9.81 * (density - 1000.0) / more - density) / 1000.0
+    return found
