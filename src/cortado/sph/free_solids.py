@@ -110,7 +110,8 @@ class FreeBody:
         matrix = matrix_of(layout.precision)
         inertia, inverse = table.mass.inertia, np.linalg.pinv(table.mass.inertia)
         self.constants: dict[str, Any] = {"number": table.number, "inertia": matrix(*inertia.ravel())}
-        self.constants["inverse"] = matrix(*inverse.ravel())
+        self.constants |= {"inverse": matrix(*inverse.ravel()), "greatest": float(np.linalg.eigvalsh(inverse).max())}
+        self.constants |= {"volume": table.mass.volume, "solid": table.number}
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
         """Momentum that it gets from what it touches, and its moment."""
         self.before, self.moved = (

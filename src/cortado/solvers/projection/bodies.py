@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from cortado.device.binding import Named
@@ -65,9 +64,7 @@ class Bodies:
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
         """What kernels know of a body."""
         body = held.body
-        inverse = np.linalg.eigvalsh(np.linalg.pinv(body.table.mass.inertia))
-        constants = {"volume": body.table.mass.volume, "greatest": float(inverse.max()), "solid": body.table.number}
-        own = held.known, held.shares, held.whole, constants, begun(body.before), self.part.poses
+        own = held.known, held.shares, held.whole, begun(body.before), self.part.poses
         return *own, *body.known(context)
 
     def begin(self, context: StepContext, a: wp.array) -> None:
