@@ -1,11 +1,13 @@
 """Where solids are, as parameters: reverse and forward mode of all four, in each solver and with each force."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from cortado import Problem, Simulation, certify
 from cortado.certificate.perturbations import coherent_directions, scales
-from cortado.errors import InputError, MissingDerivativeError
+from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
@@ -261,3 +263,17 @@ def test_a_tape_beside_solids_that_move_is_refused():
     problem = problem_of(SCENES["pcisph"]())
     with pytest.raises(MissingDerivativeError, match=r"solids that move have no tape: try gradients.Exact"):
         problem.value_and_gradient({"rotor.position": [0.3, 0.2]}, gradient=Tape())
+
+
+def test_a_solid_that_jumps_is_warned_of():
+    """Once: a displacement that does not begin near 0, and a state that goes on with another position."""
+    simulation = Simulation(plane(ROTOR))
+    with pytest.warns(CortadoWarning, match=r"the solid 'rotor' goes 0\.3 m in step 1 of this run, which is further"):
+        simulation.run(2, controls={"rotor.displacement": [0.3, 0.0], "rotor.turn": 0.0})
+    first = simulation.run(4, controls={"rotor.position": [0.3, 0.3]})
+    with pytest.warns(CortadoWarning, match=r"is given rotor\.position as the first one was"):
+        simulation.run(1, state=first.last_state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        simulation.run(1, controls={"rotor.position": [0.3, 0.3]}, state=first.last_state)
+        Simulation(plane(ROTOR)).run(4)

@@ -12,6 +12,7 @@ from cortado.particles.state import Parameters, State
 from cortado.rollout.choosing import begin_choosing
 from cortado.rollout.first_positions import FirstPositions
 from cortado.rollout.parameter_checks import check_places, check_sizes, unstable_sentence
+from cortado.rollout.path_checks import jump_sentence
 from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
@@ -104,9 +105,7 @@ class ParameterSpace:
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
-        if sought and sought not in self._told:
-            self._told.add(sought)
-            warnings.warn(sought, CortadoWarning, stacklevel=4)
+        self._warn(sought)
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
@@ -123,6 +122,7 @@ class ParameterSpace:
             self._one.run({**self._one.scheduled(own, clock), **own})
             for own, clock in zip(members, clocks, strict=True)
         ]
+        self._warn(jump_sentence(simulation.scene, firsts[0], chosen[0]))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [self._origin(one["rest_density"]) for one in chosen]
         rollout.origins = origins * (len(rollout.clocks) // len(origins))
@@ -143,6 +143,12 @@ class ParameterSpace:
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
         if simulation.scene.solver.chooses:
             begin_choosing(rollout, simulation.scene, self._one, each)
+
+    def _warn(self, sentence: str | None) -> None:
+        """Once."""
+        if sentence and sentence not in self._told:
+            self._told.add(sentence)
+            warnings.warn(sentence, CortadoWarning, stacklevel=5)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
