@@ -35,13 +35,16 @@ def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
     )
     simulation = Simulation(scene)
     steps = int(duration / step)
-    run = simulation.run(steps, record_every=max(steps // 20, 1))
+    run = simulation.run(steps, record_every=max(steps // 200, 1))
     level = len(simulation.positions) * spacing**2 + density / 1000.0 * np.prod(sides)
     drafts = level - (run.solids["box"].positions[:, 1] - 0.5 * sides[1])
-    return {"particles": len(simulation.positions), "draft over the exact one": float(drafts[10:].mean() / wanted)}
+    return {
+        "particles": len(simulation.positions),
+        "draft over the exact one": float(drafts[len(drafts) // 2 :].mean() / wanted),
+    }
 
 
-def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
+def added_mass(across: int, deep: int, settling: int, iterations: int) -> dict[str, float]:
     """A sphere so many particles across in the middle of water at rest, as wide as it is deep, between periodic sides:
     the mass of water that goes along with it over that of the water in its place.
 
@@ -72,7 +75,7 @@ def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
                 "density": 1000.0,
             }
         ],
-        solver={"kind": "projection", "time_step": STEP, "iterations": 32},
+        solver={"kind": "projection", "time_step": STEP, "iterations": iterations},
     )
     simulation = Simulation(scene)
     settled = simulation.run(settling, record_every=settling).last_state
@@ -84,7 +87,7 @@ def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
     alone = faster(1000.0)
     found: dict[str, float] = {"particles": len(simulation.positions)}
     for density in (500.0, 3000.0, 8000.0):
-        # C is nearly the one that is looked for in the small part of the acceleration that is not the density's.
+        # Water that is not quite at rest moves the ball too, and a heavier one less, with 0.5 for C in this small part.
         more = faster(density) - alone * 1500.0 / (density + 500.0)
         found[f"at {density:g} kg/m3"] = (-9.81 * (density - 1000.0) / more - density) / 1000.0
     return found
