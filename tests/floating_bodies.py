@@ -35,19 +35,22 @@ def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
     )
     simulation = Simulation(scene)
     steps = int(duration / step)
-    run = simulation.run(steps, record_every=max(steps // 20, 1))
+    run = simulation.run(steps, record_every=max(steps // 200, 1))
     level = len(simulation.positions) * spacing**2 + density / 1000.0 * np.prod(sides)
     drafts = level - (run.solids["box"].positions[:, 1] - 0.5 * sides[1])
-    return {"particles": len(simulation.positions), "draft over the exact one": float(drafts[10:].mean() / wanted)}
+    return {
+        "particles": len(simulation.positions),
+        "draft over the exact one": float(drafts[len(drafts) // 2 :].mean() / wanted),
+    }
 
 
-def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
+def added_mass(across: int, deep: int, settling: int, iterations: int, steps: int = 1) -> dict[str, float]:
     """A sphere so many particles across in the middle of water at rest, as wide as it is deep, between periodic sides:
     the mass of water that goes along with it over that of the water in its place.
 
     The water comes to rest, for ``settling`` steps, around a sphere of its own density. From there on the sphere has
-    another one, and gets faster in one step by g (rho - rho_0) / (rho + C rho_0) dt more than it would otherwise: of
-    water without end C is 0.5."""
+    another one, and gets faster, in the mean of so many ``steps``, by g (rho - rho_0) / (rho + C rho_0) dt more a step
+    than it would otherwise: of water without end C is 0.5."""
     spacing = 0.02
     side = deep * spacing
     middle = [0.5 * side] * 3
@@ -72,19 +75,20 @@ def added_mass(across: int, deep: int, settling: int) -> dict[str, float]:
                 "density": 1000.0,
             }
         ],
-        solver={"kind": "projection", "time_step": STEP, "iterations": 32},
+        solver={"kind": "projection", "time_step": STEP, "iterations": iterations},
     )
     simulation = Simulation(scene)
     settled = simulation.run(settling, record_every=settling).last_state
 
     def faster(density: float) -> float:
-        ball = simulation.run(1, controls={"ball.density": density}, state=settled).solids["ball"]
-        return float(np.diff(ball.velocities[:, 1].astype(np.float64))[0] / STEP)
+        run = simulation.run(steps, controls={"ball.density": density}, state=settled, record_every=steps)
+        first, last = run.solids["ball"].velocities[:, 1].astype(np.float64)
+        return float(last - first) / (steps * STEP)
 
     alone = faster(1000.0)
     found: dict[str, float] = {"particles": len(simulation.positions)}
     for density in (500.0, 3000.0, 8000.0):
-        # C is nearly the one that is looked for in the small part of the acceleration that is not the density's.
+        # Water that is not quite at rest moves the ball too, and a heavier one less, with 0.5 for C in this small part.
         more = faster(density) - alone * 1500.0 / (density + 500.0)
         found[f"at {density:g} kg/m3"] = (-9.81 * (density - 1000.0) / more - density) / 1000.0
     return found

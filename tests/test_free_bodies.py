@@ -8,6 +8,8 @@ from cortado.discretise.solids.mass import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose
+from cortado.runs.solid_motion import posed
+from cortado.runs.trajectory import Trajectory
 from cortado.solvers.contact_strength import STIFFNESS
 
 RAFT = {
@@ -29,6 +31,7 @@ BRICK = {
     "velocity": [0.1, -0.3, 0.1],
     "angular_velocity": [1.0, 2.0, -3.0],
 }
+FAR_AWAY = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.2, 0.1], "phase": "water"}
 
 
 def plane(*solids, **tables):
@@ -160,13 +163,21 @@ def test_a_box_floats_as_deep_as_it_should():
 
 def test_a_body_lies_on_the_floor():
     """Held by its contact alone: n points as deep as d push it with n d^3 / sqrt(n d^4) = sqrt(n) d."""
-    box = {"name": "raft", "shape": "box", "lower": [1.7, 0.0], "upper": [1.9, 0.1], "motion": "free", "density": 500.0}
-    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [2.0, 1.0]}
-    run = Simulation(plane(box, container=container), precision="float64").run(150, record_every=1)
-    solid = run.solids["raft"]
+    box = {"name": "raft", "shape": "box", "lower": [0.7, 0.0], "upper": [0.9, 0.1], "motion": "free", "density": 500.0}
+    solid = Simulation(plane(box, fluid=[FAR_AWAY]), precision="float64").run(150, record_every=1).solids["raft"]
     alone = 9.81 * 0.001**2 / STIFFNESS
     assert alone / np.sqrt(20.0) < 0.05 - solid.positions[-1, 1] < alone / 2.0
     assert np.abs(solid.velocities[-20:]).max() < 1e-4
+
+
+@pytest.mark.parametrize("time_step", [0.001, 0.0005])
+def test_a_body_bounces_less_high_than_it_fell(time_step):
+    """Contact takes a part of its speed, the same in steps of any length, and never adds to it."""
+    ball = {"name": "ball", "shape": "sphere", "centre": [0.8, 0.1], "radius": 0.08, "motion": "free", "density": 500.0}
+    solver = {"kind": "projection", "time_step": time_step}
+    simulation = Simulation(plane({**ball, "velocity": [0.0, -1.0]}, fluid=[FAR_AWAY], solver=solver))
+    up = simulation.run(int(0.06 / time_step), record_every=1).solids["ball"].velocities[:, 1]
+    assert up.min() < -1.1 and 0.5 < -up.max() / up.min() < 0.75
 
 
 @pytest.mark.parametrize(
@@ -217,6 +228,30 @@ def test_a_run_goes_on_from_a_state_with_the_same_bits():
     assert np.array_equal(whole.solids["raft"].rotations[-1], rest.solids["raft"].rotations[-1])
     with pytest.raises(InputError, match=r"parameter raft\.velocity is given, but must be left out with a state"):
         simulation.run(1, controls={"raft.velocity": [0.0, 0.0]}, state=first.last_state)
+
+
+@pytest.mark.parametrize("made", [touching, touching_in_space])
+def test_a_run_goes_on_from_a_file(made, tmp_path):
+    simulation = Simulation(made())
+    whole, first = simulation.run(8), simulation.run(3)
+    first.save(tmp_path / "first.vtkhdf")
+    rest = simulation.run(5, state=Trajectory.load(tmp_path / "first.vtkhdf").last_state).last_state
+    assert all(np.array_equal(whole.last_state[name], rest[name]) for name in rest.fields)
+
+
+@pytest.mark.parametrize("made", [touching, touching_in_space])
+def test_bodies_are_drawn_where_they_are(made):
+    """Where contact has pushed and turned the raft, which no table of the scene says."""
+    scene = made()
+    run = Simulation(scene).run(10, record_every=5)
+    drawn, solid = posed(scene, run.solids, 2).solid[0], run.solids["raft"]
+    points = np.random.default_rng(4).uniform(0.0, 0.5, (50, scene.dimension))
+    turned = np.array([drawn.turn(scene.dimension).T @ (x - solid.positions[2]) for x in points])
+    assert np.allclose(drawn.solid().distance(points), drawn.own_solid().distance(turned), atol=1e-6)
+    R = drawn.turn(scene.dimension)
+    axes = np.array([run.last_state[f"raft.turn_{axis}"][0] for axis in "xyz"[: scene.dimension]]).T
+    assert np.allclose(R, (np.eye(scene.dimension) + axes) @ scene.solid[0].turn(scene.dimension), atol=1e-5)
+    assert np.abs(axes).max() > 1e-3
 
 
 def test_a_batch_has_the_bits_of_single_runs():

@@ -83,7 +83,10 @@ CASES = {
     "piston, kd = 1.5, 30 deep": lambda: piston(30, 1.5, 0.03),
     "floating-box, 16 particles long": lambda: floating_box(16),
     "floating-box, 32 particles long": lambda: floating_box(32),
-    "added-mass, a sphere 8 particles across, 20 deep": lambda: added_mass(8, 20, 200),
+    "added-mass, a sphere 8 across, 20 deep, 4 iterations": lambda: added_mass(8, 20, 100, 4),
+    "added-mass, a sphere 8 across, 20 deep, 4 iterations, 10 steps": lambda: added_mass(8, 20, 100, 4, steps=10),
+    "added-mass, a sphere 8 across, 20 deep, 16 iterations": lambda: added_mass(8, 20, 100, 16),
+    "added-mass, a sphere 8 across, 20 deep, 32 iterations": lambda: added_mass(8, 20, 200, 32),
 }
 
 
