@@ -40,9 +40,7 @@ places = TIME_STEP**2 * np.tril(np.ones((STEPS, STEPS))) @ np.tril(np.ones((STEP
 end = np.stack([places[-1], (places[-1] - places[-2]) / TIME_STEP])  # the last place, and the last velocity
 free = np.eye(BLOCKS) - np.linalg.pinv(end) @ end
 straight = places @ np.sign(BLOCKS / 2 - 0.5 - np.arange(BLOCKS))  # full throttle, and full brake
-path = Affine(
-    np.outer(DISTANCE / straight[-1] * straight, [1.0, 0.0]), 5.0 * np.einsum("sb,d->sdb", places @ free, [1.0, 0.0])
-)
+path = Affine(DISTANCE * np.outer(straight / straight[-1], [1, 0]), 5 * np.einsum("sb,d->sdb", places @ free, [1, 0]))
 
 simulation = cortado.Simulation(scene)
 loss = cortado.losses.Frames({step: Motion() for step in range(MOVING + 10, STEPS + 1, 10)})
