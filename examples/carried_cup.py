@@ -1,7 +1,6 @@
 """A cup is carried from one place to another in 0.72 s: how, so that no water is spilt and it is at rest afterwards?
 
-What is searched are accelerations, in blocks of time, of which the cup's path is made: all of them lead to the same
-place, where the cup stands.
+Its path is made of accelerations in blocks of time, which are searched; all of them lead to the same place and stand.
 """
 
 import numpy as np
@@ -40,9 +39,8 @@ blocks = np.eye(BLOCKS)[np.arange(MOVING) * BLOCKS // MOVING]
 places = TIME_STEP**2 * np.tril(np.ones((STEPS, STEPS))) @ np.tril(np.ones((STEPS, MOVING))) @ blocks
 end = np.stack([places[-1], (places[-1] - places[-2]) / TIME_STEP])  # the last place, and the last velocity
 free = np.eye(BLOCKS) - np.linalg.pinv(end) @ end
-straight = np.sign(BLOCKS / 2 - 0.5 - np.arange(BLOCKS))  # full throttle, and full brake
-straight *= DISTANCE / (places[-1] @ straight)
-path = Affine(np.outer(places @ straight, [1.0, 0.0]), 5.0 * np.einsum("sb,d->sdb", places @ free, [1.0, 0.0]))
+straight = places @ np.sign(BLOCKS / 2 - 0.5 - np.arange(BLOCKS))  # full throttle, and full brake
+path = Affine(DISTANCE * np.outer(straight / straight[-1], [1, 0]), 5 * np.einsum("sb,d->sdb", places @ free, [1, 0]))
 
 simulation = cortado.Simulation(scene)
 loss = cortado.losses.Frames({step: Motion() for step in range(MOVING + 10, STEPS + 1, 10)})
@@ -57,3 +55,6 @@ for name, u in (("full throttle", start), ("found", found.parameters)):
     inside = (water[:, 1] > 0.0) & (np.abs(water[:, 0] - 0.1 - DISTANCE) < 0.1)
     print(f"{name}: loss {search.value(u):.4g} m2/s2, {(~inside).sum()} of {len(water)} particles are spilt")
 assert inside.all() and found.loss < 0.1 * search.value(start), "water is spilt, or sloshes"
+run = simulation.run(STEPS, search.parameters(found.parameters), record_every=50)
+pictures = [simulation.picture(run[k], width=480, height=300) for k in (0, 2, 4, 6)]
+cortado.pictures.write_picture("carried_cup.png", np.concatenate(pictures, axis=1))

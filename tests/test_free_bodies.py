@@ -303,3 +303,14 @@ def test_a_bad_pose_is_a_sentence(given, sentence):
 def test_a_pose_of_another_scene_is_a_sentence(loss, sentence):
     with pytest.raises(InputError, match=sentence):
         Problem(Simulation(plane(RAFT)), 1, loss).value({})
+
+
+def test_a_file_of_frames_tells_where_bodies_are(tmp_path):
+    run = Simulation(touching()).run(6, record_every=2)
+    run.save(tmp_path / "run.vtkhdf")
+    read = type(run).load(tmp_path / "run.vtkhdf")
+    assert read.solids.keys() == run.solids.keys() == {"raft", "ball", "arm"}
+    for name, motion in run.solids.items():
+        assert np.array_equal(read.solids[name].positions, motion.positions)
+        assert np.array_equal(read.solids[name].rotations, motion.rotations)
+    assert np.array_equal(read.solids["raft"].velocities, run.solids["raft"].velocities)

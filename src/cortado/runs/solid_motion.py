@@ -18,6 +18,9 @@ from cortado.scene.motions import (
 )
 from cortado.scene.scene import Scene
 
+END = position_name("")
+"""How fields end that say where a solid is."""
+
 
 @dataclass(frozen=True, eq=False)
 class SolidMotion:
@@ -40,7 +43,13 @@ class SolidMotion:
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:
     """Of the solids of a scene that move, by their names, from recorded fields (frames, 1, ...) of states."""
-    return {table.name: _motion(table, fields, scene.dimension) for table in moved(scene, fields)}
+    return {table.name: _motion(table.name, fields, scene.dimension) for table in moved(scene, fields)}
+
+
+def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> dict[str, SolidMotion]:
+    """Of all solids of which recorded fields (frames, 1, ...) of states tell, by their names."""
+    names = [field.removesuffix(END) for field in fields if field.endswith(END)]
+    return {name: _motion(name, fields, dimension) for name in names}
 
 
 def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
@@ -48,10 +57,9 @@ def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
     return [table for table in moving(scene.solid) if position_name(table.name) in fields]
 
 
-def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
-    name = table.name
+def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
     position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
-    if table.motion == "free":
+    if f"{name}.{AXES[0]}" in fields:  # of a body that is free
         axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
         moving = {"velocities": fields[velocity_name(name)][:, 0]}
         moving["angular_velocities"] = fields[angular_velocity_name(name)][:, 0]

@@ -19,7 +19,7 @@ from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.sensors.log import Readings
-from cortado.runs.solid_motion import SolidMotion
+from cortado.runs.solid_motion import SolidMotion, motions_in
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.words import counted
@@ -70,7 +70,7 @@ class Trajectory:
     sensors: Mapping[str, Readings] = field(default_factory=dict)
     """what sensors have read in every step, by their names; it is not in files"""
     solids: Mapping[str, SolidMotion] = field(default_factory=dict)
-    """where solids that move are, by their names; it is not in files"""
+    """where solids that move are, by their names"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
 
@@ -257,9 +257,9 @@ class Trajectory:
         for name, array in recorded.items():
             _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
             recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
-        return cls(
-            **{name: arrays[name] for name in names}, mass_fractions=fractions, origin=origin, quantities=recorded
-        )
+        solids = motions_in(arrays["others"], arrays["positions"].shape[2])
+        more = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
+        return cls(**{name: arrays[name] for name in names}, **more)
 
 
 def _spacing(positions: NDArray[Any]) -> float:
