@@ -258,7 +258,7 @@ class Trajectory:
             _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
             recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
         solids = motions_in(arrays["others"], arrays["positions"].shape[2])
-        more = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
+        more: dict[str, Any] = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
         return cls(**{name: arrays[name] for name in names}, **more)
 
 
