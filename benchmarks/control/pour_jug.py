@@ -6,7 +6,7 @@ in blocks of time; it may turn back.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class PourJug(Task):
         (lower, upper), wall = self.glass, WALL * self.spacing
         cup = {"shape": "cup", "thickness": wall}
         jug = {"base": [0.5 * width, -wall], "radius": 0.5 * width, "height": wall + 1.3 * depth}
-        glass = {"base": [float(0.5 * (lower[0] + upper[0])), float(lower[1]) - wall]}
+        glass: dict[str, Any] = {"base": [float(0.5 * (lower[0] + upper[0])), float(lower[1]) - wall]}
         glass |= {"radius": float(0.5 * (upper[0] - lower[0])), "height": wall + float(upper[1] - lower[1])}
         floor = float(lower[1]) - wall
         return scene_of(
