@@ -101,7 +101,7 @@ class Contacts:
         part: FreeSolidsPart,
         touching: Sequence[Touching],
         spacing: float,
-        periods: Sequence[float],
+        periods: NDArray[np.float64],
         layout: Layout,
     ):
         """``periods`` (d,) [m] are 0 along axes without one."""
@@ -109,7 +109,7 @@ class Contacts:
         self.strength = strength_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self.seen = [Seen(contact, layout) for contact in self.contacts]
-        self._period = layout.precision.vector(*padded(np.array([periods], dtype=np.float64))[0])
+        self._period = layout.precision.vector(*padded(periods[None])[0])
         self._whole: list[Arrays] = [{} for _ in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
 
