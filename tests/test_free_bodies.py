@@ -83,6 +83,15 @@ def touching():
     return plane(raft, ball, {**arm, "motion": "path", "velocity": [0.0, -0.2]})
 
 
+def touching_across():
+    """The same across the end of a period."""
+    raft, ball, arm = (one.model_dump(exclude_none=True) for one in touching().solid)
+    raft |= {"lower": [0.7, -0.002], "upper": [0.95, 0.18]}
+    ball["centre"], arm["lower"], arm["upper"] = [0.02, 0.14], [0.8, 0.175], [0.86, 0.3]
+    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, False]}
+    return plane(raft, ball, arm, container=container)
+
+
 def touching_in_space():
     raft = {**BRICK, "lower": [0.2, -0.002, 0.1], "upper": [0.4, 0.14, 0.3], "rotation": [0.01, 0.02, 0.01]}
     ball = {"name": "ball", "shape": "sphere", "centre": [0.3, 0.22, 0.2], "radius": 0.085, "motion": "free"}
@@ -163,15 +172,32 @@ def test_a_body_bounces_less_high_than_it_fell(time_step):
     assert up.min() < -1.1 and 0.5 < -up.max() / up.min() < 0.75
 
 
+def test_bodies_touch_across_a_period():
+    """One that has left the box where it began meets images: of a body, of a pillar, and of the floor."""
+    box = {"shape": "box", "lower": [0.8, 0.5], "upper": [0.9, 0.6], "motion": "free", "density": 500.0}
+    raft = {**box, "name": "raft", "velocity": [2.0, 0.0]}
+    other = {**box, "name": "other", "lower": [0.05, 0.5], "upper": [0.15, 0.6]}
+    pillar = {"name": "pillar", "shape": "box", "lower": [0.3, 0.3], "upper": [0.4, 0.9]}
+    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, False]}
+    scene = plane(raft, other, pillar, fluid=[FAR_AWAY], container=container)
+    run = Simulation(scene, precision="float64").run(450, record_every=10)
+    solid, hit = run.solids["raft"], run.solids["other"]
+    velocity = solid.velocities + hit.velocities
+    assert np.allclose(velocity[10], [2.0, -2 * 9.81 * 0.1], rtol=1e-9) and hit.velocities[10, 0] > 1.0
+    assert hit.velocities[:, 0].min() < -0.1 and solid.positions[:, 0].max() > 0.95
+    assert all(body.positions[:, 1].min() > 0.04 for body in (solid, hit))
+
+
 @pytest.mark.parametrize(
     ("made", "loss"),
     [
         (lambda: plane(RAFT), CentreOfMass([0.5, 0.3])),
         (lambda: space(BRICK), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
         (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
+        (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
     ],
-    ids=["plane", "space", "touching", "touching in space"],
+    ids=["plane", "space", "touching", "touching across a period", "touching in space"],
 )
 def test_derivatives_of_bodies(made, loss):
     """Reverse and forward mode to round-off, and differences, of all that a body begins with and of its density."""

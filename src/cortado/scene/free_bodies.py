@@ -36,13 +36,21 @@ def check_free(scene: SceneTables) -> None:
             continue
         points = _within(table.solid(), FINE * spacing)
         depths = [("the container", region.distance(points))]
-        others = (other for other in scene.solid if other is not table)
-        depths += [(f"the solid {other.name!r}", -other.solid().distance(points)) for other in others]
+        for other in scene.solid:
+            if other is not table:
+                near = _near(points, np.mean(other.solid().extent(), axis=0), lengths)
+                depths.append((f"the solid {other.name!r}", -other.solid().distance(near)))
         for name, depth in depths:
             if depth.max() > DEEPEST * spacing:
                 place = point_in_words(points[depth.argmax()])
                 wanted = f"at most a quarter of a spacing, {DEEPEST * spacing:g} m, in it"
                 raise field_error(("solid", index), Words(f"{depth.max():g} m deep in {name} at {place}"), wanted)
+
+
+def _near(points: Points, middle: Points, lengths: Points) -> Points:
+    """The images of points (n, d) that are nearest to a middle (d,), for periods (d,), 0 along axes without one."""
+    periods = np.where(lengths > 0.0, lengths, np.inf)
+    return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
 
 
 def _within(solid: Solid, step: float) -> Points:

@@ -158,8 +158,8 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
     ]
     if not tables:
         return None
-    spacing, touching = scene.discretisation.spacing, _touching(scene, discrete)
-    return FreeSolids(tables, scene.dimension, search, lambda part: Contacts(part, touching, spacing, layout))
+    spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods
+    return FreeSolids(tables, scene.dimension, search, lambda part: Contacts(part, touching, spacing, periods, layout))
 
 
 def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:

@@ -51,11 +51,24 @@ def contact_kernels(precision: Precision) -> ContactKernels:
     def vec(a: wp.vec3f) -> vector:
         return vector(real(a[0]), real(a[1]), real(a[2]))
 
+    @wp.func
+    def along(way: real, length: real) -> real:
+        found = way
+        if length > real(0.0):
+            found = way - length * wp.round(way / length)
+        return found
+
+    @wp.func
+    def nearest(way: vector, period: vector) -> vector:
+        """To the nearest image."""
+        return vector(along(way[0], period[0]), along(way[1], period[1]), along(way[2], period[2]))
+
     @wp.kernel(module=module, enable_backward=False)
     def look(
         points: int,
         number: int,
         against: int,
+        period: vector,
         mesh: wp.uint64,
         middle: vector,
         side: real,
@@ -67,15 +80,16 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         depth: wp.array(dtype=real),
         square: wp.array(dtype=real),
     ):
-        """Goes on from the deepest place so far; ``against`` is -1 of a solid that is at rest. ``square`` is d^4."""
+        """Goes on from the deepest place so far; ``against`` is -1 of a solid that is at rest, ``period`` is 0 along an
+        axis without one. ``square`` is d^4."""
         j = wp.tid()
         member = j // points
         x = after[member, number] + turns[member, number] * own[j - member * points]
         R = matrix(real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0))
-        y = x - middle
+        y = nearest(x - middle, period)
         if against >= 0:
             R = turns[member, against]
-            y = wp.transpose(R) * (x - after[member, against]) - middle
+            y = wp.transpose(R) * nearest(x - after[member, against], period) - middle
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(mesh, place, wp.float32(FAR))
         if not found.result or real(found.sign) * side > real(0.0):
@@ -96,6 +110,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         points: int,
         number: int,
         against: int,
+        period: vector,
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
@@ -114,7 +129,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         turn = vector()
         if against >= 0:
             turn = turned_dot[member, against]
-            x = after[member, number] + r - after[member, against]
+            x = nearest(after[member, number] + r - after[member, against], period)
             away = away - after_dot[member, against] - wp.cross(turn, x)
         change = -wp.dot(of.normal[j], away)
         if d <= real(0.0):
@@ -128,6 +143,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         points: int,
         number: int,
         against: int,
+        period: vector,
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
@@ -147,7 +163,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         share.twist[j] = wp.cross(r, f)
         other = vector()
         if against >= 0:
-            other = wp.cross(after[member, number] + r - after[member, against], f)
+            other = wp.cross(nearest(after[member, number] + r - after[member, against], period), f)
         share.other[j] = other
 
     @wp.kernel(module=module, enable_backward=False)
@@ -155,6 +171,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         points: int,
         number: int,
         against: int,
+        period: vector,
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
@@ -181,7 +198,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         share.twist_dot[j] = wp.cross(r_dot, f) + wp.cross(r, f_dot)
         other = vector()
         if against >= 0:
-            x = after[member, number] + r - after[member, against]
+            x = nearest(after[member, number] + r - after[member, against], period)
             x_dot = after_dot[member, number] + r_dot - after_dot[member, against]
             other = wp.cross(x_dot, f) + wp.cross(x, f_dot)
         share.other_dot[j] = other
@@ -191,6 +208,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         points: int,
         number: int,
         against: int,
+        period: vector,
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
@@ -207,7 +225,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         r, d, n = turns[member, number] * own[j - member * points], of.depth[j], of.normal[j]
         u = share_bar.push_bar[member] + wp.cross(share_bar.twist_bar[member], r)
         if against >= 0:
-            x = after[member, number] + r - after[member, against]
+            x = nearest(after[member, number] + r - after[member, against], period)
             u = u + wp.cross(share_bar.other_bar[member], x)
         work[j] = wp.dot(n, u)
         weighed[j] = d * d * d * wp.dot(n, u)
@@ -217,6 +235,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         points: int,
         number: int,
         against: int,
+        period: vector,
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
@@ -243,7 +262,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
             x_bar = -depth_bar * n
             own_torque = wp.cross(r, wp.cross(f, share_bar.twist_bar[member]))
             if against >= 0:
-                x = after[member, number] + r - after[member, against]
+                x = nearest(after[member, number] + r - after[member, against], period)
                 u = u + wp.cross(share_bar.other_bar[member], x)
                 by_arm = wp.cross(f, share_bar.other_bar[member])
                 other_torque = -wp.cross(x, x_bar) + wp.cross(f, u)

@@ -96,11 +96,20 @@ class Seen:
 class Contacts:
     """Those of the bodies of one solver; a step looks for them once poses are known."""
 
-    def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, layout: Layout):
+    def __init__(
+        self,
+        part: FreeSolidsPart,
+        touching: Sequence[Touching],
+        spacing: float,
+        periods: NDArray[np.float64],
+        layout: Layout,
+    ):
+        """``periods`` (d,) [m] are 0 along axes without one."""
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.strength = strength_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self.seen = [Seen(contact, layout) for contact in self.contacts]
+        self._period = layout.precision.vector(*padded(periods[None])[0])
         self._whole: list[Arrays] = [{} for _ in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
 
@@ -118,6 +127,7 @@ class Contacts:
             "points": contact.count,
             "number": own.table.number,
             "against": contact.touching.against,
+            "period": self._period,
             "is_free": contact.touching.other >= 0,
             "volumes": volumes,
             "own": contact.own,
