@@ -118,6 +118,11 @@ SLOW_TESTS = {
         "test_quiet_says_nothing_but_what_was_asked_for",
         "test_so_it_does_with_all_that_is_switched_off",
     },
+    "test_free_bodies": {
+        "test_a_body_and_fluid_in_free_space_keep_their_momentum",
+        "test_a_box_floats_as_deep_as_it_should",
+        "test_derivatives_of_bodies",
+    },
     "test_fuzz": {
         "test_one_case_by_its_command",
     },

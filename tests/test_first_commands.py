@@ -172,7 +172,7 @@ def test_all_of_them_or_none(cortado_command):
     assert cortado_command("examples", "--copy", "all", "--to", "all")[0] == 0
     assert len(os.listdir("all")) == len([path for path in (ROOT / "examples").iterdir() if path.is_file()])
     assert_refused(
-        cortado_command("examples", "--copy", "por"), "--copy is 'por', but must be all or one of custom_loss, "
+        cortado_command("examples", "--copy", "por"), "--copy is 'por', but must be all or one of carried_cup, "
     )
     assert_refused(cortado_command("examples", "--copy", "pour", "--to", "pour.toml"), "pour.toml")
 
@@ -182,7 +182,7 @@ def test_what_is_copied_is_a_name_and_no_path(cortado_command, name):
     for names in (["--copy", name], ["--copy", "pour", "--copy", name]):
         code, out, err = cortado_command("examples", *names, "--to", "here")
         assert (code, out, err.count("\n")) == (2, "", 1)
-        assert err.startswith(f"--copy is {name!r}, but must be all or one of custom_loss, ")
+        assert err.startswith(f"--copy is {name!r}, but must be all or one of carried_cup, ")
         assert not os.listdir()
 
 

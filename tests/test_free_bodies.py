@@ -148,7 +148,6 @@ def test_a_body_in_nothing_falls_and_turns_as_bodies_do():
     assert np.abs(solid.angular_velocities - solid.angular_velocities[0]).max() > 0.1
 
 
-@pytest.mark.slow
 def test_a_box_floats_as_deep_as_it_should():
     assert floating_box(16)["draft over the exact one"] == pytest.approx(1.0, rel=0.03)
 

@@ -273,7 +273,8 @@ class WallYield(Operation):
 
     def adjoint(self, values, bars):
         values = {**values, "y": self.forward(values)["y"]}
-        return {"x": launch(Kernels.walls.adjoint, s=self.s, **values, y_bar=bars["y"], **zeros("x_bar"))["x_bar"]}
+        given = {**values, "y_bar": bars["y"], "slope_bar": np.zeros((N, 3)), **zeros("x_bar")}
+        return {"x": launch(Kernels.walls.adjoint, s=self.s, **given)["x_bar"]}
 
 
 class DensityRatio(Operation):
