@@ -10,7 +10,7 @@ from cortado.arrays import read_only
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Snapshot
-from cortado.scene.motions import AXES, position_name, rotation_name, turn_name
+from cortado.scene.motions import AXES, position_name, rotation_name, solids_in, turn_name
 
 
 @fixed
@@ -41,10 +41,8 @@ class SolidPose:
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         name, names = self.name, end.state.names
         if position_name(name) not in names:
-            moving = [field.removesuffix(".position") for field in names if field.endswith(".position")]
-            raise InputError(
-                f"name is {name!r}, but must be that of a solid that moves: {', '.join(moving) or 'none does'}."
-            )
+            moving = ", ".join(solids_in(names)) or "none does"
+            raise InputError(f"name is {name!r}, but must be that of a solid that moves: {moving}.")
         value, bars = 0.0, {}
         if self.position is not None:
             position = end[position_name(name)]

@@ -13,13 +13,11 @@ from cortado.scene.motions import (
     moving,
     position_name,
     rotation_name,
+    solids_in,
     turn_name,
     velocity_name,
 )
 from cortado.scene.scene import Scene
-
-END = position_name("")
-"""How fields end that say where a solid is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +46,7 @@ def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str,
 
 def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> dict[str, SolidMotion]:
     """Of all solids of which recorded fields (frames, 1, ...) of states tell, by their names."""
-    names = [field.removesuffix(END) for field in fields if field.endswith(END)]
-    return {name: _motion(name, fields, dimension) for name in names}
+    return {name: _motion(name, fields, dimension) for name in solids_in(fields)}
 
 
 def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:

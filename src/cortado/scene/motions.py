@@ -1,6 +1,6 @@
 """How solids that move are displaced and turned from where they begin, over time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,6 +121,12 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
 def position_name(solid: str) -> str:
     """Of the parameter that says where its middle begins, and of the field of a state that says where it is."""
     return f"{solid}.position"
+
+
+def solids_in(fields: Iterable[str]) -> list[str]:
+    """The names of the solids that fields of a state tell of."""
+    end = position_name("")
+    return [field.removesuffix(end) for field in fields if field.endswith(end)]
 
 
 def rotation_name(solid: str) -> str:

@@ -27,8 +27,6 @@ class FreeFunctions:
     """The vector of an angle, or of an angular velocity."""
     angle_of: Any
     """The other way."""
-    unit: Any
-    """I"""
     attitude: Any
     """Q"""
     column: Any
@@ -39,8 +37,6 @@ class FreeFunctions:
     """The adjoint of a further turn of Q for that of a state; of a tangent twice the turn."""
     write_twist: Any
     """The adjoint of a state for that of a further turn of Q."""
-    rate: Any
-    """R A R^T w"""
 
 
 def free_module(precision: Precision) -> Any:
@@ -48,6 +44,18 @@ def free_module(precision: Precision) -> Any:
     module = wp.get_module(f"cortado_free_bodies_derivative_{precision.name}")
     module.options["enable_backward"] = False
     return module
+
+
+@cache
+def rate_function(precision: Precision) -> Any:
+    """The Warp function R A R^T w of matrices R and A and a vector w."""
+    vector, matrix = precision.vector, matrix_of(precision)
+
+    @wp.func
+    def rate(R: matrix, A: matrix, w: vector) -> vector:
+        return R * (A * (wp.transpose(R) * w))
+
+    return rate
 
 
 @cache
@@ -106,8 +114,4 @@ def free_functions(precision: Precision, dimension: int) -> FreeFunctions:
         bar.turn_y[b] = real(0.5) * wp.cross(t, column(Q, 1))
         bar.turn_z[b] = real(0.5) * wp.cross(t, column(Q, 2))
 
-    @wp.func
-    def rate(R: matrix, A: matrix, w: vector) -> vector:
-        return R * (A * (wp.transpose(R) * w))
-
-    return FreeFunctions(state, about, angle_of, unit, attitude, column, evened, twist, write_twist, rate)
+    return FreeFunctions(state, about, angle_of, attitude, column, evened, twist, write_twist)

@@ -16,7 +16,7 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
-from cortado.sph.free_functions import free_functions, free_module
+from cortado.sph.free_functions import free_functions, free_module, rate_function
 from cortado.sph.rotations import rotations
 
 
@@ -42,7 +42,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
     angle, begun_rotation, begun_further, begun_back = flat.angle, flat.rotation, flat.further, flat.back
     rotation, further, back = space.rotation, space.further, space.back
     state, about, angle_of, attitude = of_body.state, of_body.about, of_body.angle_of, of_body.attitude
-    column, evened, rate = of_body.column, of_body.evened, of_body.rate
+    column, evened, rate = of_body.column, of_body.evened, rate_function(precision)
     twist, write_twist = of_body.twist, of_body.write_twist
     module = free_module(precision)
     moving, bars = bundle(V=vector, W=vector, L=vector), bundle(V_bar=vector, W_bar=vector, L_bar=vector)

@@ -17,8 +17,6 @@ class Mass:
 
     volume: float
     """[m^d]"""
-    middle: NDArray[np.float64]
-    """(d,) its centroid [m]"""
     inertia: NDArray[np.float64]
     """(3, 3) about the centroid [m^(d + 2)]; in 2-D only that about z."""
 
@@ -39,8 +37,8 @@ class Mass:
         x[:, :dimension] = points - middle
         second = np.einsum("n,ni,nj->ij", parts, x, x)
         inertia = np.trace(second) * np.eye(3) - second
-        return cls(volume, middle, inertia if dimension == 3 else np.diag([0.0, 0.0, inertia[2, 2]]))
+        return cls(volume, inertia if dimension == 3 else np.diag([0.0, 0.0, inertia[2, 2]]))
 
     def in_volumes(self, unit: float) -> "Mass":
         """The same in volumes of so many [m^d]."""
-        return Mass(self.volume / unit, self.middle, self.inertia / unit)
+        return Mass(self.volume / unit, self.inertia / unit)

@@ -10,7 +10,7 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
-from cortado.sph.free_functions import free_module
+from cortado.sph.free_functions import free_module, rate_function
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,9 @@ class MotionKernels:
 def motion_kernels(precision: Precision) -> MotionKernels:
     """In a precision."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    module = free_module(precision)
+    module, rate = free_module(precision), rate_function(precision)
     held, moving = bundle(gamma_of=vector, arm=vector), bundle(V=vector, W=vector, L=vector)
     begun, sums = bundle(V_0=vector, W_0=vector, L_0=vector), bundle(pulled_sum=vector, twisted_sum=vector)
-
-    @wp.func
-    def rate(R: matrix, A: matrix, w: vector) -> vector:
-        return R * (A * (wp.transpose(R) * w))
 
     @wp.kernel(module=module, enable_backward=False)
     def move(
