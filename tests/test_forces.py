@@ -7,6 +7,7 @@ import warp as wp
 from cortado import Simulation
 from cortado.device.precision import FLOAT64
 from cortado.particles.arrays import Fields
+from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Layout
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
@@ -23,9 +24,9 @@ def test_gravity_adds_to_its_adjoint():
     shares = Shares(["time_step"], solver.layout)
     ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
     solver.step_number.fill_(1)
-    gravity = Gravity(solver.layout, taped=False)
+    gravity, solids = Gravity(solver.layout, taped=False), SolidShares(None, solver.layout)
     for _ in range(2):
-        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares))
+        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares, solids))
     np.testing.assert_array_equal(bar["gravity"].numpy(), [[[0.5] * 3, [0.5 + 2 * n] * 3]])
 
 

@@ -69,33 +69,34 @@ def {name}(
 class SolidShares:
     """What the particles give to the adjoints of the poses of solids in one step, particle by particle."""
 
-    def __init__(self, walls: MovingWalls, layout: Layout):
+    def __init__(self, walls: MovingWalls | None, layout: Layout):
+        """``walls`` of the solids; where None move, nothing is given."""
         self._walls, self._pair = walls, layout.precision.pair
         size, vector, device = layout.all_particles, layout.precision.vector, layout.device
-        self._arrays = [
-            {name: wp.zeros(size, dtype=vector, device=device) for name in NAMES} for _ in range(walls.solids)
-        ]
-        self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in range(walls.solids)]
+        solids = range(0 if walls is None else walls.solids)
+        self._arrays = [{name: wp.zeros(size, dtype=vector, device=device) for name in NAMES} for _ in solids]
+        self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in solids]
         self._whole = [
-            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]}
-            for _ in range(walls.solids)
+            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]} for _ in solids
         ]
         """What was given by others than particles."""
 
     def add(
         self,
         launch: Callable[..., None],
-        kernel: Any,
+        kernel: Callable[[], Any],
         *groups: Named,
         constants: tuple[float, float] = (0.0, 0.0),
         **arrays: Any,
     ) -> None:
-        """What a sum gives, by the kernel that `solid_kernel` makes of it."""
+        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move."""
+        if self._walls is None:
+            return
         before, after = self._walls.before, self._walls.after
         poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
-            launch(kernel, self.of(solid), *groups, known, solid=solid, **arrays)
+            launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
         """(n,) vectors that the particles have given to one solid so far, as kernels call them."""
@@ -116,7 +117,7 @@ class SolidShares:
 
     def clear(self) -> None:
         """Forget what was given."""
-        for solid in range(self._walls.solids):
+        for solid in range(len(self._arrays)):
             self._forget(solid)
 
     def _forget(self, solid: int) -> None:

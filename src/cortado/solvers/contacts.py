@@ -209,7 +209,6 @@ class ContactsAdjoint:
     def look(self, step: StepContext, bar: Adjoints) -> None:
         """Of `Contacts.look`, to the adjoints of poses."""
         contacts, kernels = self._contacts, self._contacts.kernels
-        assert bar.solids is not None
         for number, contact in enumerate(contacts.contacts):
             bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
             rates = {"time_step_bar": bar.parameters["time_step"]}

@@ -1,5 +1,6 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
+from functools import partial
 from weakref import finalize
 
 import warp as wp
@@ -85,7 +86,7 @@ class ParticleAdjoint:
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
             solver.new_parameters(steps),
             Shares(names, layout),
-            None if solver.search.moving is None else SolidShares(solver.search.moving, layout),
+            SolidShares(solver.search.moving, layout),
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
@@ -98,8 +99,7 @@ class ParticleAdjoint:
         """Forget the adjoints of the parameters of an earlier way back."""
         self.bar.shares.clear()
         self.bar.parameters.clear()
-        if self.bar.solids is not None:
-            self.bar.solids.clear()
+        self.bar.solids.clear()
 
     def collect(self) -> Parameters:
         """The adjoints of the parameters, of all steps since `begin`."""
@@ -156,9 +156,8 @@ class ParticleAdjoint:
         """Of the rest of `ParticleSolver.sort`."""
         solver, b = self._solver, self.bar.fields
         context.launch(solver.density.adjoint, *self.bar.named)
-        if self.bar.solids is not None:
-            densities = density_solid_kernel(solver.discretisation, solver.topic)
-            self.bar.solids.add(context.launch, densities, *self.bar.named, bar=b["n"])
+        densities = partial(density_solid_kernel, solver.discretisation, solver.topic)
+        self.bar.solids.add(context.launch, densities, *self.bar.named, bar=b["n"])
         self.begin_parts(context, state_bar)
         scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
         context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)

@@ -230,7 +230,6 @@ class FreeSolidsAdjoint(PartAdjoint):
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
-        assert bar.solids is not None
         for own in self.bodies:
             body = own.body
             bars = {**self._bars(own, bar.parameters, state_bar), **own.before, "turned_end": own.turned_end}

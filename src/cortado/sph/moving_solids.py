@@ -251,7 +251,6 @@ class MovingSolidsAdjoint(PartAdjoint):
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
-        assert bar.solids is not None
         for name, number in part.made_of.numbers.items():
             bars = {**part.state(state_bar, name, "_bar"), **part.told(bar.parameters, name, "_bar")}
             known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)

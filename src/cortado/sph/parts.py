@@ -107,8 +107,8 @@ class Adjoints:
     fields: Fields
     parameters: Parameters
     shares: Shares
-    solids: SolidShares | None = None
-    """Of the poses of solids that move; None without any."""
+    solids: SolidShares
+    """Those of the poses of solids that move."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:

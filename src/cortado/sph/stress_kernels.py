@@ -22,7 +22,8 @@ shear stress the same on both sides of a layer.
 Walls without slip: `cortado.sph.wall_contact`.
 """
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
@@ -243,8 +244,7 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     )
 
 
-def stress_solid_kernels(discretisation: Discretisation) -> tuple[Any, Any]:
-    """The kernels of what the sums and the force give to solids without slip that move."""
+def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], Any]]:
+    """What makes the kernels of what the sums and the force give to solids without slip that move."""
     works = (moments_work, stress_work)
-    sums, force = (solid_kernel(discretisation, "viscous_stress", work, rubs=True) for work in works)
-    return sums, force
+    return [partial(solid_kernel, discretisation, "viscous_stress", work, rubs=True) for work in works]

@@ -300,9 +300,9 @@ class Viscosity:
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
-        if bar.solids is not None and self.friction > 0.0:
+        if self.friction > 0.0:
             factors, given = (self._constants["kappa"] * self.friction, 0.0), {"acceleration_bar": acceleration_bar}
-            bar.solids.add(step.launch, self._of_solids(), given, *bar.named, constants=factors)
+            bar.solids.add(step.launch, self._of_solids, given, *bar.named, constants=factors)
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:

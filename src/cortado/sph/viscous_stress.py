@@ -61,7 +61,7 @@ class ViscousStress:
     def give(self, step: StepContext, bar: Adjoints, *bars: Named, by_force: bool = True) -> None:
         """What solids that move are given, by the adjoints M_bar, A_bar and R_bar of the sums, and by that of the
         acceleration."""
-        if bar.solids is None or not self._made_for[-1]:
+        if not self._made_for[-1]:
             return
         constants = self._constants["least"], self._constants["control"]
         for kernel in stress_solid_kernels(self._made_for[0])[: 1 + by_force]:

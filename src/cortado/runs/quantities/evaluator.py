@@ -1,7 +1,7 @@
 """Quantities of a state of a solver's particles, with the derivatives of each."""
 
 from collections.abc import Iterable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import cast
 
 import numpy as np
@@ -159,9 +159,10 @@ class QuantityEvaluator:
         p_bar, slope_bar = solver.numbers(), solver.vectors()
         p_bar.assign(own.p)
         adjoint.begin()
-        if isinstance(adjoint, ParticleAdjoint) and adjoint.bar.solids is not None:
+        if isinstance(adjoint, ParticleAdjoint) and solver.search.moving is not None:
             slope_bar.assign(own.slope)
-            slopes, context = wall_slope_solid_kernel(solver.discretisation), solver.context(self._rollout.parameters)
+            slopes = partial(wall_slope_solid_kernel, solver.discretisation)
+            context = solver.context(self._rollout.parameters)
             adjoint.bar.solids.add(context.launch, slopes, *adjoint.bar.named, bar=slope_bar)
         adjoint.from_within(self._counts, fields, p_bar, state_bar, self._rollout.parameters)
         return adjoint

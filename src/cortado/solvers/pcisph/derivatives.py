@@ -1,7 +1,7 @@
 """The tangent of a replayed PCISPH step, and its transpose, the adjoint."""
 
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import warp as wp
 from numpy.typing import NDArray
@@ -88,8 +88,8 @@ class PcisphAdjoint(ParticleAdjoint):
             self.push_solids(context, going, it.c[k])
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
-            densities = density_solid_kernel(solver.discretisation, solver.topic, looped=True)
-            self._give(context, going, densities, x=it.x_star[k], bar=self._r)
+            densities = partial(density_solid_kernel, solver.discretisation, solver.topic, looped=True)
+            self.bar.solids.add(context.launch, densities, going, *known, x=it.x_star[k], bar=self._r)
         self.predict(context)
         if fields_bar is not None:
             self.add(fields_bar)
@@ -101,23 +101,17 @@ class PcisphAdjoint(ParticleAdjoint):
         self.mix(context, state_bar)
         self.sort(context, state_bar)
 
-    def _give(self, context: StepContext, going: Named, kernel: Any, **arrays: wp.array) -> None:
-        """What solids that move are given in an iteration."""
-        if self.bar.solids is not None:
-            self.bar.solids.add(context.launch, kernel, going, *self.bar.named, **arrays)
-
     def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
         """What the pressure force of an iteration gives to solids that move."""
-        kernel = pressure_solid_kernel(self._solver.discretisation)
-        self._give(context, going, kernel, c=c, scaled_bar=self._scaled_bar)
+        kernel, pushed = partial(pressure_solid_kernel, self._solver.discretisation), {"scaled_bar": self._scaled_bar}
+        self.bar.solids.add(context.launch, kernel, going, pushed, *self.bar.named, c=c)
 
     def relax_beside_walls(self, context: StepContext) -> None:
         """Of the relaxation beside walls, which depends on positions alone."""
         solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
         context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
-        if self.bar.solids is not None:
-            slopes = wall_slope_solid_kernel(solver.discretisation)
-            self.bar.solids.add(context.launch, slopes, *self.bar.named, bar=self._slope_bar)
+        slopes = partial(wall_slope_solid_kernel, solver.discretisation)
+        self.bar.solids.add(context.launch, slopes, *self.bar.named, bar=self._slope_bar)
 
 
 class FrozenPcisphAdjoint(PcisphAdjoint):

@@ -4,7 +4,7 @@ step: it is found from the state that the step begins from, x' = x* + delta(x, v
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Self
 
 import warp as wp
@@ -181,5 +181,4 @@ class ShiftAdjoint(PartAdjoint):
             step.launch(kernel, *known, self._kept, shift.kept, flow)
         for kernel in shift.surroundings.adjoint:
             step.launch(kernel, *known)
-        if bar.solids is not None:
-            bar.solids.add(step.launch, beside_solid_kernel(shift.discretisation), *known)
+        bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *known)

@@ -222,7 +222,6 @@ class BodiesAdjoint:
             weighed = {"weighed": self._weigh(self._sizes)}
             context.launch(weigh, weighed, *known, a_bar=a_bar)
             context.launch(end, weighed, *known, threads=bodies.layout.members)
-            assert bar.solids is not None
             given = bar.solids.of(held.body.table.number)
             context.launch(bodies.kernels.hold.adjoint, given, *known)
             turned = self._turned[k]["turned_bar"]

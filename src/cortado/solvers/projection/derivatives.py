@@ -1,6 +1,7 @@
 """The tangent of a replayed step of the projection, and its transpose, the adjoint; every sum is a gather."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import warp as wp
 from numpy.typing import NDArray
@@ -173,8 +174,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
             context.launch(kernel, *known, solver.relaxed)
-        if self.bar.solids is not None:
-            self.bar.solids.add(context.launch, beside_solid_kernel(solver.discretisation), *known)
+        self.bar.solids.add(context.launch, partial(beside_solid_kernel, solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context)
         if fields_bar is not None:
@@ -195,9 +195,8 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(move, *known, solver.relaxed, measured, own)
             own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
             context.launch(kernels.measure.adjoint, *known, own)
-            if self.bar.solids is not None:
-                densities = density_solid_kernel(solver.discretisation, solver.topic)
-                self.bar.solids.add(context.launch, densities, *known, x=at["x_now"], bar=self._n_now_bar)
+            densities = partial(density_solid_kernel, solver.discretisation, solver.topic)
+            self.bar.solids.add(context.launch, densities, *known, x=at["x_now"], bar=self._n_now_bar)
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
