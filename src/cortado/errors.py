@@ -19,6 +19,11 @@ class InputError(CortadoError):
     """What the user gave is wrong; takes the sentence that says so. Exit code 2."""
 
 
+class OutOfRangeError(InputError):
+    """A parameter has a value with which there can be no run: out of its range, beyond what a precision holds, or a
+    place where no fluid can be. Where it is one of many points, the others are computed all the same."""
+
+
 class Words(str):
     """Words of a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
 
