@@ -120,6 +120,17 @@ class EngineMissingError(CortadoError, ImportError):
         )
 
 
+class ExtraMissingError(InputError, ImportError):
+    """A library that comes with an extra of Cortado is not installed. Exit code 2."""
+
+    def __init__(self, name: str, extra: str):
+        super().__init__(name, extra)
+
+    def __str__(self) -> str:
+        name, extra = self.args
+        return f"{name} is needed for that, but is not installed: pip install 'cortado-sph[{extra}]'."
+
+
 class LibraryMissingError(CortadoError, ImportError):
     """A library that Cortado can do without is not installed."""
 

@@ -201,6 +201,27 @@ def picture(
 
 
 @command(app)
+def export(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    to: Literal["usd", "glb", "ply", "obj", "vtp"],
+    out: Path | None = None,
+    every: int = 1,
+) -> Work:
+    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
+
+    Args:
+        run: The folder of the run.
+        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
+        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
+        every: Frames of the run from one that is written to the next.
+    """
+    require_at_least(1, every, "--every")
+    from cortado.cli.commands.export import export_run
+
+    return partial(export_run, run, to, out, every)
+
+
+@command(app)
 def view(
     path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
     overrides: Overrides = (),

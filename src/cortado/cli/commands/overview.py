@@ -8,6 +8,7 @@ _GROUPS = {
         ("cortado describe dam.toml", "particles, memory, time, what limits its time step"),
         ("cortado run dam.toml --out runs/dam", "run it; open runs/dam/report.html"),
         ("cortado picture runs/dam", "a shaded picture of it; --film for a film"),
+        ("cortado export runs/dam --to usd", "for Blender, Houdini; --to vtp for ParaView"),
         ("cortado view runs/dam", "play it in the browser; a scene runs there, live"),
         ("cortado examples", "list the examples; --copy NAME brings one here"),
     ),
