@@ -91,7 +91,7 @@ def assemble(out: Path, split: Mapping[str, Sequence[int]]) -> None:
                 temporary.replace(path)
             except RuntimeError as problem:  # so HDF5 says that the disk refused
                 raise ComputationError(
-                    f"{path} cannot be written: the disk is full, or refuses; free some space, and give the same command again."
+                    f"{path} cannot be written, as the disk refuses; free some space, and give the same command again."
                 ) from problem
             finally:
                 temporary.unlink(missing_ok=True)
