@@ -290,7 +290,7 @@ def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, qui
     assert cortado_command("dataset", file, "--runs", 5, "--out", "data")[0] == 0
     for change in (("--runs", 6), ("--runs", 5, "--set", "dataset.seed=1"), ("--runs", 5, "--precision", "float64")):
         code, _, err = cortado_command("dataset", file, *change, "--out", "data")
-        assert code == 2 and "holds a data set of another scene, table, number of runs or precision" in err
+        assert code == 2 and "holds a data set of another scene, table, number of runs, precision or version of" in err
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").touch()
     code, _, err = cortado_command("dataset", file, "--out", "mine")

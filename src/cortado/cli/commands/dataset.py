@@ -9,7 +9,7 @@ from typing import Any
 
 from cortado.cli.commands.executor import HERE, Where
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError
-from cortado.files.atomic import sentences, write_atomically
+from cortado.files.atomic import UNFINISHED, sentences, write_atomically
 from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import keeping
 from cortado.files.progress import track, untracked
@@ -23,6 +23,7 @@ from cortado.scene.scene import Scene, load_scene
 from cortado.scene.sentences import sentences as in_sentences
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
+from cortado.version import __version__
 from cortado.words import counted
 
 ASKED = "dataset.json"
@@ -78,7 +79,10 @@ def make_dataset(
         raise InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
     parts, absolute = Parts(member.out), member.out
     with locked(out):
+        for left_behind in absolute.glob(UNFINISHED):  # by a process that was killed
+            left_behind.unlink(missing_ok=True)
         if _is_complete(absolute, asked):
+            remove_parts(absolute)
             return f"The data set in {absolute} is complete already: {_sizes(read_json(absolute / METADATA))}."
         left = [number for number in range(runs) if parts.note(number) is None]
 
@@ -164,7 +168,8 @@ def _asked(member: Member, runs: int) -> dict[str, Any]:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
     scene_json = json.loads(_scene(member).to_json())
-    return {"scene": scene_json, "dataset": table.model_dump(mode="json"), "runs": runs, "precision": member.precision}
+    numbers = {"runs": runs, "precision": member.precision, "cortado": __version__}
+    return {"scene": scene_json, "dataset": table.model_dump(mode="json"), **numbers}
 
 
 def _scene(member: Member) -> Scene:
@@ -181,7 +186,8 @@ def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
     if note.exists():
         if read_json(note) != asked:
             raise InputError(
-                f"{out} holds a data set of another scene, table, number of runs or precision; choose another --out."
+                f"{out} holds a data set of another scene, table, number of runs, precision or version of Cortado; "
+                "choose another --out."
             )
         return (out / METADATA).exists()
     with sentences(out):
