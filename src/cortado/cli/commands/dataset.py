@@ -2,7 +2,8 @@
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,23 +101,32 @@ def make_dataset(
             advance(failed=len(failed))
 
         failed: list[int] = []
-        with keeping(kept):
-            try:
-                with (
-                    (where if left else HERE).executor(device, len(left)) as executor,
-                    track(len(left), "data set") as advance,
-                ):
-                    executor.map(member, left, note)
-                sizes, failures = _put_together(member, split)
-            except ComputationError as error:
-                raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
+        with (
+            (where if left else HERE).executor(device, len(left)) as executor,
+            keeping(kept),
+            _saying(kept),
+            track(len(left), "data set") as advance,
+        ):
+            executor.map(member, left, note)
+        there, notes, failures = _finished(parts, split)
+        with keeping(kept), _saying(kept):
+            sizes = _put_together(member, there, notes)
     _warn(told, failures, runs)
     return f"The data set is in {absolute}: {sizes}."
 
 
-def _put_together(member: Member, split: Mapping[str, range]) -> tuple[str, dict[int, str]]:
-    """Write the files of the data set; returns their sizes in words, and why runs failed, by their numbers."""
-    out, parts = member.out, Parts(member.out)
+@contextmanager
+def _saying(kept: Callable[[], str]) -> Iterator[None]:
+    """A disk that refuses is said together with what is ``kept``."""
+    try:
+        yield
+    except ComputationError as error:
+        raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
+
+
+def _finished(parts: Parts, split: Mapping[str, range]) -> tuple[dict[str, list[int]], dict[int, Any], dict[int, str]]:
+    """The numbers of the runs that there are for each purpose, what is noted of each, and why others failed; raises
+    `ComputationError` where a purpose has none."""
     notes = {number: parts.note(number) or {} for own in split.values() for number in own}
     failures = {number: note["failure"] for number, note in notes.items() if "failure" in note}
     there = {purpose: [number for number in own if number not in failures] for purpose, own in split.items()}
@@ -124,15 +134,20 @@ def _put_together(member: Member, split: Mapping[str, range]) -> tuple[str, dict
         if split[purpose] and not numbers:
             first = next(failures[number] for number in split[purpose])
             raise ComputationError(f"No run of those for {purpose} could be computed. The first: {first}")
-    good = {number: note for number, note in notes.items() if number not in failures}
+    return there, {number: note for number, note in notes.items() if number not in failures}, failures
+
+
+def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping[int, Any]) -> str:
+    """Write the files of the data set, of runs by purpose with what is noted of each; returns their sizes in words."""
+    out = member.out
     assemble(out, there)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        most = max(note["statistics"]["particles"] for note in good.values())
-        content = metadata(member.scene(min(good)), member.table, there, good, most)
+        most = max(note["statistics"]["particles"] for note in notes.values())
+        content = metadata(member.scene(min(notes)), member.table, there, notes, most)
     write_metadata(out, content)
     remove_parts(out)
-    return _sizes(content), failures
+    return _sizes(content)
 
 
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
