@@ -271,6 +271,11 @@ def test_a_dataset_has_names_and_units(tmp_path):
     rotor = found.sel(solid="my rotor")
     np.testing.assert_array_equal(rotor["solid_position"], trajectory().solids["my rotor"].positions)
     assert rotor["solid_velocity"].isnull().all() and rotor["solid_rotation"].attrs["units"] == "rad"
+    motion = trajectory().solids["my rotor"]
+    raft = replace(motion, velocities=motion.positions + 1.0, angular_velocities=motion.rotations)
+    both = replace(trajectory(), solids={"raft": raft, "my rotor": motion}).to_xarray()["solid_velocity"]
+    np.testing.assert_array_equal(both.sel(solid="raft"), motion.positions + 1.0)
+    assert both.sel(solid="my rotor").isnull().all()
     found.to_netcdf(tmp_path / "run.nc")
     with xarray.open_dataset(tmp_path / "run.nc") as again:
         assert again["position"].dims == ("time", "particle", "space") and again["position"].attrs["units"] == "m"

@@ -75,7 +75,7 @@ class _Writer:
         if self._surface is not None:
             self._begin_mesh(self._surface)
         self._poses: dict[str, tuple[Any, Any]] = {}
-        self._turns: dict[str, Points] = {}
+        self._first = float(codes[0])
         for solid in run.solids:
             form = geometry.Xform.Define(stage, f"/run/{solid.part}")
             self._poses[solid.name] = form.AddTranslateOp(), form.AddOrientOp(geometry.XformOp.PrecisionDouble)
@@ -93,7 +93,7 @@ class _Writer:
         for name, values in frame.fields.items():
             self._field(name, values).Set(self._floats(values), code)
         for solid in self._run.solids:
-            if solid.moves or solid.name not in self._turns:
+            if solid.moves or code == self._first:
                 own = code if solid.moves else self._pxr.Usd.TimeCode.Default()
                 self._set_pose(solid.name, frame.poses[solid.name], own)
 
@@ -127,8 +127,6 @@ class _Writer:
         from scipy.spatial.transform import Rotation
 
         turn = Rotation.from_matrix(pose.turn).as_quat()
-        turn = -turn if turn @ self._turns.get(name, turn) < 0.0 else turn  # the shorter way from the frame before
-        self._turns[name] = turn
         translate, orient = self._poses[name]
         gf = self._pxr.Gf
         translate.Set(gf.Vec3d(*pose.position), code)
