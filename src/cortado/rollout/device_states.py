@@ -58,6 +58,15 @@ class DeviceStates(HostStates):
         rollout.initial.assign(state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
+    def follow(self, rollout: Rollout, state: DeviceState) -> None:
+        """Give a rollout a first state, and leave its parameters as they are."""
+        self._require_own(state)
+        self._require_judged(state)
+        rollout.begin_evaluation()
+        rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
+        rollout.initial.assign(state.arrays)
+        rollout.step_sizes.begin_at(rollout.initial)
+
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
         """As `HostStates.state`, in arrays of its own."""
         each = zip(clocks_after(rollout, steps), rollout.origins, strict=True)

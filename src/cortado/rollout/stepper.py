@@ -1,7 +1,7 @@
 """Steps of a simulation as a function of a state and of parameters, with its derivatives."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.particles.state import Parameters, State
 from cortado.rollout.adjoint_step import AdjointStep
 from cortado.rollout.device_states import DeviceState, DeviceStates
@@ -89,6 +89,21 @@ class Stepper:
         """The state after the steps, on the device if the one before them is."""
         place = self._begin(state, self._checked(parameters))
         return place.state(self._rollout, self._forward(keep=False), self._rollout.steps)
+
+    @in_turn
+    def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
+        """As `advance`, with the parameters that the last call of it had but for these ``rows``, over time and of all
+        scenes of a batch (batch, steps, ...), which are not judged: what a controller of many scenes calls again and
+        again. All that `advance` was given over time has to be among them."""
+        place = DeviceStates(self._simulation)
+        place.follow(self._rollout, state)
+        self._rollout.parameters.set(rows)
+        return place.state(self._rollout, self._forward(keep=False), self._rollout.steps)
+
+    @property
+    def lost(self) -> Mapping[int, DivergedError]:
+        """Of a batch: the scenes that lost a particle in the last steps, by their number, and what happened."""
+        return self._rollout.lost
 
     @in_turn
     def step(
