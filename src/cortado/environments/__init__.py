@@ -19,7 +19,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def make_vec(task: str, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
+def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
     """So many environments of a task, such as "Carry", in one launch: what `gymnasium.make_vec` makes, with the
     arguments of `FluidVectorEnv` as ``settings``."""
     return FluidVectorEnv(task, num_envs, **settings)

@@ -12,8 +12,11 @@ from cortado.errors import InputError, shown
 TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Latte, Pour, Raft, Splash, Stir)}
 
 
-def task_named(name: str, size: str) -> Task:
-    """A task; raises `InputError` where there is none of that name or size."""
-    if name not in TASKS:
-        raise InputError(f"task is {shown(name)}, but must be one of {', '.join(TASKS)}.")
-    return TASKS[name](size)
+def task_of(task: str | Task, size: str) -> Task:
+    """A task by its name, in a size, or one of your own; raises `InputError` where there is none of that name or
+    size."""
+    if isinstance(task, Task):
+        return task
+    if not isinstance(task, str) or task not in TASKS:
+        raise InputError(f"task is {shown(task)}, but must be one of {', '.join(TASKS)}, or a Task.")
+    return TASKS[task](size)

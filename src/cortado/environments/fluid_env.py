@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.environments.catalogue import task_named
+from cortado.environments.catalogue import task_of
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import SEEN, Scenes
 from cortado.environments.spaces import METADATA, checked_actions, checked_render_mode, pictures, spaces
+from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError
 
@@ -23,17 +24,17 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
     def __init__(
         self,
-        task: str,
+        task: str | Task,
         size: str = "small",
         device: str = "cpu",
         precision: str = "float32",
         particles: int = SEEN,
         render_mode: str | None = None,
     ):
-        """``task``: its name, such as "Carry"; ``size`` "small" or "large"; ``particles``: how many are observed;
+        """``task``: its name, such as "Carry", in the ``size`` "small" or "large"; or a `Task` of your own; ``particles``: how many are observed;
         ``device`` and ``precision`` as those of `Simulation`; ``render_mode`` None or "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
-        self.scenes = Scenes(task_named(task, size), 1, device, precision, particles)
+        self.scenes = Scenes(task_of(task, size), 1, device, precision, particles)
         self.observation_space, self.action_space = spaces(self.scenes)
         self._over = "before the first one"
 

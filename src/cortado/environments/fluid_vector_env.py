@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import whole_number
-from cortado.environments.catalogue import task_named
+from cortado.environments.catalogue import task_of
 from cortado.environments.fluid_env import Info, Observation
 from cortado.environments.gym import AutoresetMode, VectorEnv, batch_space, np_random
 from cortado.environments.scenes import SEEN, Scenes, Start
 from cortado.environments.spaces import METADATA, checked_actions, checked_render_mode, pictures, spaces
+from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, shown
 
@@ -20,7 +21,7 @@ class FluidVectorEnv(VectorEnv):
 
     def __init__(
         self,
-        task: str,
+        task: str | Task,
         num_envs: int = 1,
         size: str = "small",
         device: str = "cpu",
@@ -34,15 +35,15 @@ class FluidVectorEnv(VectorEnv):
         ``max_episode_steps``: after how many steps an episode is truncated, at most the horizon of the task. Others as
         of `FluidEnv`."""
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
-        self.scenes = Scenes(task_named(task, size), self.num_envs, device, precision, particles)
-        self.single_observation_space, self.single_action_space = spaces(self.scenes)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
             wanted = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
             raise InputError(f"autoreset_mode is {shown(autoreset_mode)}, but must be one of {wanted}.") from None
+        self.scenes = Scenes(task_of(task, size), self.num_envs, device, precision, particles)
+        self.single_observation_space, self.single_action_space = spaces(self.scenes)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
         horizon = self.scenes.task.horizon
         most = horizon if max_episode_steps is None else whole_number("max_episode_steps", max_episode_steps, 1)
@@ -98,12 +99,12 @@ class FluidVectorEnv(VectorEnv):
         for b, sentence in lost.items():
             infos = self._add_info(infos, {"diverged": sentence}, b)
         if self._mode is AutoresetMode.SAME_STEP and self._over.any():
-            for b in np.flatnonzero(self._over).tolist():
+            over = self._over
+            for b in np.flatnonzero(over).tolist():
                 final = {"diverged": lost[b]} if b in lost else {}
                 infos = self._add_info(infos, {"final_obs": self._observations[b], "final_info": final}, b)
-            self._begin(self._over)
-            self._observe(self._over)
-            self._over = np.zeros(self.num_envs, dtype=bool)
+            self._begin(over)
+            self._observe(over)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

@@ -87,21 +87,25 @@ class Scenes:
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
         """Step all scenes with actions (scenes, a) from -1 to 1; returns the rewards (scenes,), and what happened to
         scenes that diverged, by their number. Such a scene has to begin anew before the next step."""
+        self.advance(actions)
+        rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number))
+        lost = {b: f"The episode ended in its step {self.step_number[b]}: {e}" for b, e in self._stepper.lost.items()}
+        for b in lost:  # as if every step that is left had the least reward: to end early is never worth it
+            rewards[b] = self.task.lowest * (self.task.horizon - self.step_number[b] + 1)
+        return rewards, lost
+
+    def advance(self, actions: NDArray) -> None:
+        """The steps of the simulation in a step of the environment."""
         task, rows = self.task, {}
         for k, (one, u) in enumerate(zip(task.actuators, split(task.actuators, actions), strict=True)):
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
-        with warnings.catch_warnings():  # of a loose pressure and of lost scenes, which are told of otherwise
+        with warnings.catch_warnings():  # of a loose pressure, and of lost scenes, which are told of otherwise
             warnings.simplefilter("ignore", CortadoWarning)
             if self._may_follow:
                 self.state = self._stepper.follow(self.state, rows)
             else:
                 self.state, self._may_follow = self._stepper.advance(self.state, rows), True
         self.step_number += 1
-        rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number))
-        lost = {b: f"The episode ended in its step {self.step_number[b]}: {e}" for b, e in self._stepper.lost.items()}
-        for b in lost:  # as if every step that is left had the least reward: to end early is never worth it
-            rewards[b] = task.lowest * (task.horizon - self.step_number[b] + 1)
-        return rewards, lost
 
     @property
     def parts(self) -> dict[str, NDArray]:

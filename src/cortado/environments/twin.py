@@ -12,12 +12,11 @@ from cortado.environments.scenes import Scenes
 from cortado.environments.spaces import checked_actions
 from cortado.gradients import GradientEstimator
 from cortado.losses import Frames
+from cortado.optimisation.fixed_parameters import FixedParameters
 from cortado.optimisation.transforms import Affine, Transformed
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays
 from cortado.simulation import Simulation
-
-FIRST = "initial_positions"
 
 
 class Twin:
@@ -32,7 +31,7 @@ class Twin:
         require_at_most("actions", count, task.horizon)
         require_at_most("number", whole_number("number", number, 0), len(scenes) - 1)
         start = scenes.starts[number]
-        self._actuators, self._start = task.actuators, {FIRST: start.positions}
+        self._actuators, self._start = task.actuators, {"initial_positions": start.positions}
         self.coordinates = {one.parameter: one.over(count, task.substeps, task.time_step) for one in task.actuators}
         """From the actions of each actuator to the parameter that it drives."""
         goal, m = start.goal[None], task.substeps
@@ -40,15 +39,16 @@ class Twin:
         single = Simulation(task.scene, simulation.device.alias, simulation.precision.name)
         self.problem = Problem(single, count * m, loss)
         """The loss as one of the parameters of the scene."""
-        self.search = Transformed(self.problem, self.coordinates)
+        fixed: Any = FixedParameters(self.problem, self._start)
+        self.search = Transformed(fixed, self.coordinates)
         """The loss as one of the actions, named by `named`: what `cortado.optimise` takes."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
         """(actions, a)"""
 
     def named(self, actions: Any) -> Arrays:
-        """Actions by the names of the parameters that they drive, with the first positions."""
+        """Actions by the names of the parameters that they drive."""
         parts = split(self._actuators, checked_actions("actions", actions, self.shape))
-        return {**self._start, **{one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}}
+        return {one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}
 
     def value(self, actions: Any) -> float:
         """Minus the return."""

@@ -51,7 +51,7 @@ class Splash(Task):
         return np.array([0.0]), np.array([1.5 * HALF])
 
     def reward(self, simulation: Simulation) -> Reward:
-        return Reward(((1.0, Share(Letter(), 2.0 * self.coarse_spacing)),))
+        return Reward(((1.0, Share(Letter(), self.coarse_spacing)),))
 
 
 @dataclass(frozen=True)
