@@ -70,7 +70,8 @@ def test_observations_are_what_the_layout_says(environments):
     assert np.array_equal(particles[:, 1], state["velocities"][chosen].astype(np.float32))
     x, y, cosine, sine, u, v, rate = seen[-1, layout["raft"]]
     assert np.allclose([x, y, u, v], np.ravel([state["raft.position"], state["raft.velocity"]]))
-    assert np.isclose(cosine**2 + sine**2, 1.0) and sine != 0.0 and rate == np.float32(state["raft.angular_velocity"][0])
+    assert np.isclose(cosine**2 + sine**2, 1.0) and sine != 0.0
+    assert rate == np.float32(state["raft.angular_velocity"][0])
     assert np.isclose(seen[-1, layout["progress"]], 3 / 40)
     paddle = state["paddle.position"][0, 0] - 0.11
     assert np.isclose(seen[-1, layout["paddle.displacement"]][0], paddle) and paddle != 0.0
@@ -251,7 +252,7 @@ def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
     ("settings", "sentence"),
     [
         ({"size": "huge"}, 'size is \'huge\', but must be "small" or "large"'),
-        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96"),
+        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96, all"),
         ({"particles": 2.5}, "particles is 2.5"),
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"num_envs": 0}, "num_envs"),
@@ -308,10 +309,8 @@ def test_terms_are_what_numpy_finds():
     lower, upper = np.array([-0.05, -0.04]), np.array([0.02, 0.03])
     angle = actions["cup.turn"][:, :, None]
     r = x - place
-    y = np.concatenate(
-        [np.cos(angle) * r[..., :1] + np.sin(angle) * r[..., 1:], np.cos(angle) * r[..., 1:] - np.sin(angle) * r[..., :1]],
-        axis=-1,
-    )
+    c, s, (r_x, r_y) = np.cos(angle), np.sin(angle), np.split(r, 2, axis=-1)
+    y = np.concatenate([c * r_x + s * r_y, c * r_y - s * r_x], axis=-1)
     squares = ((y - np.clip(y, lower, upper)) ** 2).sum(axis=-1)
     share = Share(OneBox(tuple(lower), tuple(upper)), 0.01, solid="cup").values(at)
     assert np.allclose(share, (1.0 / (1.0 + squares / 1e-4)).mean(axis=1), rtol=1e-12) and (share < 0.9).all()

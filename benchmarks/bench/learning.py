@@ -2,6 +2,8 @@
 
 import json
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,23 +16,18 @@ WARM = 3
 """Steps before those that are timed: they compile kernels, make room and capture graphs."""
 
 
-def bench_environments(task: str, scenes: int, size: str, steps: int, device: str, precision: str, as_json: bool) -> str:
+def bench_environments(
+    task: str, scenes: int, size: str, steps: int, device: str, precision: str, as_json: bool
+) -> str:
     """Particle-steps a millisecond, as text: of so many steps of the environment under random actions, and of those of
     the simulation alone, from the same states with the same actions."""
     envs = make_vec(task, scenes, size=size, device=device, precision=precision)
     envs.reset(seed=0)
     engine, simulation = envs.scenes, envs.scenes.simulation
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (WARM + steps, *envs.action_space.shape))
-    whole, bare = [], []
-    for number, action in enumerate(actions):
-        whole.append(_seconds(lambda action=action: envs.step(action), device))
-        if number % engine.task.horizon == engine.task.horizon - 1:
-            envs.reset()
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (WARM + steps, *np.shape(envs.action_space.sample())))
+    whole = [_seconds(partial(envs.step, action), device) for action in actions]
     envs.reset(seed=0)
-    for action in actions:
-        bare.append(_seconds(lambda action=action: engine.advance(action), device))
-        if not np.isfinite(engine.observed()).all():
-            envs.reset()
+    bare = [_seconds(partial(engine.advance, action), device) for action in actions]
     work = scenes * simulation.particles * engine.task.substeps
     around = environment()
     found: dict[str, Any] = {
@@ -47,7 +44,7 @@ def bench_environments(task: str, scenes: int, size: str, steps: int, device: st
     return json.dumps(found, indent=2) if as_json else _as_text(found)
 
 
-def _seconds(work: Any, device: str) -> float:
+def _seconds(work: Callable[[], Any], device: str) -> float:
     wp.synchronize_device(device)
     start = time.perf_counter()
     work()

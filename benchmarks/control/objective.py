@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from cortado import DivergedError, Problem
-from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator
+from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
 from cortado.optimisation.fixed_parameters import FixedParameters
 from cortado.optimisation.transforms import Transformed
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameters.values import Arrays
 
 from ..counting import Counted, Steps
 from .task import Task

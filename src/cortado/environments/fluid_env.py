@@ -31,11 +31,13 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         particles: int = SEEN,
         render_mode: str | None = None,
     ):
-        """``task``: its name, such as "Carry", in the ``size`` "small" or "large"; or a `Task` of your own; ``particles``: how many are observed;
-        ``device`` and ``precision`` as those of `Simulation`; ``render_mode`` None or "rgb_array"."""
+        """``task``: its name, such as "Carry", in the ``size`` "small" or "large"; or a `Task` of your own.
+        ``particles``: how many are observed; ``device`` and ``precision`` as those of `Simulation`; ``render_mode``
+        None or "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
         self.scenes = Scenes(task_of(task, size), 1, device, precision, particles)
-        self.observation_space, self.action_space = spaces(self.scenes)
+        self.observation_space, actions = spaces(self.scenes)
+        self.action_space, self._shape = actions, actions.shape
         self._over = "before the first one"
 
     @property
@@ -58,7 +60,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         Raises `InputError` for an action of another shape or that is not finite, and where no episode is going on."""
         if self._over:
             raise InputError(f"step is called {self._over}, but must come after reset().")
-        actions = checked_actions("action", action, self.action_space.shape)
+        actions = checked_actions("action", action, self._shape)
         rewards, lost = self.scenes.step(actions[None])
         if not lost:
             self._observation = self.scenes.observed()[0]

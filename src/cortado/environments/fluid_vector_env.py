@@ -41,7 +41,8 @@ class FluidVectorEnv(VectorEnv):
             wanted = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
             raise InputError(f"autoreset_mode is {shown(autoreset_mode)}, but must be one of {wanted}.") from None
         self.scenes = Scenes(task_of(task, size), self.num_envs, device, precision, particles)
-        self.single_observation_space, self.single_action_space = spaces(self.scenes)
+        self.single_observation_space, actions = spaces(self.scenes)
+        self.single_action_space, self._shape = actions, (num_envs, *actions.shape)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
@@ -67,12 +68,12 @@ class FluidVectorEnv(VectorEnv):
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             wanted = f"an array ({self.num_envs},) of bool that is not False throughout"
             raise InputError(f"reset_mask is {shown(mask)}, but must be {wanted}.")
-        seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, int) else seed
-        if seeds is not None and len(seeds) != self.num_envs:
+        seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        if len(seeds) != self.num_envs:
             raise InputError(f"seed has {len(seeds)} numbers, but must have {self.num_envs}, one for each environment.")
-        for b in np.flatnonzero(mask) if seeds is not None else ():
-            if seeds[b] is not None:
-                self._generators[b] = np_random(seeds[b])[0]
+        for b, own in enumerate(seeds):
+            if mask[b] and own is not None:
+                self._generators[b] = np_random(own)[0]
         self._begin(mask)
         self._observe(mask)
         return self._observations.copy(), {}
@@ -81,7 +82,7 @@ class FluidVectorEnv(VectorEnv):
         """As that of `FluidEnv`, for all. An episode that is over begins anew as the autoreset mode says: in the next
         step, in the place of its action; in the same step, with what it ended with in ``infos["final_obs"]`` and
         ``infos["final_info"]``; or only by `reset`."""
-        actions = checked_actions("actions", actions, self.action_space.shape)
+        actions = checked_actions("actions", actions, self._shape)
         if self._over.any() and self._mode is not AutoresetMode.NEXT_STEP:
             found = f"step is called after the end of the episode of environment {self._over.argmax()}"
             raise InputError(f"{found}, but must come after reset().")

@@ -23,12 +23,15 @@ class Reward:
     @WARP
     def values(self, at: StepEnd) -> NDArray:
         """(scenes,)"""
-        return self.constant + sum(weight * term.values(at) for weight, term in self.terms)
+        found = np.full(at.scenes, self.constant)
+        for weight, term in self.terms:
+            found += weight * term.values(at)
+        return found
 
     @WARP
     def adjoint(self, at: StepEnd, factor: float) -> State:
         """The derivative times ``factor``."""
-        bar, each = at.state.like(), np.full(len(at.step), factor)
+        bar, each = at.state.like(), np.full(at.scenes, factor)
         for weight, term in self.terms:
             term.adjoint(at, weight * each, bar)
         return bar

@@ -46,7 +46,9 @@ class Scenes:
         self._may_follow = False
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
         if not isinstance(seen, int) or not 0 <= seen <= n:
-            raise InputError(f"particles is {shown(seen)}, but must be a whole number from 0 to {n}, those of the scene.")
+            raise InputError(
+                f"particles is {shown(seen)}, but must be a whole number from 0 to {n}, those of the scene."
+            )
         self._seen = np.linspace(0, n - 1, seen).astype(int)
         self._jitters = (np.arange(n) < free)[:, None] * JITTER * task.spacing
         self.state: DeviceState = self._first
@@ -101,10 +103,9 @@ class Scenes:
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
         with warnings.catch_warnings():  # of a loose pressure, and of lost scenes, which are told of otherwise
             warnings.simplefilter("ignore", CortadoWarning)
-            if self._may_follow:
-                self.state = self._stepper.follow(self.state, rows)
-            else:
-                self.state, self._may_follow = self._stepper.advance(self.state, rows), True
+            found = (self._stepper.follow if self._may_follow else self._stepper.advance)(self.state, rows)
+        assert isinstance(found, DeviceState)
+        self.state, self._may_follow = found, True
         self.step_number += 1
 
     @property

@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 320, 200
 """Of pictures."""
 
 
-def spaces(scenes: Scenes) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces(scenes: Scenes) -> tuple[Any, Any]:
     """Of the observations and of the actions of one environment."""
     seen = scenes.observed().shape[1]
     actions = sum(len(one.axes) for one in scenes.task.actuators)
@@ -26,7 +26,7 @@ def spaces(scenes: Scenes) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Actions within -1 and 1; raises `InputError` for another shape and for what is not finite."""
+    """Actions of a shape, cut off at -1 and 1; raises `InputError` for another shape and for what is not finite."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")

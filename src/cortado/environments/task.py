@@ -4,7 +4,6 @@ An environment is one subclass in a file of `cortado.environments.tasks`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -86,11 +85,11 @@ class Task(ABC):
         """(g,), (g,) bounds within which goals of episodes are drawn."""
         return np.zeros(0), np.zeros(0)
 
-    def scene_of(self, container: Mapping[str, Any], **tables: Any) -> Scene:
+    def scene_of(self, **tables: Any) -> Scene:
         """A scene with what all have in common."""
         common: dict[str, Any] = {
             "name": self.name,
             "discretisation": {"spacing": self.spacing},
             "solver": {"kind": "projection", "time_step": self.time_step},
         }
-        return Scene(dimension=2, container=container, **{**common, **tables})
+        return Scene(dimension=2, **{**common, **tables})

@@ -19,6 +19,8 @@ from cortado.simulation import Simulation
 
 WIDTH, DEPTH, HEIGHT, WALL = 0.15, 0.1, 0.175, 0.05
 """Of the inside of the cup, of its water, of the cup above the floor of its inside, and of its walls [m]."""
+FLOOR = -0.15
+"""Height of what spilt water falls on: deeper than a corner of the cup ever is [m]."""
 FASTEST, TURNING = 0.8, 1.0
 """[m/s], [rad/s]"""
 
@@ -27,8 +29,8 @@ class Carry(Task):
     """Actions: velocity of the cup along x, and rate at which it leans. Goal: where its middle shall be."""
 
     name = "Carry"
-    horizon, repeats = 75, 5
-    coarse_spacing, coarse_step = 0.0125, 0.003
+    horizon, repeats = 75, 6
+    coarse_spacing, coarse_step = 0.0125, 0.0025
     lowest = -12.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the cup [m]",)
 
@@ -38,7 +40,7 @@ class Carry(Task):
         cup |= {"height": WALL + HEIGHT, "thickness": WALL, "motion": "path", "velocity": [0.0, 0.0]}
         reach = 1.1 * FASTEST * self.horizon * self.repeats * self.coarse_step
         return self.scene_of(
-            {"shape": "box", "lower": [-0.2 - reach, -0.3], "upper": [WIDTH + 0.2 + reach, 0.5]},
+            container={"shape": "box", "lower": [-0.2 - reach, FLOOR], "upper": [WIDTH + 0.2 + reach, 0.5]},
             phase=[WATER],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [WIDTH, DEPTH], "phase": "water"}],
             solid=[{**cup, "colour": [0.6, 0.6, 0.65]}],

@@ -46,7 +46,7 @@ class Latte(Task):
     def _poured(self, flow_rate: float) -> Scene:
         jet: dict[str, Any] = {"phase": "milk", "outlet": [0.0, HEIGHT], "radius": OPENING, "length": COLUMN}
         return self.scene_of(
-            {"shape": "box", "lower": [-RADIUS, 0.0], "upper": [RADIUS, 2.5 * DEPTH]},
+            container={"shape": "box", "lower": [-RADIUS, 0.0], "upper": [RADIUS, 2.5 * DEPTH]},
             phase=[{**one, "viscosity": 0.3} for one in (COFFEE, MILK)],
             fluid=[{"shape": "box", "lower": [-RADIUS, 0.0], "upper": [RADIUS, DEPTH], "phase": "coffee"}],
             emitter={**jet, "flow_rate": flow_rate},

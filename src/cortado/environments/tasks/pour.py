@@ -4,6 +4,8 @@ After PourWater of SoftGym (Lin et al. 2020), with its reward: the share of the 
 counts particles; here they count smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
 """
 
+from typing import Any
+
 from cortado.environments.actuators import Actuator, Velocity
 from cortado.environments.reward import Reward
 from cortado.environments.task import WATER, Task
@@ -28,11 +30,11 @@ class Pour(Task):
     @property
     def scene(self) -> Scene:
         cup = {"shape": "cup", "thickness": WALL, "colour": [0.6, 0.6, 0.65]}
-        jug = {"name": "jug", "base": [0.075, -0.05], "radius": 0.075, "height": 0.25}
-        glass = {"name": "glass", "base": [0.5 * (LOWER[0] + UPPER[0]), LOWER[1] - WALL]}
+        jug: dict[str, Any] = {"name": "jug", "base": [0.075, -0.05], "radius": 0.075, "height": 0.25}
+        glass: dict[str, Any] = {"name": "glass", "base": [0.5 * (LOWER[0] + UPPER[0]), LOWER[1] - WALL]}
         glass |= {"radius": 0.5 * (UPPER[0] - LOWER[0]), "height": UPPER[1] - LOWER[1] + WALL}
         return self.scene_of(
-            {"shape": "box", "lower": [-0.3, LOWER[1] - WALL], "upper": [0.7, 0.4]},
+            container={"shape": "box", "lower": [-0.3, LOWER[1] - WALL], "upper": [0.7, 0.4]},
             phase=[{**WATER, "name": "syrup", "viscosity": 0.3, "colour": [0.8, 0.45, 0.1]}],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.15, 0.125], "phase": "syrup"}],
             solid=[{**cup, **jug, "motion": "path", "angular_velocity": 0.0}, {**cup, **glass}],

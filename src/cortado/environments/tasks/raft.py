@@ -36,7 +36,7 @@ class Raft(Task):
         paddle = {"name": "paddle", "shape": "box", "lower": [0.06, -0.1], "upper": [0.16, 0.4]}
         raft = {"name": "raft", "shape": "box", "lower": [0.36, 0.15], "upper": [0.36 + LENGTH, 0.25]}
         return self.scene_of(
-            {"shape": "box", "lower": [-0.2, 0.0], "upper": [0.96, 0.5]},
+            container={"shape": "box", "lower": [-0.2, 0.0], "upper": [0.96, 0.5]},
             phase=[{**WATER, "viscosity": 0.1}],
             fluid=[{"shape": "box", "lower": [0.16, 0.0], "upper": [0.96, 0.2], "phase": "water"}],
             solid=[

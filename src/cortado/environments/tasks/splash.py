@@ -36,7 +36,7 @@ class Splash(Task):
     @property
     def scene(self) -> Scene:
         return self.scene_of(
-            {"shape": "box", "lower": [0.0, 0.0], "upper": [2.0 * HALF, 2.0 * HALF]},
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [2.0 * HALF, 2.0 * HALF]},
             phase=[WATER],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [HALF, HALF], "phase": "water"}],
             forces={"gravity": [0.0, -GRAVITY]},

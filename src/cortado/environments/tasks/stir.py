@@ -16,7 +16,7 @@ from cortado.simulation import Simulation
 
 WIDTH, DEPTH, MILKY = 0.08, 0.045, 0.02
 """Of the cup, of what is in it, and of the part whose left half is milk [m]."""
-SPOON, RADIUS, REACH, LAG = (0.04, 0.0225), 0.01, (0.018, 0.006), 0.1
+SPOON, RADIUS, REACH, LAG = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
 """Where the spoon begins, its radius, how far it can be sent [m], and how it follows [s]."""
 
 
@@ -24,8 +24,8 @@ class Stir(Task):
     """Actions: where the spoon, a disc in the plane, is sent to."""
 
     name = "Stir"
-    horizon, repeats = 50, 8
-    coarse_spacing, coarse_step = 0.005, 0.002
+    horizon, repeats = 50, 16
+    coarse_spacing, coarse_step = 0.005, 0.001
     lowest = -1.0
 
     @property
@@ -34,7 +34,7 @@ class Stir(Task):
         coffee, milk = {"shape": "box", "phase": "coffee"}, {"shape": "box", "phase": "milk"}
         spoon = {"name": "spoon", "shape": "sphere", "centre": SPOON, "radius": RADIUS, "slip": "no"}
         return self.scene_of(
-            {"shape": "box", "lower": [0.0, 0.0], "upper": [WIDTH, 1.8 * DEPTH]},
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [WIDTH, 1.8 * DEPTH]},
             phase=[COFFEE, MILK],
             fluid=[
                 {**coffee, "lower": [0.0, 0.0], "upper": [WIDTH, border]},
