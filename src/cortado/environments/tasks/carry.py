@@ -21,7 +21,7 @@ WIDTH, DEPTH, HEIGHT, WALL = 0.15, 0.1, 0.175, 0.05
 """Of the inside of the cup, of its water, of the cup above the floor of its inside, and of its walls [m]."""
 FLOOR = -0.15
 """Height of what spilt water falls on: deeper than a corner of the cup ever is [m]."""
-FASTEST, TURNING = 0.8, 1.0
+FASTEST, TURNING = 0.6, 1.0
 """[m/s], [rad/s]"""
 
 
