@@ -15,7 +15,7 @@ from cortado.environments.catalogue import TASKS
 from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
 
 SOME = ("Carry", "Latte", "Raft")
-"""Between them all solvers, an emitter, a solid on a path, and one that floats."""
+"""Between them an emitter, a solid on a path, and one that floats."""
 
 
 @pytest.fixture(scope="module")

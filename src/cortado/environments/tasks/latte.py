@@ -50,9 +50,6 @@ class Latte(Task):
             phase=[{**one, "viscosity": 0.3} for one in (COFFEE, MILK)],
             fluid=[{"shape": "box", "lower": [-RADIUS, 0.0], "upper": [RADIUS, DEPTH], "phase": "coffee"}],
             emitter={**jet, "flow_rate": flow_rate},
-            solver={"time_step": self.time_step, "minimum_iterations": 4, "maximum_iterations": 4},
-            discretisation={"spacing": self.spacing, "support": 2.0, "kernel": "cubic_spline"},
-            forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
         )
 
     @property
