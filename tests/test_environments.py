@@ -77,6 +77,30 @@ def test_observations_are_what_the_layout_says(environments):
     assert np.isclose(seen[-1, layout["paddle.displacement"]][0], paddle) and paddle != 0.0
 
 
+def test_sensors_are_observed_as_a_simulation_reads_them():
+    """Also that of the pressure, which follows from where solids are in the next step."""
+    sensors = {"probe": cortado.sensors.PressureProbe([0.5, 0.1]), "gauge": cortado.sensors.WaveGauge([0.7, 0.0])}
+    envs = cortado.environments.make_vec("Raft", 2, precision="float64", sensors=sensors)
+    first, _ = envs.reset(seed=1)
+    stepped = envs.step(np.ones((2, 1)))[0]
+    scenes, task = envs.scenes, envs.scenes.task
+    assert list(envs.layout)[-2:] == ["probe", "gauge"]
+    single, steps = Simulation(task.scene, precision="float64"), task.substeps
+    path = task.actuators[0].over(1, steps, task.time_step).parameter(np.ones((1, 1)))
+    for b, start in enumerate(scenes.starts):
+        for displacement, seen, at in ((np.zeros(2), first, 0), (path, stepped, -1)):
+            controls = {"initial_positions": start.positions, "paddle.displacement": displacement}
+            read = single.run(steps, controls, record_every=steps, sensors=sensors).sensors
+            expected = [read["probe"]["pressure"][at], read["gauge"]["height"][at]]
+            assert np.allclose(seen[b, -2:], expected, rtol=1e-6) and expected[0] > 10.0
+    broken(scenes, 1)
+    seen, _, terminated, _, _ = envs.step(np.ones((2, 1)))
+    assert terminated.tolist() == [False, True] and np.array_equal(seen[1], stepped[1]) and np.isfinite(seen).all()
+    for bad in ({"goal": sensors["gauge"]}, ["gauge"], {"gauge": 1}):
+        with pytest.raises(InputError, match="sensor"):
+            cortado.environments.make_vec("Raft", 2, sensors=bad)
+
+
 @pytest.mark.parametrize("name", SOME)
 def test_each_scene_of_a_batch_has_the_bits_of_a_single_one(environments, name):
     env, envs = environments(name), gymnasium.make_vec(f"cortado/{name}-v0", num_envs=2, precision="float64")
@@ -252,7 +276,7 @@ def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
     ("settings", "sentence"),
     [
         ({"size": "huge"}, 'size is \'huge\', but must be "small" or "large"'),
-        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96, all"),
+        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96"),
         ({"particles": 2.5}, "particles is 2.5"),
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"num_envs": 0}, "num_envs"),

@@ -40,13 +40,17 @@ class Actuator(ABC):
     def advance(self, now: NDArray, u: NDArray, steps: int, time_step: float) -> tuple[NDArray, NDArray]:
         """From `at_rest` or what this returned, and actions (members, a), to the same after so many steps of the
         simulation, and the parameter after each of them, (members, steps, d) or (members, steps)."""
-        q, last = now[:, 0], now[:, 1]
+        driven, last = [now[:, 0]], now[:, 1]
         wanted = np.array(self.greatest) * u
-        rows = np.tile(self.rest, (len(u), steps, 1)).astype(np.float64)
         for j in range(steps):
-            q = self.after(q, last + (wanted - last) * ((j + 1) / steps), time_step)
-            rows[:, j, self.axes] += q
-        return np.stack([q, wanted], axis=1), rows[:, :, 0] if self.is_number else rows
+            driven.append(self.after(driven[-1], last + (wanted - last) * ((j + 1) / steps), time_step))
+        return np.stack([driven[-1], wanted], axis=1), self.value(np.stack(driven[1:], axis=1))
+
+    def value(self, q: NDArray) -> NDArray:
+        """(..., d) or (...) the parameter, given the driven components (..., a)."""
+        found = np.tile(np.array(self.rest, dtype=np.float64), (*q.shape[:-1], 1))
+        found[..., self.axes] += q
+        return found[..., 0] if self.is_number else found
 
     def over(self, actions: int, steps: int, time_step: float) -> Affine:
         """The parameter over so many actions, each of so many steps of the simulation, as a function of the actions

@@ -1,5 +1,6 @@
 """One environment of Gymnasium's."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from cortado.environments.spaces import METADATA, checked_actions, checked_rende
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError
+from cortado.runs.sensors.sensor import Sensor
 
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
@@ -29,13 +31,14 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         device: str = "cpu",
         precision: str = "float32",
         particles: int = SEEN,
+        sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
     ):
         """``task``: its name, such as "Carry", in the ``size`` "small" or "large"; or a `Task` of your own.
-        ``particles``: how many are observed; ``device`` and ``precision`` as those of `Simulation`; ``render_mode``
-        None or "rgb_array"."""
+        ``particles``: how many are observed; ``sensors`` by name, such as those of `cortado.sensors`, are observed as
+        well; ``device`` and ``precision`` as those of `Simulation`; ``render_mode`` None or "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
-        self.scenes = Scenes(task_of(task, size), 1, device, precision, particles)
+        self.scenes = Scenes(task_of(task, size), 1, device, precision, particles, sensors)
         self.observation_space, actions = spaces(self.scenes)
         self.action_space, self._shape = actions, actions.shape
         self._over = "before the first one"

@@ -1,5 +1,6 @@
 """Many environments of one task in one launch."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from cortado.environments.spaces import METADATA, checked_actions, checked_rende
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, shown
+from cortado.runs.sensors.sensor import Sensor
 
 
 class FluidVectorEnv(VectorEnv):
@@ -27,6 +29,7 @@ class FluidVectorEnv(VectorEnv):
         device: str = "cpu",
         precision: str = "float32",
         particles: int = SEEN,
+        sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
@@ -40,7 +43,7 @@ class FluidVectorEnv(VectorEnv):
         except ValueError:
             wanted = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
             raise InputError(f"autoreset_mode is {shown(autoreset_mode)}, but must be one of {wanted}.") from None
-        self.scenes = Scenes(task_of(task, size), self.num_envs, device, precision, particles)
+        self.scenes = Scenes(task_of(task, size), self.num_envs, device, precision, particles, sensors)
         self.single_observation_space, actions = spaces(self.scenes)
         self.single_action_space, self._shape = actions, (num_envs, *actions.shape)
         self.observation_space = batch_space(self.single_observation_space, num_envs)

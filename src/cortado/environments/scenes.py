@@ -12,12 +12,14 @@ from cortado.device.launching import launch
 from cortado.device.threads import WARP
 from cortado.environments.actuators import split
 from cortado.environments.kernels import environment_kernels
+from cortado.environments.sensing import checked_sensors, readings
 from cortado.environments.task import JITTER, Task
 from cortado.environments.terms import StepEnd
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.stepper import Stepper
+from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.simulation import Simulation
 
@@ -38,12 +40,20 @@ class Start:
 class Scenes:
     """Scenes that are stepped together, each in an episode of its own."""
 
-    def __init__(self, task: Task, scenes: int, device: str, precision: str, seen: int):
+    def __init__(
+        self,
+        task: Task,
+        scenes: int,
+        device: str,
+        precision: str,
+        seen: int,
+        sensors: Mapping[str, Sensor] | None = None,
+    ):
         """``seen``: how many particles are observed, at most all."""
+        self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task, self.simulation = task, Simulation(task.scene, device, precision, batch=scenes)
         self.reward, self._stepper = task.reward(self.simulation), Stepper(self.simulation, task.substeps)
         self._first = self.simulation.on_device()
-        self._may_follow = False
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
         if not isinstance(seen, int) or not 0 <= seen <= n:
             raise InputError(
@@ -59,6 +69,12 @@ class Scenes:
         self._now = [one.at_rest(scenes) for one in task.actuators]
         self.starts: list[Start] = [Start(self.simulation.positions, self.goal[b]) for b in range(scenes)]
         """Of each scene's episode."""
+        self._lost: set[int] = set()
+        """Scenes that have diverged, and have no numbers."""
+        still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
+        with warnings.catch_warnings():  # see `advance`
+            warnings.simplefilter("ignore", CortadoWarning)
+            self._stepper.advance(self._first, still)  # so that other steps can follow
 
     def __len__(self) -> int:
         """Number of scenes."""
@@ -81,6 +97,7 @@ class Scenes:
                 own.assign(first.member(b))
             own.set({"positions": start.positions})
             self.starts[b], self.goal[b], self.step_number[b] = start, start.goal, 0
+            self._lost.discard(b)
             for now in self._now:
                 now[b] = 0.0
         scenes = [self._first.scenes[b] if b in starts else scene for b, scene in enumerate(self.state.scenes)]
@@ -91,9 +108,12 @@ class Scenes:
         scenes that diverged, by their number. Such a scene has to begin anew before the next step."""
         self.advance(actions)
         rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number))
-        lost = {b: f"The episode ended in its step {self.step_number[b]}: {e}" for b, e in self._stepper.lost.items()}
-        for b in lost:  # as if every step that is left had the least reward: to end early is never worth it
+        lost = {}
+        for b, error in self._stepper.rollout.lost.items():
+            lost[b] = f"The episode ended in its step {self.step_number[b]}: {error}"
+            # As if every step that is left had the least reward: to end early is never worth it.
             rewards[b] = self.task.lowest * (self.task.horizon - self.step_number[b] + 1)
+        self._lost = set(lost)
         return rewards, lost
 
     def advance(self, actions: NDArray) -> None:
@@ -103,9 +123,7 @@ class Scenes:
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
         with warnings.catch_warnings():  # of a loose pressure, and of lost scenes, which are told of otherwise
             warnings.simplefilter("ignore", CortadoWarning)
-            found = (self._stepper.follow if self._may_follow else self._stepper.advance)(self.state, rows)
-        assert isinstance(found, DeviceState)
-        self.state, self._may_follow = found, True
+            self.state = self._stepper.follow(self.state, rows)
         self.step_number += 1
 
     @property
@@ -115,10 +133,17 @@ class Scenes:
         now = {one.parameter: own for one, own in zip(task.actuators, self._now, strict=True)}
         free = {name: self._free(arrays, name) for name in task.free_solids}
         share = self.step_number[:, None] / task.horizon
-        return {"particles": self._particles(arrays), **now, **free, "goal": self.goal, "progress": share}
+        found = {"particles": self._particles(arrays), **now, **free, "goal": self.goal, "progress": share}
+        return {**found, **self._read(arrays)}
+
+    @property
+    def _driven(self) -> dict[str, NDArray]:
+        """The parameters that actions drive, as they are (scenes, 1, ...)."""
+        each = zip(self.task.actuators, self._now, strict=True)
+        return {one.parameter: one.value(now[:, None, 0]) for one, now in each}
 
     def observed(self) -> NDArray[np.float32]:
-        """(scenes, k) all of that."""
+        """(scenes, k) all of that; of scenes that have diverged it means nothing."""
         flat = [np.reshape(part, (len(self), -1)) for part in self.parts.values()]
         return np.concatenate(flat, axis=1, dtype=np.float32, casting="same_kind")
 
@@ -141,6 +166,14 @@ class Scenes:
         own = {"per": self.simulation.particles, "chosen": chosen, "x": x, "v": state.velocities, "seen": seen}
         launch(kernel, threads, x.device, **own)
         return seen.numpy()
+
+    def _read(self, state: State) -> dict[str, NDArray]:
+        """(scenes, k) of each sensor."""
+        if self._sensors and self._lost:  # so that all are numbers
+            state = state.copy()
+            for b in self._lost:
+                state.member(b).assign(self._first.arrays.member(b))
+        return readings(self._sensors, self.simulation, self._stepper.rollout, state, self._driven)
 
     def _free(self, state: State, name: str) -> NDArray:
         """(scenes, 7) of a free body the place, the cosine and the sine of its turn, the velocity and the rate."""

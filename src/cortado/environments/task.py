@@ -76,6 +76,11 @@ class Task(ABC):
     def actuators(self) -> tuple[Actuator, ...]:
         """What actions move; the numbers of an action are theirs, in this order."""
 
+    @property
+    def driven(self) -> list[str]:
+        """Names of the parameters that actions drive."""
+        return [one.parameter for one in self.actuators]
+
     @abstractmethod
     def reward(self, simulation: Simulation) -> Reward:
         """Of a step, given a simulation of the scene."""
