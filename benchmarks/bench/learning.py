@@ -25,7 +25,7 @@ def bench_environments(
     envs.reset(seed=0)
     engine, simulation = envs.scenes, envs.scenes.simulation
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (WARM + steps, *np.shape(envs.action_space.sample())))
-    whole, bare = [], []
+    whole, bare = list[float](), list[float]()
     for action in actions:
         for work, times in ((envs.step, whole), (engine.advance, bare)):
             times.append(_seconds(partial(work, action), device))
