@@ -326,9 +326,12 @@ def test_steps_before_the_first_episode_and_other_bad_calls(environments):
 
 
 def test_pictures(environments):
-    env = gymnasium.make("cortado/Stir-v0", render_mode="rgb_array")
+    env = environments("Carry").unwrapped
+    assert env.render() is None
+    env.render_mode = "rgb_array"
     env.reset(seed=1)
     picture = env.render()
+    env.render_mode = None
     assert picture.shape == (200, 320, 3) and picture.dtype == np.uint8 and picture.std() > 10.0
 
 

@@ -91,11 +91,12 @@ class Scenes:
         arrays, first = self.state.arrays.copy(), self._first.arrays
         if len(starts) == len(self):
             arrays.assign(first)
+            arrays.set({"positions": np.stack([starts[b].positions for b in range(len(self))])})
         for b, start in starts.items():
-            own = arrays.member(b)
             if len(starts) < len(self):
+                own = arrays.member(b)
                 own.assign(first.member(b))
-            own.set({"positions": start.positions})
+                own.set({"positions": start.positions})
             self.starts[b], self.goal[b], self.step_number[b] = start, start.goal, 0
             self._lost.discard(b)
             for now in self._now:
