@@ -71,7 +71,10 @@ class FluidVectorEnv(VectorEnv):
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             wanted = f"an array ({self.num_envs},) of bool that is not False throughout"
             raise InputError(f"reset_mask is {shown(mask)}, but must be {wanted}.")
-        seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seeds = [None if seed is None else int(seed) + b for b in range(self.num_envs)]
+        else:
+            seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise InputError(f"seed has {len(seeds)} numbers, but must have {self.num_envs}, one for each environment.")
         for b, own in enumerate(seeds):
@@ -122,8 +125,7 @@ class FluidVectorEnv(VectorEnv):
     def _begin(self, which: NDArray) -> dict[int, Start]:
         """Begin new episodes of some environments, (num_envs,) bool."""
         starts = {b: self.scenes.drawn(self._generators[b]) for b in np.flatnonzero(which).tolist()}
-        if starts:
-            self.scenes.begin(starts)
+        self.scenes.begin(starts)
         self._over = self._over & ~which
         return starts
 

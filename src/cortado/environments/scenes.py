@@ -88,6 +88,8 @@ class Scenes:
     @WARP
     def begin(self, starts: Mapping[int, Start]) -> None:
         """Begin episodes of some scenes, by their number."""
+        if not starts:
+            return
         arrays, first = self.state.arrays.copy(), self._first.arrays
         if len(starts) == len(self):
             arrays.assign(first)
