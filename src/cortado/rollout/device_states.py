@@ -69,10 +69,15 @@ class DeviceStates(HostStates):
 
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
         """As `HostStates.state`, in arrays of its own."""
-        each = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
-        scenes = tuple(RestartState({}, clock, origin) for clock, origin in each)
-        self._simulation.judged_states.update(scene for b, scene in enumerate(scenes) if b not in rollout.lost)
-        return DeviceState(_without_lost(rollout, state.copy()), scenes)
+        made: dict[tuple[int, int, bool], RestartState] = {}
+        """One for all scenes of a clock and an origin: a batch has hundreds."""
+        keys = []
+        for b, (clock, origin) in enumerate(zip(clocks_after(rollout, steps), rollout.origins, strict=True)):
+            keys.append((id(clock), id(origin), b in rollout.lost))
+            if keys[-1] not in made:
+                made[keys[-1]] = RestartState({}, clock, origin)
+        self._simulation.judged_states.update(scene for (*_, is_lost), scene in made.items() if not is_lost)
+        return DeviceState(_without_lost(rollout, state.copy()), tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         """As `HostStates.write`."""
