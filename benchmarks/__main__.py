@@ -49,5 +49,32 @@ def bench(
         return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
 
 
+@command(app, answers=True)
+def environments(
+    task: str = "Carry",
+    scenes: int = 256,
+    size: Literal["small", "large"] = "large",
+    steps: int = 20,
+    device: str = "cpu",
+    precision: str = "float32",
+    json: Flag = False,
+) -> Work:
+    """Time steps of a batch of environments under random actions, beside those of the simulation alone.
+
+    Args:
+        task: Such as "Carry".
+        scenes: Environments in the batch.
+        size: "small", with about 100 particles each, or "large", with about 1,000.
+        steps: Steps of the environments that are timed; their median counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        json: Print JSON for machines instead of a sentence.
+    """
+    require_at_least(1, steps, "--steps")
+    from benchmarks.bench.learning import bench_environments
+
+    return partial(bench_environments, task, scenes, size, steps, device, precision, json)
+
+
 if __name__ == "__main__":
     main(program=BENCH)

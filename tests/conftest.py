@@ -101,6 +101,14 @@ SLOW_TESTS = {
         "test_what_is_done_is_not_repeated",
     },
     "test_driver": {"test_an_old_driver_is_told"},
+    "test_environments": {
+        "test_estimators_go_through_the_twin",
+        "test_gymnasium_has_nothing_to_say_of_the_others",
+        "test_sensors_are_observed_as_a_simulation_reads_them",
+        "test_so_it_is_of_the_others",
+        "test_the_twin_in_jax",
+        "test_the_twin_in_torch",
+    },
     "test_estimators": {
         "test_a_mistake_is_a_sentence",
         "test_a_viscosity_keeps_the_adjoint_of_a_long_run_from_growing",

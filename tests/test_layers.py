@@ -45,7 +45,7 @@ def imports(source: str, module: str, known: set[str]) -> set[str]:
 
 
 MODULES = modules()
-MOST_PACKAGES = 16
+MOST_PACKAGES = 17
 
 
 def above(sources: dict[str, str]) -> dict[str, set[str]]:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from cortado import DivergedError, Problem
-from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator
+from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
+from cortado.optimisation.fixed_parameters import FixedParameters
 from cortado.optimisation.transforms import Transformed
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameters.values import Arrays
 
 from ..counting import Counted, Steps
 from .task import Task
@@ -45,7 +46,7 @@ class Objective:
         self.fixed = fixed
         """Parameters in the place of the scene's, such as the seed's first positions."""
         self._changed = np.arange(start.size) >= (1.0 - late) * start.size
-        counted: Any = Counted(Fixed(self.inner, fixed), self.inner.steps, self.steps)
+        counted: Any = Counted(FixedParameters(self.inner, fixed), self.inner.steps, self.steps)
         self.problem = Transformed(counted, {self._name: self.task.controls.mapping})
         self.curve: list[tuple[float, float]] = []
         """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
@@ -137,43 +138,6 @@ class Objective:
         """Raises `BudgetSpent`."""
         if self.steps.cost >= self.budget:
             raise BudgetSpent
-
-
-class Fixed:
-    """A problem some of whose parameters, first positions among them, replace those of the scene."""
-
-    def __init__(self, problem: Problem, fixed: Arrays):
-        self._problem, self._fixed = problem, fixed
-        self.simulation = _Simulation(problem, fixed["initial_positions"])
-
-    def value(self, parameters: Values) -> Any:
-        return self._problem.value(self._all(parameters))
-
-    def forward_pass(self, parameters: Values) -> ForwardPass:
-        return self._problem.forward_pass(self._all(parameters))
-
-    def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Batchable.room`."""
-        return self._problem.room(estimator)
-
-    def together(
-        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
-    ) -> list[Estimate | DivergedError]:
-        """See `Batchable.together`."""
-        return self._problem.together([self._all(point) for point in points], estimator)
-
-    def _all(self, parameters: Values) -> Values:
-        return {**self._fixed, **parameters}
-
-
-class _Simulation:
-    """A simulation with other first positions, as ensembles look at it."""
-
-    batch = None
-
-    def __init__(self, problem: Problem, initial_positions: np.ndarray):
-        self.scene, self.positions = problem.simulation.scene, initial_positions
-        self.precision, self.known = problem.simulation.precision, problem.simulation.known
 
 
 def first_positions(problem: Problem, seed: int) -> Arrays:

@@ -163,7 +163,8 @@ class PaddlePath:
 
     def bijector(self, simulation: Simulation, steps: int) -> Bijector:
         block = np.arange(steps) * self.blocks // steps
-        return Linear(simulation.scene.solver.time_step * np.cumsum(np.eye(self.blocks)[block], axis=0))
+        time_step = simulation.scene.solver.fixed_time_step("a path in blocks")
+        return Linear(time_step * np.cumsum(np.eye(self.blocks)[block], axis=0))
 
     def drawn(self, simulation: Simulation, steps: int, random: np.random.Generator) -> np.ndarray:
         return SCATTER * self.spread(simulation) * random.standard_normal((self.blocks, simulation.dimension))

@@ -134,10 +134,12 @@ class ExtraMissingError(InputError, ImportError):
 class LibraryMissingError(CortadoError, ImportError):
     """A library that Cortado can do without is not installed."""
 
-    def __init__(self, name: str, package: str):
-        super().__init__(name, package)
+    def __init__(self, name: str, package: str, module: str | None = None):
+        """``module`` of Cortado that needs it, by default the one with the name of the package."""
+        super().__init__(name, package, module)
         self.package = package
         """What it is installed as."""
 
     def __str__(self) -> str:
-        return f"{self.args[0]} is not installed, which cortado.{self.package} needs: pip install {self.package}"
+        name, package, module = self.args
+        return f"{name} is not installed, which cortado.{module or package} needs: pip install {package}"

@@ -58,12 +58,26 @@ class DeviceStates(HostStates):
         rollout.initial.assign(state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
+    def follow(self, rollout: Rollout, state: DeviceState) -> None:
+        """Give a rollout a first state, and leave its parameters as they are."""
+        self._require_own(state)
+        self._require_judged(state)
+        rollout.begin_evaluation()
+        rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
+        rollout.initial.assign(state.arrays)
+        rollout.step_sizes.begin_at(rollout.initial)
+
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
         """As `HostStates.state`, in arrays of its own."""
-        each = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
-        scenes = tuple(RestartState({}, clock, origin) for clock, origin in each)
-        self._simulation.judged_states.update(scene for b, scene in enumerate(scenes) if b not in rollout.lost)
-        return DeviceState(_without_lost(rollout, state.copy()), scenes)
+        made: dict[tuple[int, int, bool], RestartState] = {}
+        """One for all scenes of a clock and an origin: a batch has hundreds."""
+        keys = []
+        for b, (clock, origin) in enumerate(zip(clocks_after(rollout, steps), rollout.origins, strict=True)):
+            keys.append((id(clock), id(origin), b in rollout.lost))
+            if keys[-1] not in made:
+                made[keys[-1]] = RestartState({}, clock, origin)
+        self._simulation.judged_states.update(scene for (*_, is_lost), scene in made.items() if not is_lost)
+        return DeviceState(_without_lost(rollout, state.copy()), tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         """As `HostStates.write`."""

@@ -117,6 +117,10 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 
 
 def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
-    """Of each scene of a rollout, after so many steps."""
+    """Of each scene of a rollout, after so many steps. Scenes with one clock keep having one."""
+    made: dict[tuple[int, float], Clock] = {}
+    for clock, size in zip(rollout.clocks, rollout.time_steps.tolist(), strict=True):
+        if (id(clock), size) not in made:
+            made[id(clock), size] = clock.after(steps, size)
     each = zip(rollout.clocks, rollout.time_steps.tolist(), strict=True)
-    return [clock.after(steps, size) for clock, size in each]
+    return [made[id(clock), size] for clock, size in each]

@@ -56,25 +56,26 @@ class Stepper:
     def __init__(self, simulation: Steppable, steps: int):
         """``steps`` may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
-        self._rollout = Rollout(simulation.solver, steps)
+        self.rollout = Rollout(simulation.solver, steps)
+        """What takes the steps, with the parameters of the last ones."""
 
     @property
     def turn(self) -> Turn:
         """What a thread holds that uses the simulation."""
-        return self._rollout.turn
+        return self.rollout.turn
 
     @in_turn
     def first(self, parameters: Values | None = None) -> States:
         """The state before the first step of a run with these parameters."""
-        self._space.begin(self._rollout, self._checked(parameters))
-        return HostStates(self._simulation).state(self._rollout, self._rollout.initial, 0)
+        self._space.begin(self.rollout, self._checked(parameters))
+        return HostStates(self._simulation).state(self.rollout, self.rollout.initial, 0)
 
     @in_turn
     def on_device(self, state: Given | DeviceState, fields: Values, parameters: Values | None = None) -> DeviceState:
         """A state of a run with these parameters in arrays of its own on the device, with other ``fields``."""
         values, place = self._checked(parameters), DeviceStates(self._simulation)
         self._begin(state, values)
-        found = place.state(self._rollout, self._rollout.initial, 0)
+        found = place.state(self.rollout, self.rollout.initial, 0)
         return place.replaced(self._space, found, fields) if fields else found
 
     @in_turn
@@ -88,7 +89,17 @@ class Stepper:
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
         """The state after the steps, on the device if the one before them is."""
         place = self._begin(state, self._checked(parameters))
-        return place.state(self._rollout, self._forward(keep=False), self._rollout.steps)
+        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
+
+    @in_turn
+    def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
+        """As `advance`, with the parameters that the last call of it had but for these ``rows``, over time and of all
+        scenes of a batch (batch, steps, ...), which are not judged: what a controller of many scenes calls again and
+        again. All that `advance` was given over time has to be among them."""
+        place = DeviceStates(self._simulation)
+        place.follow(self.rollout, state)
+        self.rollout.parameters.set(rows)
+        return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
 
     @in_turn
     def step(
@@ -102,8 +113,8 @@ class Stepper:
         """
         values = self._checked(parameters)
         place = self._begin(state, values, {*values, *self._space.checked_names("along", along)})
-        last = place.state(self._rollout, self._forward(keep=True), self._rollout.steps)
-        return last, StepResidual(Residual(self._rollout), values, place)
+        last = place.state(self.rollout, self._forward(keep=True), self.rollout.steps)
+        return last, StepResidual(Residual(self.rollout), values, place)
 
     @in_turn
     def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], Arrays]:
@@ -115,7 +126,7 @@ class Stepper:
         all else that is returned is in float64. A batch has a first axis for the scenes. Raises `InputError` for fields
         that the state does not have, or that have other shapes.
         """
-        rollout, space, place = self._rollout, self._space, self._place_of(residual)
+        rollout, space, place = self.rollout, self._space, self._place_of(residual)
         times = place.write("state_bar", state_bar, self._bar)
         values = self._brought_back(residual)
         first = rollout.backward(self._adjoint, {rollout.steps: self._bar})
@@ -131,7 +142,7 @@ class Stepper:
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
         """Forward mode: from tangents of the state before the steps and of any parameters that it does not hold to that
         of the state after them; as `vjp` takes and returns adjoints."""
-        rollout, space, place = self._rollout, self._space, self._place_of(residual)
+        rollout, space, place = self.rollout, self._space, self._place_of(residual)
         along = space.checked({} if parameter_dots is None else parameter_dots, "direction")
         space.check_directions(along)
         dot, parameters_dot = self._dots
@@ -153,7 +164,7 @@ class Stepper:
         return times[0] if self._simulation.batch is None else times
 
     def _place_of(self, residual: StepResidual) -> HostStates:
-        if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self._rollout:
+        if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self.rollout:
             raise InputError(f"residual is {shown(residual)}, but must be one that this stepper's step returned.")
         return residual.place
 
@@ -164,22 +175,22 @@ class Stepper:
 
     @cached_property
     def _bar(self) -> State:
-        return self._rollout.solver.new_state()
+        return self.rollout.solver.new_state()
 
     @cached_property
     def _dots(self) -> tuple[State, Parameters]:
-        return self._rollout.solver.new_state(), self._rollout.solver.new_parameters(self._rollout.steps)
+        return self.rollout.solver.new_state(), self.rollout.solver.new_parameters(self.rollout.steps)
 
     @cached_property
     def _adjoint(self) -> BackwardStep:
-        solver = self._rollout.solver
-        require(solver.gradient_memory(self._rollout.log), "take a larger spacing", solver.device)
-        return AdjointStep(self._rollout, solver.adjoint(self._rollout.steps))
+        solver = self.rollout.solver
+        require(solver.gradient_memory(self.rollout.log), "take a larger spacing", solver.device)
+        return AdjointStep(self.rollout, solver.adjoint(self.rollout.steps))
 
     def _begin(self, state: Given | DeviceState, values: Arrays, varied: Iterable[str] = ()) -> HostStates:
         """Give the rollout a first state and parameters; returns where the state is."""
         place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
-        place.begin(self._space, self._rollout, state, values, set(varied))
+        place.begin(self._space, self.rollout, state, values, set(varied))
         return place
 
     def _checked(self, parameters: Values | None) -> Arrays:
@@ -187,7 +198,7 @@ class Stepper:
 
     def _forward(self, keep: bool) -> State:
         """Take the steps; ``keep`` checkpoints for a way back. Warnings and errors as of `Simulation.run`."""
-        last = self._rollout.forward(keep=keep)
-        for sentence in trouble(self._rollout, self._simulation.scene):
+        last = self.rollout.forward(keep=keep)
+        for sentence in trouble(self.rollout, self._simulation.scene):
             warnings.warn(sentence, CortadoWarning, stacklevel=6)
         return last

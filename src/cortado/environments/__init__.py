@@ -1,0 +1,35 @@
+"""Environments of Gymnasium with fluids in them: see `docs/environments.md`.
+
+The import registers them, for ``gymnasium.make("cortado/Carry-v0")`` and ``gymnasium.make_vec``.
+"""
+
+from typing import Any
+
+from cortado.environments.catalogue import TASKS
+from cortado.environments.fluid_env import FluidEnv
+from cortado.environments.fluid_vector_env import FluidVectorEnv
+from cortado.environments.gym import gymnasium
+from cortado.environments.task import Task
+from cortado.environments.twin import Twin
+
+__all__ = ["FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
+    """So many environments of a task, such as "Carry", in one launch: what `gymnasium.make_vec` makes, with the
+    arguments of `FluidVectorEnv` as ``settings``."""
+    return FluidVectorEnv(task, num_envs, **settings)
+
+
+for _name, _task in TASKS.items():
+    gymnasium.register(
+        f"cortado/{_name}-v0",
+        entry_point="cortado.environments.fluid_env:FluidEnv",
+        vector_entry_point="cortado.environments.fluid_vector_env:FluidVectorEnv",
+        max_episode_steps=_task.horizon,
+        kwargs={"task": _name},
+    )

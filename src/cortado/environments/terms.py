@@ -1,0 +1,248 @@
+"""What rewards are made of: numbers of a state, each with its derivative. All are computed for all scenes at once, and
+sums over particles stay on the device."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.launching import add, launch, sum_of
+from cortado.environments.kernels import EnvironmentKernels, environment_kernels
+from cortado.losses.loss import precision_of
+from cortado.particles.arrays import padded, to_device
+from cortado.particles.state import State
+from cortado.scene.motions import AXES, position_name, turn_name
+
+
+@dataclass(frozen=True, eq=False)
+class StepEnd:
+    """The states of all scenes after a step of the environment."""
+
+    state: State
+    """(scenes n,)"""
+    goal: NDArray
+    """(scenes, g) what each scene is to reach."""
+    step: NDArray
+    """(scenes,) which step of its episode it is, counted from 1."""
+
+    @property
+    def scenes(self) -> int:
+        """How many there are."""
+        return len(self.step)
+
+    @property
+    def per(self) -> int:
+        """Particles of a scene."""
+        return len(self.state.positions) // self.scenes
+
+
+class Term(Protocol):
+    """A part of a reward."""
+
+    def values(self, at: StepEnd) -> NDArray:
+        """(scenes,)"""
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        """Add the derivative times ``factor`` (scenes,) to an adjoint of the states."""
+
+
+Boxes = Callable[[NDArray], tuple[NDArray, NDArray]]
+"""From goals (scenes, g) to lower and upper corners (scenes, boxes, d) [m]."""
+
+
+@dataclass(frozen=True)
+class OneBox:
+    """The same box, whatever the goal."""
+
+    lower: tuple[float, ...]
+    """[m]"""
+    upper: tuple[float, ...]
+    """[m]"""
+
+    def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
+        lower, upper = (np.tile(corner, (len(goal), 1, 1)) for corner in (self.lower, self.upper))
+        return lower, upper
+
+
+class OverParticles:
+    """A term that is a sum over particles."""
+
+    def __init__(self, *given: Any):
+        """``given``: what it is made from."""
+        self._given = given
+        self._made: dict[Any, Any] = {}
+        """Sums, and arrays on devices."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return type(self), self._given
+
+    def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
+        """What is made once for a device, a precision and a number of scenes."""
+        key = key, str(at.state.positions.device), at.state.positions.dtype, at.scenes
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
+
+    def _total(self, at: StepEnd, value: wp.array) -> NDArray:
+        """(scenes,)"""
+        count = value.size // at.scenes
+        total = self._kept(count, at, lambda: sum_of(wp.float64, count, value.device, at.scenes))
+        return total(value.flatten()).numpy().copy()
+
+
+class Share(OverParticles):
+    """The share of the fluid that is in some boxes, each particle counted by 1 / (1 + e^2 / w^2), where e is its
+    distance to the nearest box: 1 within, a half at the distance w, so that there is a gradient everywhere."""
+
+    def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
+        """``width`` w [m]; ``solid``: on whose middle boxes are placed, and with which they turn, in the plane."""
+        super().__init__(boxes, width, solid)
+        self._boxes, self._width, self._solid = boxes, width, solid
+
+    def values(self, at: StepEnd) -> NDArray:
+        x, value = at.state.positions, _empty(at, at.scenes * at.per)
+        launch(_kernels(at).share, len(x), x.device, **self._where(at), x=x, value=value)
+        return self._total(at, value) / at.per
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        x = at.state.positions
+        place_bar, turn_bar = wp.empty_like(x), wp.empty(len(x), dtype=precision_of(at.state).real, device=x.device)
+        own = {"factor": _reals(at, factor / at.per), "x_bar": bar.positions}
+        own |= {"x": x, "place_bar": place_bar, "turn_bar": turn_bar}
+        launch(_kernels(at).share_adjoint, len(x), x.device, **self._where(at), **own)
+        if self._solid is not None:
+            for name, bars in ((position_name(self._solid), place_bar), (turn_name(self._solid), turn_bar)):
+                add(sum_of(bars.dtype, at.per, x.device, at.scenes)(bars), bar[name])
+
+    def _where(self, at: StepEnd) -> dict[str, Any]:
+        lower, upper = (_vectors(at, corners) for corners in self._boxes(at.goal))
+        if self._solid is None:
+            fixed = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
+        else:
+            fixed = at.state[position_name(self._solid)], at.state[turn_name(self._solid)]
+        found = {"per": at.per, "width": self._width, "lower": lower, "upper": upper}
+        return {**found, "place": fixed[0], "turn": fixed[1]}
+
+
+class Spread(OverParticles):
+    """The mean distance of all pairs of some particles, component by component, |dx| + |dy|, over ``everywhere``."""
+
+    def __init__(self, chosen: NDArray, everywhere: float):
+        """``chosen`` (m,) numbers of particles; ``everywhere`` [m]."""
+        super().__init__(chosen, everywhere)
+        self._chosen, self._pairs = chosen, len(chosen) ** 2 * everywhere
+
+    def values(self, at: StepEnd) -> NDArray:
+        value = _empty(at, at.scenes, len(self._chosen))
+        self._launch(_kernels(at).apart, at, value=value)
+        return self._total(at, value) / self._pairs
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        by_pair = _reals(at, factor / self._pairs)
+        self._launch(_kernels(at).apart_adjoint, at, factor=by_pair, x_bar=bar.positions)
+
+    def _launch(self, kernel: Any, at: StepEnd, **arguments: Any) -> None:
+        x = at.state.positions
+        chosen = self._kept("chosen", at, lambda: wp.array(self._chosen, dtype=wp.int32, device=x.device))
+        launch(kernel, (at.scenes, len(chosen)), x.device, per=at.per, chosen=chosen, x=x, **arguments)
+
+
+class Missed(OverParticles):
+    """The squared distances of particles to targets that change from step to step, each times a weight, added up."""
+
+    def __init__(self, targets: NDArray, weights: NDArray):
+        """``targets`` (steps, n, d) [m], those of step k, counted from 1, at k - 1; ``weights`` (steps, n)."""
+        super().__init__(targets, weights)
+        self._targets, self._weights = targets, weights
+
+    def values(self, at: StepEnd) -> NDArray:
+        value = _empty(at, at.scenes * at.per)
+        self._launch(_kernels(at).missed, at, value=value)
+        return self._total(at, value)
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        self._launch(_kernels(at).missed_adjoint, at, factor=_reals(at, factor), x_bar=bar.positions)
+
+    def _launch(self, kernel: Any, at: StepEnd, **arguments: Any) -> None:
+        x = at.state.positions
+        target, weight = self._kept("targets", at, lambda: (_vectors(at, self._targets), _reals(at, self._weights)))
+        step = wp.array(np.clip(at.step, 1, len(self._targets)) - 1, dtype=wp.int32, device=x.device)
+        launch(kernel, len(x), x.device, per=at.per, step=step, target=target, weight=weight, x=x, **arguments)
+
+
+@dataclass(frozen=True)
+class Distance:
+    """|x - x*| [m]: how far the middle of a solid is from its goal along the first axis."""
+
+    solid: str
+
+    def values(self, at: StepEnd) -> NDArray:
+        return np.abs(self._miss(at))
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        _add(bar, position_name(self.solid), factor[:, None] * np.sign(self._miss(at))[:, None] * [1.0, 0.0])
+
+    def _miss(self, at: StepEnd) -> NDArray:
+        return _numbers(at.state, position_name(self.solid))[:, 0] - at.goal[:, 0]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """(x - x*)^2 / l^2 + 2 (1 - cos angle) of a free body in the plane: how far it is from its goal along the first
+    axis, and how far from level."""
+
+    solid: str
+    length: float
+    """l [m]"""
+
+    def values(self, at: StepEnd) -> NDArray:
+        turned = sum(_numbers(at.state, name)[:, axis] for axis, name in self._axes)
+        return (self._miss(at) / self.length) ** 2 - turned
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+        slopes = (2.0 / self.length**2 * factor * self._miss(at))[:, None]
+        _add(bar, position_name(self.solid), slopes * [1.0, 0.0])
+        for axis, name in self._axes:
+            _add(bar, name, -factor[:, None] * np.eye(2)[axis])
+
+    @property
+    def _axes(self) -> list[tuple[int, str]]:
+        """Fields of how far the ends of its axes have moved, of which these components are cos angle - 1."""
+        return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
+
+    def _miss(self, at: StepEnd) -> NDArray:
+        return _numbers(at.state, position_name(self.solid))[:, 0] - at.goal[:, 0]
+
+
+def _kernels(at: StepEnd) -> EnvironmentKernels:
+    return environment_kernels(precision_of(at.state))
+
+
+def _reals(at: StepEnd, values: NDArray) -> wp.array:
+    return wp.array(values, dtype=precision_of(at.state).real, device=at.state.positions.device)
+
+
+def _vectors(at: StepEnd, values: NDArray) -> wp.array:
+    """Of (..., d)."""
+    return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
+        values.shape[:-1]
+    )
+
+
+def _empty(at: StepEnd, *shape: int) -> wp.array:
+    return wp.empty(shape, dtype=wp.float64, device=at.state.positions.device)
+
+
+def _numbers(state: State, name: str) -> NDArray:
+    """A field with an entry for each scene, in float64."""
+    return state[name].numpy().astype(np.float64)
+
+
+def _add(bar: State, name: str, values: NDArray) -> None:
+    """Vectors (scenes, d) to a field with one for each scene."""
+    field = bar[name]
+    add(wp.array(padded(values), dtype=field.dtype, device=field.device), field)

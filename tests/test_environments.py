@@ -1,0 +1,401 @@
+"""Environments of Gymnasium: its own checks, seeds, batches, rewards with derivatives, and bad uses in sentences."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import cortado
+import cortado.environments
+from cortado import InputError, Simulation
+from cortado.environments.actuators import Position, Velocity
+from cortado.environments.catalogue import TASKS
+from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
+
+SOME = ("Carry", "Raft")
+"""Between them solids on a path, and one that floats."""
+OTHERS = sorted(TASKS.keys() - set(SOME))
+
+
+@pytest.fixture(scope="module")
+def environments():
+    """One of each task, made once."""
+    made = {}
+
+    def of(name):
+        if name not in made:
+            made[name] = gymnasium.make(f"cortado/{name}-v0", precision="float64")
+        return made[name]
+
+    return of
+
+
+def actions_of(env, count, seed=0):
+    return np.random.default_rng(seed).uniform(-1.2, 1.2, (count, *env.action_space.shape))
+
+
+def episode(env, actions, seed):
+    """The first observation, and those and the rewards of its steps."""
+    first, _ = env.reset(seed=seed)
+    found = [env.step(action) for action in actions]
+    return np.array([first, *(one[0] for one in found)]), np.array([one[1] for one in found])
+
+
+def checked_by_gymnasium(env, recwarn):
+    check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
+    assert not [str(one.message) for one in recwarn if "infinity" not in str(one.message)]
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_gymnasium_has_nothing_to_say(environments, name, recwarn):
+    checked_by_gymnasium(environments(name), recwarn)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_gymnasium_has_nothing_to_say_of_the_others(environments, name, recwarn):
+    checked_by_gymnasium(environments(name), recwarn)
+
+
+def test_the_same_seed_has_the_same_bits_and_another_one_others(environments):
+    env = environments("Carry")
+    actions = actions_of(env, 2)
+    (seen, rewards), (again, rewards_again), (other, _) = (episode(env, actions, seed) for seed in (3, 3, 4))
+    assert np.array_equal(seen, again) and np.array_equal(rewards, rewards_again)
+    layout = env.unwrapped.layout
+    for part in ("particles", "goal"):
+        assert not np.array_equal(seen[0, layout[part]], other[0, layout[part]])
+
+
+def test_observations_are_what_the_layout_says(environments):
+    env = environments("Raft").unwrapped
+    seen, _ = episode(env, actions_of(env, 3), 1)
+    scenes, layout = env.scenes, env.layout
+    state = scenes.simulation.on_host(scenes.state)[0]
+    particles = seen[-1, layout["particles"]].reshape(32, 2, 2)
+    chosen = np.linspace(0, scenes.simulation.particles - 1, 32).astype(int)
+    assert np.array_equal(particles[:, 0], state["positions"][chosen].astype(np.float32))
+    assert np.array_equal(particles[:, 1], state["velocities"][chosen].astype(np.float32))
+    x, y, cosine, sine, u, v, rate = seen[-1, layout["raft"]]
+    assert np.allclose([x, y, u, v], np.ravel([state["raft.position"], state["raft.velocity"]]))
+    assert np.isclose(cosine**2 + sine**2, 1.0) and sine != 0.0
+    assert rate == np.float32(state["raft.angular_velocity"][0])
+    assert np.isclose(seen[-1, layout["progress"]], 3 / 40)
+    paddle = state["paddle.position"][0, 0] - 0.11
+    assert np.isclose(seen[-1, layout["paddle.displacement"]][0], paddle) and paddle != 0.0
+
+
+def test_sensors_are_observed_as_a_simulation_reads_them():
+    """Also that of the pressure, which follows from where solids are in the next step."""
+    sensors = {"probe": cortado.sensors.PressureProbe([0.5, 0.1]), "gauge": cortado.sensors.WaveGauge([0.7, 0.0])}
+    envs = cortado.environments.make_vec("Raft", 2, precision="float64", sensors=sensors)
+    first, _ = envs.reset(seed=1)
+    stepped = envs.step(np.ones((2, 1)))[0]
+    scenes, task = envs.scenes, envs.scenes.task
+    assert list(envs.layout)[-2:] == ["probe", "gauge"]
+    single, steps = Simulation(task.scene, precision="float64"), task.substeps
+    path = task.actuators[0].over(1, steps, task.time_step).parameter(np.ones((1, 1)))
+    for b, start in enumerate(scenes.starts):
+        for displacement, seen, at in ((np.zeros(2), first, 0), (path, stepped, -1)):
+            controls = {"initial_positions": start.positions, "paddle.displacement": displacement}
+            read = single.run(steps, controls, record_every=steps, sensors=sensors).sensors
+            expected = [read["probe"]["pressure"][at], read["gauge"]["height"][at]]
+            assert np.allclose(seen[b, -2:], expected, rtol=1e-6) and expected[0] > 10.0
+    broken(scenes, 1)
+    seen, _, terminated, _, _ = envs.step(np.ones((2, 1)))
+    assert terminated.tolist() == [False, True] and np.array_equal(seen[1], stepped[1]) and np.isfinite(seen).all()
+    for bad in ({"goal": sensors["gauge"]}, ["gauge"], {"gauge": 1}):
+        with pytest.raises(InputError, match="sensor"):
+            cortado.environments.make_vec("Raft", 2, sensors=bad)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_each_scene_of_a_batch_has_the_bits_of_a_single_one(environments, name):
+    env, envs = environments(name), gymnasium.make_vec(f"cortado/{name}-v0", num_envs=2, precision="float64")
+    actions = actions_of(env, 2)
+    first, _ = envs.reset(seed=7)
+    batch = [envs.step(np.stack([action, -action])) for action in actions]
+    for b, sign in enumerate((1.0, -1.0)):
+        seen, rewards = episode(env, sign * actions, 7 + b)
+        assert np.array_equal(seen, [first[b], *(one[0][b] for one in batch)])
+        assert np.array_equal(rewards, [one[1][b] for one in batch])
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------------------
+
+
+def differentiated_by_its_twin(env):
+    """The loss is minus the return, and the gradient that of differences."""
+    actions = actions_of(env, 2)
+    _, rewards = episode(env, actions, 5)
+    twin = env.twin(2)
+    value, gradient = twin.value_and_gradient(actions)
+    assert abs(value + rewards.sum()) < 1e-12 * max(1.0, abs(value))
+    assert gradient.shape == actions.shape and not gradient[np.abs(actions) > 1.0].any()
+    direction = np.where(np.abs(actions) < 0.99, np.random.default_rng(1).standard_normal(actions.shape), 0.0)
+    h = 1e-6
+    difference = (twin.value(actions + h * direction) - twin.value(actions - h * direction)) / (2.0 * h)
+    assert gradient.any() and np.isclose(difference, (gradient * direction).sum(), rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_the_loss_of_the_twin_is_minus_the_return(environments, name):
+    differentiated_by_its_twin(environments(name).unwrapped)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_so_it_is_of_the_others(environments, name):
+    differentiated_by_its_twin(environments(name).unwrapped)
+
+
+ESTIMATORS = [cortado.gradients.AdjointViscosity(), cortado.gradients.EnsembleMean(samples=4, spread=0.01)]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda one: type(one).__name__)
+def test_estimators_go_through_the_twin(environments, estimator):
+    env = environments("Carry").unwrapped
+    env.reset(seed=5)
+    twin = env.twin(1)
+    value, gradient = twin.value_and_gradient(np.full((1, 2), 0.3), estimator)
+    assert np.isfinite(value) and gradient.shape == (1, 2) and gradient.any()
+
+
+def test_the_twin_in_jax(environments):
+    import jax
+
+    env = environments("Carry").unwrapped
+    env.reset(seed=5)
+    twin, actions = env.twin(2), np.array([[0.5, -0.2], [1.5, 0.1]])
+    jax.config.update("jax_enable_x64", True)
+    try:
+        value, gradient = jax.value_and_grad(twin.in_jax())(jax.numpy.array(actions))
+    finally:
+        jax.config.update("jax_enable_x64", False)
+    expected, slopes = twin.value_and_gradient(actions)
+    assert np.isclose(value, expected, rtol=1e-12) and np.allclose(gradient, slopes, rtol=1e-9, atol=1e-12)
+
+
+def test_the_twin_in_torch(environments):
+    torch = pytest.importorskip("torch")
+    env = environments("Carry").unwrapped
+    env.reset(seed=5)
+    twin = env.twin(2)
+    actions = torch.tensor([[0.5, -0.2], [1.5, 0.1]], dtype=torch.float64, requires_grad=True)
+    value = twin.in_torch()(actions)
+    value.backward()
+    expected, slopes = twin.value_and_gradient(actions.detach().numpy())
+    assert np.isclose(value.item(), expected, rtol=1e-12)
+    assert np.allclose(actions.grad.numpy(), slopes, rtol=1e-9, atol=1e-12)
+
+
+def test_actuators_are_their_matrices():
+    generator = np.random.default_rng(2)
+    for one in (
+        Velocity("cup.displacement", (1.0, 2.0), (1,), (3.0,)),
+        Position("gravity", (0.0, -9.81), (0, 1), (2.0, -1.0), lag=0.2),
+        Velocity("cup.turn", (0.0,), (0,), (0.5,), is_number=True),
+    ):
+        actions, now, parts = generator.uniform(-1.0, 1.0, (4, len(one.axes))), one.at_rest(1), []
+        for u in actions:
+            now, rows = one.advance(now, u[None], 3, 0.01)
+            parts.append(rows[0])
+        assert np.allclose(np.concatenate(parts), one.over(4, 3, 0.01).parameter(actions), rtol=1e-14, atol=1e-14)
+    steady = Velocity("x", (0.0,), (0,), (2.0,)).over(10, 5, 0.01).parameter(np.ones((10, 1)))
+    assert np.isclose(steady[-1, 0], 2.0 * (0.5 - 0.05 / 2 + 0.01 / 2))  # a ramp in the first step, then 2 m/s
+
+
+# ---- episodes that end -----------------------------------------------------------------------------------------------
+
+
+def test_autoreset_in_the_next_step():
+    envs = gymnasium.make_vec("cortado/Carry-v0", 2, vectorization_mode="vector_entry_point", max_episode_steps=2)
+    assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    first, _ = envs.reset(seed=1)
+    zero = np.zeros((2, 2))
+    found = [envs.step(zero) for _ in range(4)]
+    assert [one[3].tolist() for one in found] == [[False] * 2, [True] * 2, [False] * 2, [False] * 2]
+    assert not found[2][1].any() and found[3][1].all()  # the third step begins new episodes, in place of its actions
+    assert not np.array_equal(found[2][0], first) and not found[2][0][:, envs.unwrapped.layout["progress"]].any()
+
+
+def test_autoreset_in_the_same_step_and_disabled():
+    settings = {"num_envs": 2, "max_episode_steps": 1}
+    envs = cortado.environments.make_vec("Carry", **settings, autoreset_mode="SameStep")
+    envs.reset(seed=1)
+    seen, _, _, truncated, infos = envs.step(np.zeros((2, 2)))
+    progress = envs.layout["progress"]
+    assert truncated.all() and infos["_final_obs"].all() and not seen[:, progress].any()
+    assert np.isclose(infos["final_obs"][1][progress], 1 / 75)
+    envs = cortado.environments.make_vec("Carry", **settings, autoreset_mode="Disabled")
+    envs.reset(seed=1)
+    ended = envs.step(np.zeros((2, 2)))[0]
+    mask = np.array([False, True])
+    seen, _ = envs.reset(options={"reset_mask": mask})
+    assert np.array_equal(seen[0], ended[0]) and not np.array_equal(seen[1], ended[1])
+    with pytest.raises(InputError, match="environment 0, but must come after reset"):
+        envs.step(np.zeros((2, 2)))
+
+
+def broken(scenes, number):
+    """Lets a particle of a scene fly away in the next step."""
+    velocities = np.from_dlpack(scenes.state["velocities"]).copy()
+    velocities[number, 0, 0] = 1e6
+    scenes.state = replace(scenes.state, arrays=scenes.state.arrays.copy())
+    scenes.state.arrays.set({"velocities": velocities[..., :2]})
+
+
+def test_an_episode_that_diverges_is_terminated_with_a_sentence(environments):
+    env = environments("Splash").unwrapped
+    before, _ = env.reset(seed=1)
+    broken(env.scenes, 0)
+    seen, reward, terminated, truncated, info = env.step(np.zeros(2))
+    assert terminated and not truncated and np.array_equal(seen, before) and reward == 0.0
+    assert info["diverged"].startswith("The episode ended in its step 1: The simulation diverged")
+    with pytest.raises(InputError, match="after the end of an episode, but must come after reset"):
+        env.step(np.zeros(2))
+    env.reset(seed=1)
+    assert np.isfinite(env.step(np.zeros(2))[1])
+
+
+def test_in_a_batch_the_others_go_on():
+    envs = cortado.environments.make_vec("Carry", 3, precision="float64")
+    envs.reset(seed=1)
+    broken(envs.scenes, 1)
+    seen, rewards, terminated, _, infos = envs.step(np.zeros((3, 2)))
+    assert terminated.tolist() == [False, True, False] and infos["_diverged"].tolist() == terminated.tolist()
+    assert np.isfinite(seen).all() and rewards[1] == 75 * -12.0
+    alone = cortado.environments.make_vec("Carry", 1, precision="float64")
+    alone.reset(seed=3)
+    both = [envs.step(np.full((3, 2), 0.5)), alone.step(np.zeros((1, 2))) and alone.step(np.full((1, 2), 0.5))]
+    assert np.array_equal(both[0][0][2], both[1][0][0]) and both[0][1][1] == 0.0 and np.isfinite(both[0][0]).all()
+
+
+# ---- bad uses --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("action", "sentence"),
+    [
+        ([0.0], r"action has shape \(1,\), but must be \(2,\)"),
+        ([0.0, np.nan], "action has a value that is not finite"),
+        (["a", "b"], "action"),
+        (None, "action"),
+    ],
+)
+def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
+    env = environments("Carry").unwrapped
+    env.reset(seed=1)
+    with pytest.raises(InputError, match=sentence):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"size": "huge"}, 'size is \'huge\', but must be "small" or "large"'),
+        ({"particles": 1000}, "particles is 1000, but must be a whole number from 0 to 96"),
+        ({"particles": 2.5}, "particles is 2.5"),
+        ({"render_mode": "human"}, "render_mode is 'human'"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"autoreset_mode": "never"}, "autoreset_mode is 'never', but must be one of"),
+        ({"precision": "half"}, "precision"),
+    ],
+)
+def test_bad_settings_are_refused_in_a_sentence(settings, sentence):
+    with pytest.raises(InputError, match=sentence):
+        cortado.environments.make_vec("Carry", **{"num_envs": 1, **settings})
+
+
+def test_steps_before_the_first_episode_and_other_bad_calls(environments):
+    with pytest.raises(InputError, match="task is 'Juggle', but must be one of Carry"):
+        cortado.environments.make_vec("Juggle")
+    envs = cortado.environments.make_vec("Carry", 2, autoreset_mode="Disabled")
+    for bad in (np.array([True]), np.zeros(2, dtype=bool), [True, False]):
+        with pytest.raises(InputError, match="reset_mask"):
+            envs.reset(options={"reset_mask": bad})
+    with pytest.raises(InputError, match="seed has 3 numbers"):
+        envs.reset(seed=[1, 2, 3])
+    with pytest.raises(InputError, match="must come after reset"):
+        envs.step(np.zeros((2, 2)))
+    env = environments("Carry").unwrapped
+    env.reset(seed=1)
+    for bad in (0, 76):
+        with pytest.raises(InputError, match="actions"):
+            env.twin(bad)
+
+
+def test_pictures(environments):
+    env = environments("Carry").unwrapped
+    assert env.render() is None
+    env.render_mode = "rgb_array"
+    env.reset(seed=1)
+    picture = env.render()
+    env.render_mode = None
+    assert picture.shape == (200, 320, 3) and picture.dtype == np.uint8 and picture.std() > 10.0
+
+
+def test_gymnasium_is_optional():
+    """Without it one sentence says what to install."""
+    error = cortado.errors.LibraryMissingError("Gymnasium", "gymnasium", "environments")
+    assert str(error) == "Gymnasium is not installed, which cortado.environments needs: pip install gymnasium"
+
+
+# ---- terms of rewards, by NumPy --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def carried():
+    """The end of a step of two scenes, whose cups have leant."""
+    simulation = Simulation(TASKS["Carry"]().scene, precision="float64", batch=2)
+    path = {"cup.displacement": np.full((2, 1, 2), 0.003), "cup.turn": np.array([[0.3], [-0.2]])}
+    state = simulation.step(simulation.on_device(), path)
+    return StepEnd(state.arrays, np.array([[0.3], [0.5]]), np.array([1, 2]))
+
+
+LOWER, UPPER, CHOSEN = np.array([-0.05, -0.04]), np.array([0.02, 0.03]), np.array([3, 10, 40])
+TARGETS, WEIGHTS = np.random.default_rng(0).normal(size=(2, 96, 2)), np.random.default_rng(1).uniform(size=(2, 96))
+TERMS = {
+    "share": Share(OneBox(tuple(LOWER), tuple(UPPER)), 0.01, solid="cup"),
+    "spread": Spread(CHOSEN, 2.0),
+    "missed": Missed(TARGETS, WEIGHTS),
+    "distance": Distance("cup"),
+}
+
+
+def test_terms_are_what_numpy_finds(carried):
+    x = carried.state.numpy(2)["positions"]
+    place, angle = carried.state.numpy(2)["cup.position"], carried.state.numpy(2)["cup.turn"][..., None]
+    c, s, (r_x, r_y) = np.cos(angle), np.sin(angle), np.split(x - place, 2, axis=-1)
+    y = np.concatenate([c * r_x + s * r_y, c * r_y - s * r_x], axis=-1)
+    squares = ((y - np.clip(y, LOWER, UPPER)) ** 2).sum(axis=-1)
+    pairs = np.abs(x[:, CHOSEN, None] - x[:, None, CHOSEN]).sum(axis=-1).mean(axis=(1, 2))
+    expected = {
+        "share": (1.0 / (1.0 + squares / 1e-4)).mean(axis=1),
+        "spread": pairs / 2.0,
+        "missed": [(WEIGHTS[k] * ((x[k] - TARGETS[k]) ** 2).sum(axis=1)).sum() for k in range(2)],
+        "distance": np.abs(place[:, 0, 0] - carried.goal[:, 0]),
+    }
+    for name, term in TERMS.items():
+        assert np.allclose(term.values(carried), expected[name], rtol=1e-12), name
+    assert (expected["share"] < 0.9).all()
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_adjoints_of_terms_are_differences(carried, name):
+    """With respect to where particles are, and where the cup is and how it leans; of each scene on its own."""
+    factor, bar, generator = np.array([2.0, -0.7]), carried.state.like(), np.random.default_rng(2)
+    TERMS[name].adjoint(carried, factor, bar)
+    fields, bars = carried.state.numpy(2), bar.numpy(2)
+    for field in ("positions", "cup.position", "cup.turn"):
+        dot = generator.standard_normal(fields[field].shape)
+
+        def moved(h, field=field, dot=dot):
+            state = carried.state.copy()
+            state.set({field: fields[field] + h * dot})
+            return TERMS[name].values(replace(carried, state=state))
+
+        difference = factor * (moved(1e-6) - moved(-1e-6)) / 2e-6
+        product = (bars[field] * dot).reshape(2, -1).sum(axis=1)
+        assert np.allclose(product, difference, rtol=1e-7, atol=1e-9), field
+    assert bars["positions"].any() != (name == "distance")
