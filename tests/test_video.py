@@ -63,3 +63,11 @@ def test_a_missing_package_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'cortado-sph\[video\]'"):
         write_video(tmp_path / "a.mp4", [heart(16)])
+
+
+def test_a_minute_of_noise_is_below_10_mb(tmp_path):
+    """As it would be at 1080 lines: the limit goes with the pixels."""
+    noise = np.random.default_rng(0)
+    path = write_video(tmp_path / "a.mp4", (noise.random((180, 320, 3)) for _ in range(300)), 25)
+    pixels = 320 * 180 / (1920 * 1080)
+    assert 0.5e6 * pixels < path.stat().st_size * 60 / 12 < 12e6 * pixels**0.75

@@ -9,8 +9,9 @@ from typing import Any
 from cortado.errors import InputError
 from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
-from cortado.scene.picture import MOST_FRAMES
 
+FORMER_FRAMES = 120
+"""The default of film_frames in folders without a format."""
 LARGEST = 2**31
 """Bytes of a file that is read again when a run goes on."""
 
@@ -19,7 +20,7 @@ def asked_for(scene_json: str) -> str:
     """A scene of a folder without a format, whose default of film_frames, 120, was written as if it were asked for."""
     try:
         scene = json.loads(scene_json)
-        if scene["picture"]["film_frames"] == MOST_FRAMES:
+        if scene["picture"]["film_frames"] == FORMER_FRAMES:
             del scene["picture"]["film_frames"]
     except (ValueError, RecursionError, LookupError, TypeError):
         return scene_json  # an error is reported where it is read
