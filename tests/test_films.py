@@ -7,12 +7,14 @@ import cortado
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
 from cortado.pictures import Dolly, Follow, Keyframes, Orbit
+from cortado.pictures.painter import painter
+from cortado.pictures.plan import MOVING, plan
 from cortado.pictures.scale import Scale
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.runs.curl import vorticity
 from cortado.runs.emitted import ages, is_out
 from cortado.scene.camera_paths import Moment, View
-from scenes import jet, plane, scene
+from scenes import jet, plane, pour, scene
 
 SMALL = {"width": 160, "height": 90}
 HOME = View(np.array([0.0, 1.0, 4.0]), np.array([0.0, 1.0, 0.0]))
@@ -178,3 +180,20 @@ def test_who_goes_around_sees_the_whole_container_from_all_sides():
         half = np.tan(0.5 * np.radians(stage.picture.field_of_view))
         assert across < half and upwards < half * 90 / 160
     np.testing.assert_allclose(seen.sun, stage.sun)
+
+
+@pytest.mark.parametrize("make", [jet, pour])
+def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
+    made = make(picture={"width": 320, "height": 180})
+    simulation = cortado.Simulation(made)
+    free = simulation.positions[: simulation.free_particles]
+    image = plan(made, free, np.tile([0.1, 0.3, 0.8], (len(free), 1)))
+    stage = painter(made, simulation.positions).stage
+    emitter = made.emitter
+    column, row = stage.on_screen(np.array([np.add(emitter.outlet, np.multiply(0.03, emitter.direction))]))[0].round()
+    around = image[int(row) - 6 : int(row) + 7, int(column) - 6 : int(column) + 7].reshape(-1, 3)
+    assert np.abs(around - MOVING).max(axis=1).min() < 0.2
+    low, high = stage.on_screen(np.array([made.container.lower, made.container.upper]))
+    assert low[1] > high[1]  # upwards is upwards
+    box = image[max(int(low[1]) + 2, 0) :]
+    assert (box.max(axis=2) < 0.4).any()  # words below

@@ -65,6 +65,16 @@ class PlaneStage:
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
+    def on_screen(self, points: Points) -> Points:
+        """As `Stage.on_screen`, of points (n, 2) [m]."""
+        off = (points - 0.5 * (self.lower + self.upper)) / self.pixel
+        return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
+
+    @property
+    def up_axis(self) -> int:
+        """Which axis of the scene is upright in the picture."""
+        return 1
+
     @property
     def gloss_width(self) -> float:
         """How wide the edges of bodies are drawn, in pixels."""

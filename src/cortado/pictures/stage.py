@@ -148,6 +148,21 @@ class Stage:
         """Positions (n, 3) [m] of the scene in the frame of the picture."""
         return (positions - self.origin) @ self.frame.T
 
+    def on_screen(self, points: Points) -> Points:
+        """(n, 2) the column and the row, counted in pixels from the upper left corner, where points (n, 3) [m] of the
+        scene are in the picture."""
+        forward = self.look_at - self.eye
+        forward = forward / np.linalg.norm(forward)
+        off = self.placed(points) - self.eye
+        scale = 0.5 * self.picture.width / np.tan(0.5 * np.radians(self.picture.field_of_view))
+        right, up = (off @ axis / (off @ forward) * scale for axis in screen_axes(forward))
+        return np.stack([0.5 * self.picture.width + right, 0.5 * self.picture.height - up], axis=1)
+
+    @property
+    def up_axis(self) -> int:
+        """Which axis of the scene is upright."""
+        return int(np.abs(self.frame[1]).argmax())
+
     def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
         """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
         shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""

@@ -9,11 +9,13 @@ from cortado.scene.scene import Scene
 
 def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.bool_]:
     """(n,) whether each of the particles of a scene has left the emitter, of which so much came out: `Frame.others`
-    has ``emitted`` (1,) [m]; all have where there is none."""
+    has ``emitted`` (1,) [m]; all have where there is none. Where there is no other fluid, the layer that comes first is
+    out from the start."""
     found = np.ones(particles, dtype=bool)
     if scene.emitter is not None and emitted is not None:
         upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
-        found[particles - len(upstream) :] = upstream <= float(np.ravel(emitted)[0])
+        least = upstream.min() if len(upstream) == particles else 0.0
+        found[particles - len(upstream) :] = upstream <= max(float(np.ravel(emitted)[0]), least)
     return found
 
 
