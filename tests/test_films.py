@@ -10,10 +10,13 @@ from cortado.pictures import Dolly, Follow, Keyframes, Orbit
 from cortado.pictures.painter import painter
 from cortado.pictures.plan import MOVING, plan
 from cortado.pictures.scale import Scale
+from cortado.pictures.shadow import floor_shadow
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.runs.curl import vorticity
 from cortado.runs.emitted import ages, is_out
 from cortado.scene.camera_paths import Moment, View
+from cortado.scene.lights import LIGHTS
+from cortado.scene.picture import Picture
 from scenes import jet, plane, pour, scene
 
 SMALL = {"width": 160, "height": 90}
@@ -82,11 +85,11 @@ def test_a_wrong_table_is_a_sentence(maker, table, sentence):
 
 def test_a_trajectory_makes_films_and_pictures(tmp_path):
     simulation = cortado.Simulation(scene(picture=SMALL))
-    trajectory = simulation.run(4)
+    trajectory = simulation.run(2)
     made = trajectory.film(tmp_path / "a.mp4", camera=Orbit(turns=0.5), film_speed=0.01, lines=64)
     shown = frames_of(made.path)
-    assert [frame.shape for frame in shown] == [(64, 114, 3)] * 5
-    assert "5 frames" in repr(made) and "0.01 x" in repr(made) and "data:video/mp4" in made._repr_html_()
+    assert [frame.shape for frame in shown] == [(64, 114, 3)] * 3
+    assert "3 frames" in repr(made) and "0.01 x" in repr(made) and "data:video/mp4" in made._repr_html_()
     still = frames_of(trajectory.film(tmp_path / "b.mp4", lines=64).path)
     changes = [np.abs(film[-1].astype(int) - film[0]).mean() for film in (shown, still)]
     assert changes[0] > 3.0 * changes[1]
@@ -180,6 +183,20 @@ def test_who_goes_around_sees_the_whole_container_from_all_sides():
         half = np.tan(0.5 * np.radians(stage.picture.field_of_view))
         assert across < half and upwards < half * 90 / 160
     np.testing.assert_allclose(seen.sun, stage.sun)
+
+
+def test_a_low_sun_casts_a_longer_shadow_and_a_light_has_its_own_background():
+    positions, shaded = np.array([[0.1, 0.2, 0.1]]), {}
+    for name in LIGHTS:
+        stage = Stage.of(scene(picture={**SMALL, "light": name}), positions)
+        light, corner, cell = floor_shadow(stage, stage.placed(positions), np.ones((1, 3)))
+        dark = np.argwhere(light[..., 0] < 1.0 - 0.5 * (1.0 - light.min()))
+        shaded[name] = np.linalg.norm(corner[[0, 2]] + cell * dark.mean(axis=0) - stage.placed(positions)[0, ::2])
+    assert shaded["evening"] > 1.5 * shaded["studio"] > 1.5 * shaded["noon"]
+    assert Picture(light="evening").sun_and_sky.background == LIGHTS["evening"].background
+    assert Picture(light="evening", background=(0.1, 0.2, 0.3)).sun_and_sky.background == (0.1, 0.2, 0.3)
+    with pytest.raises(SceneError, match='light is \'dawn\', but must be "studio" or "noon"'):
+        Picture(light="dawn")
 
 
 @pytest.mark.parametrize("make", [jet, pour])

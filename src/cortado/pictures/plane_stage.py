@@ -144,7 +144,7 @@ class PlaneStage:
         x, y = self.pixels
         middle, half = 0.5 * (self.lower + self.upper), 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
-        return np.asarray(self.picture.background) * (1.12 - 0.20 * away)[..., None]
+        return np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
 
     @cached_property
     def _room(self) -> Points:

@@ -119,11 +119,12 @@ def _directions(count: int) -> Points:
 
 
 def _surroundings(stage: Stage) -> Any:
-    picture, s = stage.picture, Environment()
-    horizon = np.asarray(picture.background)
+    picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
+    horizon = np.asarray(light.background)
     s.size, s.nearest = stage.size, 1e-4 * stage.size
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
-    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * (0.62, 0.72, 0.84)))
+    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * light.zenith))
+    s.lamp, s.strip, s.sunlight = wp.vec3(*light.lamp), wp.vec3(*light.strip), wp.vec3(*light.sunlight)
     s.has_floor, s.floor_height = int(picture.floor), float(stage.lower[1])
     s.floor_colour = wp.vec3(*(0.93 * horizon))
     s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))

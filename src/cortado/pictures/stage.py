@@ -234,7 +234,8 @@ class Stage:
     @property
     def sun(self) -> Points:
         """(3,) unit vector towards the lamp: behind the camera, on its left."""
-        return self._direction(-62.0, 50.0)
+        light = self.picture.sun_and_sky
+        return self._direction(light.azimuth, light.elevation)
 
     @property
     def fill(self) -> Points:

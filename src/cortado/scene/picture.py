@@ -1,6 +1,7 @@
 """How shaded pictures of a scene are made; it changes nothing of what is computed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import ValidationInfo, field_validator
@@ -8,6 +9,7 @@ from pydantic import ValidationInfo, field_validator
 from cortado.errors import Words
 from cortado.scene.camera_paths import AnyCameraPath
 from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, components, count, field_error, quantity
+from cortado.scene.lights import LIGHTS, Light
 from cortado.scene.quantities import NAMES
 from cortado.scene.tables import Table
 
@@ -41,8 +43,10 @@ class Picture(Table):
     out 0.9 with one phase, and 0 with several or with another colour than theirs."""
     floor: Flag = True
     """Whether there is a floor, in 3-D."""
-    background: Colour = (0.74, 0.77, 0.80)
-    """(3,) red, green and blue, linear, each from 0 to 1"""
+    light: Annotated[str, OneOf(LIGHTS)] = "studio"
+    """Sun and sky, in 3-D: "studio", "noon", "evening" or "overcast"."""
+    background: Colour | None = None
+    """(3,) red, green and blue, linear, each from 0 to 1; that of the light if left out"""
     colour: Annotated[str, OneOf(COLOURS)] = "phase"
     """What colours particles: "phase", their own colours; a quantity, "density", "pressure", "speed", "vorticity" or
     "wall_force", or "age", the time since they left an emitter or since the start; of both with a scale beside it."""
@@ -54,6 +58,12 @@ class Picture(Table):
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
     """Seconds of the run in a second of its film: 1 is real time, 0.25 a quarter of it; films show at most 60 frames in
     a second. If left out real time, or as much slower as a film needs to last 4 s and to show every frame."""
+
+    @property
+    def sun_and_sky(self) -> Light:
+        """The light by its numbers, with the background that is shown."""
+        light = LIGHTS[self.light]
+        return light if self.background is None else replace(light, background=self.background)
 
     @property
     def searched_frames(self) -> int:
