@@ -6,6 +6,7 @@ import pytest
 import cortado
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
+from cortado.files.srgb import to_srgb
 from cortado.pictures import Dolly, Follow, Keyframes, Orbit
 from cortado.pictures.painter import painter
 from cortado.pictures.plan import MOVING, plan
@@ -214,3 +215,13 @@ def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
     assert low[1] > high[1]  # upwards is upwards
     box = image[max(int(low[1]) + 2, 0) :]
     assert (box.max(axis=2) < 0.4).any()  # words below
+
+
+def test_a_fluid_at_rest_does_not_flicker():
+    made = scene(picture={"width": 320, "height": 180})
+    simulation, noise = cortado.Simulation(made), np.random.default_rng(0)
+    moved = simulation.positions + 0.02 * 0.05 * noise.standard_normal(simulation.positions.shape)
+    stirred = moved + 1e-4 * 0.05 * noise.standard_normal(moved.shape)
+    artist, colours = painter(made, moved), np.tile([0.1, 0.3, 0.8], (len(moved), 1))
+    one, other = (to_srgb(artist.image(positions, colours)).astype(int) for positions in (moved, stirred))
+    assert (np.abs(one - other).max(axis=2) > 1).mean() < 1e-3
