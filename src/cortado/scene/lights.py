@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-Numbers = tuple[float, float, float]
+Numbers = tuple[float, ...]
 
 
 @dataclass(frozen=True)
