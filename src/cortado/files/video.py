@@ -19,8 +19,8 @@ from cortado.files.srgb import to_srgb
 
 QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
-BITS = 1.25e6
-"""A second at most of 1920 x 1080 pixels, over some seconds: 9.4 MB a minute."""
+BITS = 1.2e6
+"""A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
 TICKS = 90_000
 """Of a second, in which times of frames are counted."""
 

@@ -50,6 +50,8 @@ def film_of(
     simulation: Callable[[], Measuring] | None = None,
 ) -> Film:
     """Write a film of a run; as `page_of`."""
+    if not len(trajectory):
+        raise InputError("The trajectory has no frames, but must have one to be filmed.")
     shown = shown_as(scene, settings, trajectory.others if units is None else units)
     missing = lacking(shown)
     if missing:

@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from cortado.errors import InputError
+from cortado.device.driver import device_named
+from cortado.device.kernel_cache import start_warp
+from cortado.errors import InputError, shown
 from cortado.pictures.film import Film
 from cortado.pictures.shaded_picture import ShadedPicture
 from cortado.scene.scene import Scene, as_scene
@@ -27,8 +29,8 @@ class Showing:
 
         own = cast("Trajectory", self)
         if k not in range(-len(own), len(own)):
-            raise InputError(f"k is {k}, but must be the number of one of {len(own)} frames, such as 0 or -1.")
-        page = page_of(own, self._scene(scene), device, settings)
+            raise InputError(f"k is {shown(k)}, but must be the number of one of {len(own)} frames, such as 0 or -1.")
+        page = page_of(own, self._scene(scene), _device(device), settings)
         return ShadedPicture.of(page.image(k % len(own)))
 
     def film(
@@ -50,10 +52,16 @@ class Showing:
         """
         from cortado.runs.drawing import film_of
 
-        return film_of(cast("Trajectory", self), self._scene(scene), path, device, settings)
+        return film_of(cast("Trajectory", self), self._scene(scene), path, _device(device), settings)
 
     def _scene(self, given: Scene | str | Path | None) -> Scene:
         found = self.scene if given is None else as_scene(given)
         if found is None:
             raise InputError("The trajectory does not know its scene, as it was loaded: give it, as scene=scene.")
         return found
+
+
+def _device(name: str) -> Any:
+    """Warp's device of that name; raises `InputError` where there is none."""
+    start_warp()
+    return device_named(name)
