@@ -196,9 +196,9 @@ def test_its_field_is_read_by_name(tmp_path):
 def test_its_field_colours_pictures():
     simulation = Simulation(plane(picture={"width": 160, "height": 120}), forces=[Memory()])
     frame = simulation.run(6)[-1]
-    found = simulation.picture(frame, colour_by=U.name)
+    found = simulation.picture(frame, colour=U.name)
     assert found.shape == (120, 160, 3)
     assert np.abs(found - simulation.picture(frame)).max() > 0.1
-    assert np.abs(found - simulation.picture(frame, colour_by="speed")).max() > 0.1
-    with pytest.raises(cortado.SceneError, match="colour_by"):
-        simulation.picture(frame, colour_by="mass_fractions")
+    assert np.abs(found - simulation.picture(frame, colour="speed")).max() > 0.1
+    with pytest.raises(cortado.SceneError, match="colour"):
+        simulation.picture(frame, colour="mass_fractions")

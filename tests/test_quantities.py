@@ -276,17 +276,17 @@ def test_the_command_records_what_is_asked_for(tmp_path, monkeypatch, capsys):
 
 
 def test_pictures_are_coloured_by_a_quantity_on_a_scale():
-    simulation = cortado.Simulation(plane(picture={"width": 160, "height": 120, "colour_by": "vorticity"}))
+    simulation = cortado.Simulation(plane(picture={"width": 160, "height": 120, "colour": "vorticity"}))
     frame = simulation.run(5, record=["vorticity"])[-1]
-    found, plain = simulation.picture(frame), simulation.picture(frame, colour_by=None)
+    found, plain = simulation.picture(frame), simulation.picture(frame, colour="phase")
     assert found.shape == plain.shape == (120, 160, 3)
     assert np.abs(found - plain).max() > 0.1
-    bar = found[-6, 4:-4]
+    bar = found[41:84, 160 - 4 - 27 - 3]
     assert np.linalg.norm(bar[0] - bar[-1]) > 0.5
     with pytest.raises(InputError, match="density was not recorded"):
-        simulation.picture(frame, colour_by="density")
-    with pytest.raises(cortado.SceneError, match="colour_by"):
-        simulation.picture(frame, colour_by="rho")
+        simulation.picture(frame, colour="density")
+    with pytest.raises(cortado.SceneError, match="colour"):
+        simulation.picture(frame, colour="rho")
 
 
 def test_the_pictures_of_a_run_are_coloured_by_what_was_not_recorded_too(tmp_path, monkeypatch):
@@ -295,6 +295,6 @@ def test_the_pictures_of_a_run_are_coloured_by_what_was_not_recorded_too(tmp_pat
     main(["run", "scene.toml", "--steps", "2", "--no-pictures", "--out", "run"])
     main(["picture", "run", "--out", "plain.png", "--set", "picture.width=160", "--set", "picture.height=120"])
     for name in ("speed", "pressure"):
-        sizes = ["--set", "picture.width=160", "--set", "picture.height=120", "--set", f"picture.colour_by={name}"]
+        sizes = ["--set", "picture.width=160", "--set", "picture.height=120", "--set", f"picture.colour={name}"]
         main(["picture", "run", "--out", f"{name}.png", *sizes])
         assert (tmp_path / f"{name}.png").read_bytes() != (tmp_path / "plain.png").read_bytes()

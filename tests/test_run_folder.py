@@ -125,6 +125,14 @@ def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
         RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
 
 
+def test_what_colours_pictures_had_another_name(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", Scene(**plane(picture={"colour": "speed"})).to_json(), [])
+    folder.scene.write_text(folder.scene.read_text().replace('"colour": "speed"', '"colour_by": "speed"'))
+    assert folder.read_scene().picture.colour == "speed"
+    folder.scene.write_text(folder.scene.read_text().replace('"colour_by": "speed"', '"colour_by": null'))
+    assert folder.read_scene().picture.colour == "phase"
+
+
 def test_a_former_default_of_a_scene_was_not_asked_for(tmp_path):
     """Runs of before wrote 120 as film_frames, the default then, whether or not anybody had asked for it."""
     scene = Scene(**plane(picture={"film_frames": 120, "width": 100}))

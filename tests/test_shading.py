@@ -18,9 +18,10 @@ from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
 from cortado.pictures.film import film, lacking
 from cortado.pictures.labels import labelled, side_by_side
+from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.scenery import sceneries, scenery
+from cortado.pictures.scenery import State, sceneries, scenery
 from cortado.pictures.shadow import floor_shadow
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.surface import spheres
@@ -231,9 +232,9 @@ class _Shades:
         return (picture for picture, _ in states)
 
 
-def page_of(picture):
+def page_of(picture, fingerprint=""):
     """A page that shows what a function returns for the number of a frame."""
-    return Page(_Shades(), [lambda k: (picture(k), None)])
+    return Page(_Shades(), [lambda k: (picture(k), None)], fingerprint=fingerprint)
 
 
 def test_a_page_shows_its_states_side_by_side():
@@ -244,7 +245,7 @@ def test_a_page_shows_its_states_side_by_side():
 
 def test_processes_draw_what_one_draws():
     positions, colours = first_state(scene_of(fluids=2))
-    states = [(positions + (0.0, 0.02 * k, 0.0), colours) for k in range(5)]
+    states = [State(positions + (0.0, 0.02 * k, 0.0), colours) for k in range(5)]
     stage = Stage.of(scene_of(fluids=2), positions)
     for one, other in zip(sceneries(stage, states, 1), sceneries(stage, states, 2), strict=True):
         assert len(one.surface.triangles) == len(other.surface.triangles)  # whose order differs from call to call
@@ -262,7 +263,7 @@ def test_a_process_that_is_killed_is_a_sentence(monkeypatch):
     stage = Stage.of(scene_of(), positions)
     monkeypatch.setattr("cortado.pictures.scenery.scenery", _killed)
     with pytest.raises(ComputationError, match="CORTADO_CORES"):
-        list(sceneries(stage, [(positions, colours)], 2))
+        list(sceneries(stage, [State(positions, colours)], 2))
 
 
 def test_a_lattice_in_a_round_cup_reaches_its_glass():
@@ -273,7 +274,7 @@ def test_a_lattice_in_a_round_cup_reaches_its_glass():
             container={**cup, "radius": radius, "height": 0.8},
         )
         positions, colours = first_state(scene)
-        off = scenery(Stage.of(scene, positions), positions, colours).surface.points
+        off = scenery(Stage.of(scene, positions), State(positions, colours)).surface.points
         level = off[np.abs(off[:, 1] + 0.2) < 0.1]  # halfway up the fluid
         turn = np.arctan2(level[:, 2], level[:, 0])
         reached = [np.hypot(*level[np.abs(turn - at) < 0.1][:, ::2].T).max() for at in np.linspace(-3.0, 3.0, 31)]
@@ -283,7 +284,7 @@ def test_a_lattice_in_a_round_cup_reaches_its_glass():
 def test_a_film_has_its_size_and_its_frames(tmp_path):
     av = pytest.importorskip("av")
     shades = [np.full((34, 64, 3), k / 10.0) for k in range(11)]
-    path = film(tmp_path / "film.mp4", page_of(shades.__getitem__), range(11), 6)
+    path = film(tmp_path / "film.mp4", page_of(shades.__getitem__), range(11), Pace.of(np.arange(11.0), 6)).path
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
@@ -291,32 +292,53 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
     assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
 
 
-def frames_of(path):
+def shown_in(path):
+    """How bright the frames of a film are, from 0 to 1, and when each is shown [s]."""
     with pytest.importorskip("av").open(str(path)) as container:
-        return sum(1 for _ in container.decode(video=0))
+        frames = [(frame.to_ndarray(format="gray").mean() / 255.0, frame.time) for frame in container.decode(video=0)]
+    return np.array(frames).T
 
 
-def black(k):
-    return np.zeros((32, 32, 3))
+def test_a_film_that_is_stopped_keeps_its_frames_and_goes_on(tmp_path):
+    path, pace, drawn = tmp_path / "film.mp4", Pace.of(0.1 * np.arange(20.0) ** 1.5), []
+
+    def shade(k, last=20):
+        if k == last:
+            raise KeyboardInterrupt
+        drawn.append(k)
+        return np.full((32, 32, 3), k / 20.0)
+
+    with pytest.raises(KeyboardInterrupt):
+        film(path, page_of(lambda k: shade(k, 7), "a run"), range(20), pace)
+    assert len(shown_in(path)[0]) == 7 and drawn == list(range(7))
+    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
+    film(path, page_of(shade, "a run"), range(20), pace)
+    light, times = shown_in(path)
+    assert drawn == list(range(20)) and np.all(np.diff(light) > 0.0)
+    np.testing.assert_allclose(times, pace.times, atol=1e-4)
+    film(path, page_of(shade, "another run"), range(20), pace)  # nor does one that is whole go on
+    film(path, page_of(shade, "another run"), range(20), pace)
+    assert len(drawn) == 60
 
 
-def test_a_film_takes_no_longer_than_it_may_and_says_what_is_left_out(tmp_path, monkeypatch, capsys):
-    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(30))) == 30
-    assert "frames" not in capsys.readouterr().err
-    monkeypatch.setattr(shading_film, "SECONDS", 0.0)
-    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(100))) == shading_film.LEAST_FRAMES
-    said = capsys.readouterr().err
-    assert "film.mp4 has 16 of 100 frames" in said and "; picture.film_frames=100 draws them." in said
-    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(300))) == shading_film.LEAST_FRAMES
-    assert "film.mp4 has 16 of 120 frames" in capsys.readouterr().err
+def test_a_film_shows_every_frame_in_real_time_or_as_slowly_as_it_says():
+    long, short = Pace.of(np.linspace(0.0, 8.0, 201)), Pace.of(0.0015 * np.arange(421))
+    assert len(long.frames) == 201 and long.speed == 1.0 and str(long) == "201 frames, 8.0 s, in real time"
+    assert len(short.frames) == 421 and short.speed == 0.05 and str(short) == "421 frames, 12.6 s, at 0.05 x"
+    np.testing.assert_allclose(np.diff(short.times), 0.03)
+    assert Pace.of(10.0 * np.arange(101)).speed == 50.0  # a frame every 10 s
 
 
-def test_a_film_has_as_many_frames_as_are_asked_for(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(shading_film, "SECONDS", 0.0)
-    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(100), 90)) == 90
-    assert "draws them" not in capsys.readouterr().err
-    with pytest.warns(CortadoWarning, match=r"film.mp4 has 7 frames of the 90 that picture.film_frames asks for"):
-        assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(7), 90)) == 7
+def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
+    times = np.linspace(0.0, 2.0, 401)
+    some = Pace.of(times, 101)
+    assert len(some.frames) == 101 and some.frames[:3] == (0, 4, 8) and some.frames[-1] == 400
+    assert str(some) == "101 frames, 4.0 s, at 0.5 x; 300 of the 401 that were recorded are left out"
+    asked = Pace.of(times, speed=1.0)  # 200 in a second are more than one sees
+    assert len(asked.frames) == 121 and asked.times[-1] == 2.0 and "280 of the 401" in str(asked)
+    with pytest.warns(CortadoWarning, match=r"the film has 7 frames of the 90 that picture.film_frames asks for"):
+        assert len(pace_of(np.arange(7.0), Picture(film_frames=90)).frames) == 7
+    assert str(Pace.unknown(50)) == "50 frames, 4.0 s, step by step"
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch):
@@ -414,8 +436,8 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "a" / "report.html").read_text().count("data:video/mp4") == 1
     main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
-    main(["picture", "a", "--film"])
-    capsys.readouterr()
+    main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
+    assert "film.mp4: 4 frames, 1.7 s, at 0.005 x." in capsys.readouterr().out
     main(["optimise", "task.toml", "--out", "b"])
     assert capsys.readouterr().out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
@@ -425,6 +447,12 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "c" / "figures" / "film.mp4").exists()
     for arguments, sentence in (
         (["--frame", "9"], "--frame is 9, but the run has 4 frames"),
+        (["--camera", "fly"], "picture.camera_path.kind is 'fly'"),
+        (
+            ["--camera", "follow:raft"],
+            "picture.camera_path is a table, but must be left out, as the scene has 2 dimensions",
+        ),
+        (["--colour", "heat"], "picture.colour is 'heat'"),
         (["--set", "solver.time_step=1"], "must begin with picture."),
     ):
         with pytest.raises(SystemExit) as end:

@@ -313,7 +313,7 @@ def test_solids_are_drawn_in_their_poses_from_one_place(dimension):
     )
     positions = COLUMN[dimension]
     artist, colours = painter(before, positions, poses=[after]), colours_of(before, None, len(positions))
-    images = [one.image(positions, colours) for one in (artist, artist.posed(before), artist.posed(after))]
+    images = [artist.image(positions, colours, pose) for pose in (None, before, after)]
     np.testing.assert_array_equal(images[0], images[1])
     far = painter(after, positions, poses=[before]).image(positions, colours)
     np.testing.assert_array_equal(images[2], far)

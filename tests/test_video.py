@@ -6,10 +6,11 @@ import av
 import numpy as np
 import pytest
 
-from cortado.errors import InputError
+from cortado.errors import ComputationError, InputError
 from cortado.files.srgb import to_srgb
-from cortado.files.video import write_video
+from cortado.files.video import BITS, write_video, writing
 from cortado.pictures.image_files import COFFEE, MILK, heart
+from full_disk import largest_file
 
 
 def levels_of(frame: av.VideoFrame) -> np.ndarray:
@@ -59,7 +60,34 @@ def test_what_cannot_be_filmed_is_a_sentence(tmp_path, name, frames, rate, words
     assert not list(tmp_path.iterdir())
 
 
+def test_a_full_disk_is_a_sentence_and_keeps_the_film_of_before(tmp_path):
+    path, noise = write_video(tmp_path / "a.mp4", [heart(16)]), np.random.default_rng(0)
+    before = path.read_bytes()
+    with largest_file(20_000), pytest.raises(ComputationError, match=r"a\.mp4 cannot be written: .*free some space"):
+        write_video(path, (noise.random((180, 320, 3)) for _ in range(100)))
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"] and path.read_bytes() == before
+
+
+def test_what_follows_no_film_that_is_there_begins_anew(tmp_path):
+    path = tmp_path / "a.mp4"
+    for content in (b"", b"no film"):
+        path.write_bytes(content)
+        with writing(path, 25.0, "note", 2) as video:
+            assert video.frames == 0
+            video.add(heart(16), 0.0)
+    assert path.stat().st_size > 500
+
+
 def test_a_missing_package_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install 'cortado-sph\[video\]'"):
         write_video(tmp_path / "a.mp4", [heart(16)])
+
+
+def test_noise_takes_no_more_than_10_mb_a_minute(tmp_path):
+    """At 1080 lines: the limit goes with the pixels. Besides it there are four seconds' worth of it in store."""
+    noise, pixels = np.random.default_rng(0), 320 * 180 / (1920 * 1080)
+    path = write_video(tmp_path / "a.mp4", (noise.random((180, 320, 3)) for _ in range(75)), 25)
+    most = BITS * pixels**0.75 / 8  # bytes a second
+    assert 1.0 * most < path.stat().st_size < 1.1 * (3.0 + 4.0) * most
+    assert BITS / 8 * (60 + 4) < 10e6

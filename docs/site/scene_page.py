@@ -380,6 +380,26 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
             ),
         ),
     ),
+    (
+        "## Cameras that move: `camera_path`",
+        "How the camera of a film moves, a key of `[picture]` ([pictures](pictures.md#cameras-that-move)).",
+        (
+            ("Orbit", "### Around the scene", '[picture]\ncamera_path = {kind = "orbit", turns = 0.5}'),
+            ("Dolly", "### Nearer or further away", '[picture]\ncamera_path = {kind = "dolly", distance = 0.5}'),
+            (
+                "Keyframes",
+                "### Through places",
+                '[picture.camera_path]\nkind = "keyframes"\ntimes = [0.0, 1.0]                  # s\n'
+                "cameras = [[1.0, 1.0, 3.0], [3.0, 1.0, 1.0]]",
+            ),
+            (
+                "Follow",
+                "### With a solid",
+                '[[solid]]\nname = "raft"\nshape = "box"\nlower = [0.6, 0.0, 0.1]\nupper = [0.8, 0.1, 0.4]\n\n'
+                '[picture]\ncamera_path = {kind = "follow", solid = "raft"}',
+            ),
+        ),
+    ),
 ]
 """Of every section its heading, its words, and tables: name of the model, heading, example."""
 

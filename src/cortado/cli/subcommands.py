@@ -182,6 +182,9 @@ def picture(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
     frame: int = -1,
     film: Flag = False,
+    lines: int | None = None,
+    camera: str | None = None,
+    colour: str | None = None,
     out: Path | None = None,
     overrides: Overrides = (),
     device: Device = "cpu",
@@ -191,13 +194,17 @@ def picture(
     Args:
         run: The folder of the run.
         frame: Number of a recorded frame, counted from the end where it is negative.
-        film: A film of all frames in its place.
+        film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
+        lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
+        camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
+        colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
         out: Where to write it; into the run's figures if left out.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
-    from cortado.cli.commands.picture import draw_run
+    from cortado.cli.commands.picture import draw_run, picture_settings
 
-    return partial(draw_run, run, frame, film, out, as_text(overrides), device)
+    settings = picture_settings(lines, camera, colour)
+    return partial(draw_run, run, frame, film, out, as_text(overrides), device, settings)
 
 
 @command(app)

@@ -7,6 +7,7 @@ library, or get lost in it. Within `keeping` it is a `KeyboardInterrupt`, so tha
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -94,6 +95,22 @@ class Hold:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         while self._late:
             os.kill(os.getpid(), self._late.pop())
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Within it signals wait, so that what is written is whole; other threads than the first never hear of them."""
+    late, before = list[int](), dict[int, Any]()
+    if threading.current_thread() is threading.main_thread():
+        heard = [number for number in SIGNALS if callable(signal.getsignal(number))]
+        before = {number: signal.signal(number, lambda number, _: late.append(number)) for number in heard}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in late:
+            signal.raise_signal(number)
 
 
 def _first_said(stop: BaseException | None) -> str:

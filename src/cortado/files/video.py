@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,50 +13,146 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
-from cortado.files.atomic import write_atomically
+from cortado.files.atomic import sentences, unfinished
+from cortado.files.interruption import held
 from cortado.files.srgb import to_srgb
 
-MOST_FRAMES = 120
-"""Frames of a report's video."""
 QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
+BITS = 1.2e6
+"""A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
+TICKS = 90_000
+"""Of a second, in which times of frames are counted."""
 
 
-def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25) -> Path:
-    """Writes a video and returns its path. The file appears whole, when the last frame is in it.
+class Video:
+    """A video that grows by a frame at a time; see `writing`."""
+
+    def __init__(self, container: Any, frames_per_second: float):
+        self._container, self._rate = container, frames_per_second
+        self._stream: Any = None
+        self._shape: tuple[int, ...] | None = None
+        self.frames = 0
+        """How many it has."""
+
+    def add(self, image: ArrayLike, time: float) -> None:
+        """One more frame, shown from a time [s] on: a linear image (rows, columns, 3), of which the last row or column
+        is repeated where a side is odd."""
+        pixels = to_srgb(image)
+        self._shape = self._shape or pixels.shape
+        if pixels.shape != self._shape:
+            found = f"Frame {self.frames} of the video has shape {pixels.shape}"
+            raise InputError(f"{found}, but those before it {self._shape}.")
+        rows, columns = self._shape[:2]
+        even = np.pad(pixels, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")  # yuv420p: a colour for 2 x 2
+        frame, stream = _frame(even), self._stream_of(even.shape[1], even.shape[0])
+        frame.pts, frame.duration, frame.time_base = round(time * TICKS), round(TICKS / self._rate), stream.time_base
+        with held():
+            self._container.mux(stream.encode(frame))
+            self.frames += 1
+
+    def copy(self, other: Any) -> None:
+        """The frames of a video that was written here, which is open, as they are, before others are added."""
+        from av.bitstream import BitStreamFilterContext
+
+        source = other.streams.video[0]
+        own, plain = self._stream_of(source.width, source.height), BitStreamFilterContext("h264_mp4toannexb", source)
+        for packet in other.demux(source):
+            for part in plain.filter(None if packet.dts is None else packet):
+                part.stream = own
+                self._container.mux(part)
+        self.frames = source.frames
+
+    def finish(self) -> None:
+        """Write what the encoder still holds."""
+        if self._stream is not None:
+            self._container.mux(self._stream.encode())
+
+    def _stream_of(self, width: int, height: int) -> Any:
+        """The stream, made for the first frame. No frame depends on a later one, so that others can follow a copy."""
+        if self._stream is None:
+            most = BITS * (width * height / (1920 * 1080)) ** 0.75
+            options = {"crf": QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
+            rate = Fraction(self._rate).limit_denominator(1001)
+            self._stream = self._container.add_stream("libx264", rate=rate, options=options)
+            self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+            self._stream.time_base = self._stream.codec_context.time_base = Fraction(1, TICKS)
+            _describe_colours(self._stream.codec_context)
+        return self._stream
+
+
+@contextmanager
+def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
+    """A video that appears under its path when the block ends. Where it is interrupted, the frames so far appear, and
+    the next call with the same ``note`` and ``count`` begins with them.
 
     Args:
         path: ends in .mp4.
-        frames: linear images (rows, columns, 3) of one size, taken one at a time; an odd side is made even by
-            repeating the last row or column.
-        frames_per_second: one frame of a simulation may last longer or shorter than in life.
+        frames_per_second: about; each frame has a time of its own.
+        note: what the video is made of, which is written into it.
+        count: how many frames it will have.
 
     Raises:
         InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
+        ComputationError: the disk is full.
     """
-    av = _pyav()
-    path = Path(path)
+    av, path = _pyav(), Path(path)
     if path.suffix.lower() != ".mp4":
         raise InputError(f"The video {path} must end in .mp4.")
     if not 0.0 < frames_per_second < np.inf:
         raise InputError(f"frames_per_second is {frames_per_second}, but must be a positive number.")
-    images = _even_images(frames)
-    first = next(images, None)
-    if first is None:
-        raise InputError(f"The video {path} has no frames; give one at least.")
-    content = BytesIO()
-    with av.open(content, "w", format="mp4") as container:
-        rate = Fraction(frames_per_second).limit_denominator(1001)
-        stream = container.add_stream("libx264", rate=rate, options={"crf": QUALITY})
-        stream.height, stream.width = first.shape[:2]
-        stream.pix_fmt = "yuv420p"
-        _describe_colours(stream.codec_context)
-        container.mux(stream.encode(_frame(av, first)))
-        for image in images:
-            container.mux(stream.encode(_frame(av, image)))
-        container.mux(stream.encode())
-    write_atomically(path, content.getvalue())
-    return path
+    temporary = unfinished(path)
+    with sentences(path):
+        try:
+            with open(temporary, "xb") as file:
+                container = av.open(file, "w", format="mp4", options={"movflags": "+faststart"})
+                container.metadata["comment"] = note
+                video = Video(container, frames_per_second)
+                _begin(av, video, path, note, count)
+                try:
+                    yield video
+                except KeyboardInterrupt:
+                    if video.frames:
+                        _end(video, container, file)
+                        os.replace(temporary, path)
+                    raise
+                if not video.frames:
+                    raise InputError(f"The video {path} has no frames; give one at least.")
+                _end(video, container, file)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25.0) -> Path:
+    """Write a video of linear images (rows, columns, 3) of one size, taken one at a time, and return its path; errors
+    as of `writing`."""
+    with writing(path, frames_per_second) as video:
+        for k, frame in enumerate(frames):
+            video.add(frame, k / frames_per_second)
+    return Path(path)
+
+
+def _begin(av: Any, video: Video, path: Path, note: str, count: int) -> None:
+    """With the frames of one that was interrupted, if it is there."""
+    if not note or not path.is_file():
+        return
+    try:
+        former = av.open(str(path))
+    except (av.error.FFmpegError, OSError):
+        return  # it is no video
+    with former:
+        ours = former.metadata.get("comment") == note and len(former.streams.video) == 1
+        if ours and 0 < former.streams.video[0].frames < count:
+            video.copy(former)
+
+
+def _end(video: Video, container: Any, file: Any) -> None:
+    with held():
+        video.finish()
+        container.close()
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _pyav() -> Any:
@@ -66,20 +163,10 @@ def _pyav() -> Any:
     return av
 
 
-def _even_images(frames: Iterable[ArrayLike]) -> Iterator[NDArray[np.uint8]]:
-    """(rows, columns, 3) sRGB, both sides even, as yuv420p has one colour for two by two pixels"""
-    shape = None
-    for k, frame in enumerate(frames):
-        image = to_srgb(frame)
-        shape = shape or image.shape
-        if image.shape != shape:
-            raise InputError(f"Frame {k} of the video has shape {image.shape}, but those before it {shape}.")
-        rows, columns = shape[:2]
-        yield np.pad(image, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
-
-
-def _frame(av: Any, image: NDArray[np.uint8]) -> Any:
+def _frame(image: NDArray[np.uint8]) -> Any:
     """The image as luma and chroma of ITU-R BT.709, which `_describe_colours` tells the player."""
+    import av
+
     frame = av.VideoFrame.from_ndarray(image, format="rgb24")
     return frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
 

@@ -4,6 +4,10 @@ from cortado.lazy import getter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from cortado.pictures.camera_paths import Dolly as Dolly
+    from cortado.pictures.camera_paths import Follow as Follow
+    from cortado.pictures.camera_paths import Keyframes as Keyframes
+    from cortado.pictures.camera_paths import Orbit as Orbit
     from cortado.pictures.image_files import COFFEE as COFFEE
     from cortado.pictures.image_files import MILK as MILK
     from cortado.pictures.image_files import WHITE as WHITE
@@ -12,10 +16,12 @@ if TYPE_CHECKING:
     from cortado.pictures.image_files import rosetta as rosetta
     from cortado.pictures.image_files import write_picture as write_picture
 
-__all__ = ["COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture"]
+_PATHS = ("Dolly", "Follow", "Keyframes", "Orbit")
+_FILES = ("COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture")
+__all__ = [*_PATHS, *_FILES]
 
 if not TYPE_CHECKING:
-    __getattr__ = getter(__name__, dict.fromkeys(__all__, "image_files"))
+    __getattr__ = getter(__name__, dict.fromkeys(_FILES, "image_files") | dict.fromkeys(_PATHS, "camera_paths"))
 
 
 def __dir__() -> list[str]:

@@ -1,38 +1,43 @@
 """Films of shaded pictures."""
 
-import time
-import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
-
-from cortado.discretise.shapes import Points
-from cortado.errors import CortadoWarning
 from cortado.files.progress import track
-from cortado.files.terminal import note
-from cortado.files.video import write_video
+from cortado.files.video import writing
+from cortado.pictures.notebook import with_video
+from cortado.pictures.pace import Pace
 from cortado.pictures.page import Page
-from cortado.scene.picture import MOST_FRAMES, Picture
+from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
-from cortado.words import counted
 
-SECONDS = 40.0
-"""[s] that a film may take to draw, about, where its scene does not say how many frames it has."""
-LEAST_FRAMES = 16
-"""Of such a film, however long they take."""
-ALONE = 0.25
-"""The part of the time of a picture of a large fluid that is not shared by processes, about."""
-SHORTEST, SLOWEST, QUICKEST = 4.0, 6.0, 25.0
-"""[s] that a film lasts if it can, and its frames per second at least and at most."""
+
+@dataclass(frozen=True)
+class Film:
+    """A film that is written."""
+
+    path: Path
+    pace: Pace
+    """Which frames it shows, and how fast."""
+
+    def __str__(self) -> str:
+        return f"{self.path.name}: {self.pace}"
+
+    def __repr__(self) -> str:
+        return f"Film({self.path}, {self.pace})"
+
+    def _repr_html_(self) -> str:
+        """To be played."""
+        return with_video(self, self.path)
 
 
 def lacking(scene: Scene) -> str | None:
     """A sentence about the package that shaded pictures of a scene need and that is not there; None where nothing is
     missing."""
     picture = scene.picture or Picture()
-    needed = {"av": "PyAV"} if picture.most_frames else {}
+    needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
     if scene.dimension == 3 and picture.surface == "liquid":
         needed["pysplashsurf"] = "pysplashsurf"
     missing = [name for module, name in needed.items() if find_spec(module) is None]
@@ -42,38 +47,15 @@ def lacking(scene: Scene) -> str | None:
     return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install 'cortado-sph[pictures]'."
 
 
-def film(path: Path, page: Page, frames: Sequence[int], asked: int | None = None) -> Path:
-    """Write a film of so many of these frames, evenly chosen; where none are asked for of so many as are drawn in
-    `SECONDS`. Says how many are left out; returns its path."""
-    count = _in_time(path, page, frames) if asked is None else _there(path, len(frames), asked)
-    chosen = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
-    rate = float(np.clip(len(chosen) / SHORTEST, SLOWEST, QUICKEST))
-    with track(len(chosen), "film") as advance:
-
-        def told(image: Points) -> Points:
-            advance()
-            return image
-
-        return write_video(path, map(told, page.images(chosen)), rate)
-
-
-def _there(path: Path, most: int, asked: int) -> int:
-    """How many frames a film has of those that are asked for, with a warning where that is not all."""
-    if most < asked:
-        found = f"{path.name} has {counted(most, 'frame')} of the {asked} that picture.film_frames asks for"
-        advice = "a smaller --record-every or more steps give more"
-        warnings.warn(f"{found}, as the run has no more; {advice}.", CortadoWarning, stacklevel=4)
-    return min(asked, most)
-
-
-def _in_time(path: Path, page: Page, frames: Sequence[int]) -> int:
-    """How many frames are drawn in `SECONDS`, about."""
-    begun = time.monotonic()
-    page.image(frames[len(frames) // 2])
-    each = (time.monotonic() - begun) * (ALONE + (1.0 - ALONE) / page.painter.at_once)
-    most = min(MOST_FRAMES, len(frames))
-    count = min(most, max(int(SECONDS / max(each, 1e-6)), LEAST_FRAMES))
-    if count < most:
-        found = f"{path.name} has {count} of {most} frames, as all of them would take about {most * each:.0f} s"
-        note(f"{found}; picture.film_frames={most} draws them.")
-    return count
+def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
+    """Write a film of those of the frames that a pace chooses. Where it is interrupted, what is drawn is kept, and the
+    next call of the same film goes on after it."""
+    shown = [frames[k] for k in pace.frames]
+    note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
+    with writing(path, pace.frames_per_second, note, len(shown)) as video:
+        there = video.frames
+        with track(len(shown) - there, "film") as advance:
+            for image, time in zip(page.images(shown[there:]), pace.times[there:], strict=True):
+                video.add(image, time)
+                advance()
+    return Film(path, pace)

@@ -159,15 +159,20 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
         InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
             .png, or a file that cannot be written.
     """
-    from PIL import Image
-
     if Path(as_path("path", path)).suffix.lower() != ".png":
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
+    write_atomically(Path(path), png(image))
+    return Path(path)
+
+
+def png(image: ArrayLike) -> bytes:
+    """What `write_picture` writes."""
+    from PIL import Image
+
     pixels, content = to_srgb(image), BytesIO()
     check_light("The image", image)
     Image.fromarray(pixels).save(content, format="PNG")
-    write_atomically(Path(path), content.getvalue())
-    return Path(path)
+    return content.getvalue()
 
 
 def _drawn(

@@ -10,21 +10,42 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.files.srgb import from_srgb
 
+FINER = 3
+"""How many times finer than pixels lines are drawn, for smooth edges."""
+Text = tuple[tuple[int, int], str, str]
+"""Where words are, (column, row), the words, and which point of them is there, by Pillow's two letters."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 
 
 def labelled(image: Points, text: str) -> Points:
     """A picture (rows, columns, 3), linear, with a word at its top, on the left."""
+    size = max(round(0.042 * image.shape[0]), 11)
+    return written(image, [((round(0.9 * size), round(0.7 * size)), text, "la")], size)
+
+
+def written(image: Points, texts: Sequence[Text], size: int) -> Points:
+    """A picture (rows, columns, 3), linear, with texts on it, whose letters are so many pixels high."""
     from PIL import Image, ImageDraw
 
-    size = max(round(0.042 * image.shape[0]), 11)
-    labelled = np.array(image)
-    strip = labelled[: 3 * size]
-    mask = Image.new("L", strip.shape[1::-1])
-    ImageDraw.Draw(mask).text((round(0.9 * size), round(0.7 * size)), text, fill=255, font=_font(size))
+    mask = Image.new("L", image.shape[1::-1])
+    for place, text, anchor in texts:
+        ImageDraw.Draw(mask).text(place, text, fill=255, font=_font(size), anchor=anchor)
     cover = (np.asarray(mask) / 255.0)[..., None]
-    strip[:] = strip * (1.0 - cover) + INK * cover
-    return labelled
+    return image * (1.0 - cover) + INK * cover
+
+
+def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
+    """A picture (rows, columns, 3), linear, with lines of a linear colour (3,) on it, through points (k, 2), columns
+    and rows; ``width`` in pixels."""
+    from PIL import Image, ImageDraw
+
+    rows, columns = image.shape[:2]
+    mask = Image.new("L", (FINER * columns, FINER * rows))
+    for line in lines:
+        points = [tuple(point) for point in (FINER * np.asarray(line)).tolist()]
+        ImageDraw.Draw(mask).line(points, fill=255, width=FINER * width, joint="curve")
+    cover = (np.asarray(mask.resize((columns, rows), Image.Resampling.BOX)) / 255.0)[..., None]
+    return image * (1.0 - cover) + colour * cover
 
 
 def side_by_side(images: Sequence[Points], across: int) -> Points:

@@ -78,6 +78,6 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
                         arriving_sun = 0.0
                 sunlight += arriving_sun
             sunlight = sunlight * cosine / wp.float32(sun_directions.shape[0])
-        light[i] = 0.70 * around + wp.vec3(0.62, 0.60, 0.57) * sunlight
+        light[i] = 0.70 * around + s.sunlight * sunlight
 
     return illuminate

@@ -18,6 +18,8 @@ class LitSurface:
     """(points,) light that falls on the surface, of which white reflects 1"""
     scattering: wp.float32
     """Of a fluid [1/m]."""
+    is_flat: wp.int32
+    """Whether its colours are shown as they are, without light and shadow."""
     reach: wp.float32
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
     left: wp.array(dtype=wp.vec2)

@@ -23,6 +23,13 @@ def with_view(found: object, view: str, draw: Callable[[Path], Any]) -> str:
     return as_words(found) + frame + still
 
 
+def with_video(found: object, path: Path) -> str:
+    """HTML of an object: its repr, and a video in a file, which is part of the page."""
+    content = b64encode(path.read_bytes()).decode()
+    source = f"data:video/mp4;base64,{content}"
+    return f'{as_words(found)}<video controls loop muted playsinline src="{source}" style="width: 100%"></video>'
+
+
 def as_words(found: object) -> str:
     """HTML of the repr of an object."""
     return f"<p>{escape(repr(found))}</p>"

@@ -24,6 +24,8 @@ class Page:
     """From a frame to what the painter draws, for each picture that is part of the page."""
     composed: Callable[[list[Points]], Points] = alone
     """From the pictures of the states, (rows, columns, 3) each, to the page."""
+    fingerprint: str = ""
+    """A checksum of all that its pictures are made of; nothing where that is not known."""
 
     def image(self, frame: int) -> Points:
         """(rows, columns, 3), linear from 0 to 1."""

@@ -24,8 +24,8 @@ class Painter(Protocol):
     def at_once(self) -> int:
         """How many states `images` works on at a time."""
 
-    def image(self, positions: Points, colours: Points) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, d) [m] with colours (n, 3)."""
+    def image(self, *state: Any) -> Points:
+        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
 
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state in their order."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import starmap
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from cortado.pictures.mirrored import mirrored
 from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scenery import State
 from cortado.pictures.shown_solids import shown_solids
-from cortado.scene.scene import Scene
 
 SUPPORT = 1.3
 """In spacings: how far a particle is felt."""
@@ -33,11 +32,17 @@ class PlanePainter:
     stage: PlaneStage
     at_once: ClassVar[int] = 1
 
-    def image(self, positions: Points, colours: Points) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 2) [m] with colours (n, 3)."""
-        stage = self.stage
-        cover, colour = self._fluid(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
-        fluid = glossy(np.where(stage.free > 0.5, cover, 1.0), colour, stage.gloss_width)
+    def image(self, *state: Any) -> Points:
+        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
+        positions, colours, pose, _ = State(*state)
+        own = self if pose is None else PlanePainter(replace(self.stage, solids=shown_solids(pose)))
+        return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
+
+    def _drawn(self, positions: Points, colours: Points) -> Points:
+        """The picture with the solids where the stage has them."""
+        stage, (cover, colour) = self.stage, self._fluid(positions, colours)
+        body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
+        fluid = glossy(body, colour, width) if stage.picture.shaded else colour
         alpha = (cover * stage.shown)[..., None]
         image = stage.behind * (1.0 - alpha) + fluid * alpha
         for opacity, light in stage.before:
@@ -47,10 +52,6 @@ class PlanePainter:
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state in their order."""
         return starmap(self.image, states)
-
-    def posed(self, scene: Scene) -> "PlanePainter":
-        """The same with the solids where a scene has them."""
-        return PlanePainter(replace(self.stage, solids=shown_solids(scene)))
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
         """(rows, columns) the part of each pixel that fluid covers, and its colour (rows, columns, 3)."""

@@ -65,6 +65,16 @@ class PlaneStage:
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
+    def on_screen(self, points: Points) -> Points:
+        """As `Stage.on_screen`, of points (n, 2) [m]."""
+        off = (points - 0.5 * (self.lower + self.upper)) / self.pixel
+        return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
+
+    @property
+    def up_axis(self) -> int:
+        """Which axis of the scene is upright in the picture."""
+        return 1
+
     @property
     def gloss_width(self) -> float:
         """How wide the edges of bodies are drawn, in pixels."""
@@ -134,7 +144,7 @@ class PlaneStage:
         x, y = self.pixels
         middle, half = 0.5 * (self.lower + self.upper), 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
-        return np.asarray(self.picture.background) * (1.12 - 0.20 * away)[..., None]
+        return np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
 
     @cached_property
     def _room(self) -> Points:

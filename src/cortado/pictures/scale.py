@@ -7,12 +7,16 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.files.srgb import from_srgb
-from cortado.pictures.labels import labelled
+from cortado.pictures.labels import INK, written
 from cortado.scene.quantities import QUANTITIES
 
 PALETTE = "cividis"
 OUTERMOST = (0.5, 99.5)
 """Percentiles at the ends of the scale, so that a few particles do not darken all the others."""
+
+
+UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
+"""Of what all scenes have, by its name."""
 
 
 @dataclass(frozen=True)
@@ -29,23 +33,37 @@ class Scale:
         """That of numbers, such as those of all frames of a film; ``unit`` of what is no quantity that all scenes
         have."""
         least, greatest = np.percentile(values, OUTERMOST)
-        return cls(name, QUANTITIES[name].unit if unit is None else unit, float(least), float(greatest))
+        return cls(name, UNITS[name] if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
         """(n, 3) linear, of numbers (n,)."""
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def beside(self, image: Points) -> Points:
-        """A picture (rows, columns, 3) with the colours along its lower edge, and words at its top that say what they
-        are."""
+        """A picture (rows, columns, 3) with the scale at its right edge: its colours with numbers beside them, the
+        greatest on top, and its name and unit above."""
         rows, columns = image.shape[:2]
-        height, margin = max(rows // 60, 3), max(rows // 40, 4)
-        words = f"{self.name.replace('_', ' ')} from {self.least:.3g} to {self.greatest:.3g} {self.unit}"
-        told = labelled(image, words)
-        told[rows - margin - height : rows - margin, margin : columns - margin] = _colours(
-            np.linspace(0.0, 1.0, columns - 2 * margin)
-        )
-        return told
+        size = max(round(0.026 * rows), 9)
+        top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
+        left = right - 3 * size - size // 2
+        found, bar = np.array(image), _colours(np.linspace(1.0, 0.0, bottom - top))
+        found[top:bottom, left : left + size // 2] = bar[:, None]
+        name = self.name.replace("_", " ")
+        texts = [((right, top - 3 * size), name, "rm"), ((right, top - 3 * size // 2), f"[{self.unit}]", "rm")]
+        for number in self._ticks():
+            row = bottom - 1 - round((number - self.least) / (self.greatest - self.least) * (bottom - top - 1))
+            found[row, left + size // 2 : left + 3 * size // 4] = INK
+            texts.append(((left + size, row), f"{number:.4g}", "lm"))
+        return written(found, texts, size)
+
+    def _ticks(self) -> list[float]:
+        """Round numbers that are told."""
+        from matplotlib.ticker import MaxNLocator
+
+        if not self.greatest > self.least:
+            return []
+        found = MaxNLocator(nbins=4, steps=[1, 2, 2.5, 5, 10]).tick_values(self.least, self.greatest)
+        return [float(number) for number in found if self.least <= number <= self.greatest]
 
 
 def _colours(shares: NDArray) -> Points:

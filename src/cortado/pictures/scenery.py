@@ -9,6 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import get_context
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,34 +19,49 @@ from cortado.errors import ComputationError
 from cortado.pictures.shadow import floor_shadow
 from cortado.pictures.stage import Stage
 from cortado.pictures.surface import Surface, liquid, spheres
+from cortado.scene.camera_paths import View
+from cortado.scene.scene import Scene
 
-State = tuple[Points, Points]
-"""Positions (n, d) [m] of particles, in the scene's axes, and their colours (n, 3), linear from 0 to 1"""
 LARGE = 20_000
 """Particles from which on a surface takes longer than to hand it from one process to another."""
 FEWEST, MOST = 4, 16
 """Processes: with fewer cores one does all, on all of them."""
 
 
+class State(NamedTuple):
+    """What a picture shows."""
+
+    positions: Points
+    """(n, d) of particles [m], in the scene's axes"""
+    colours: Points
+    """(n, 3) of particles, linear from 0 to 1"""
+    pose: Scene | None = None
+    """The scene with its solids where they are; where it has them if left out."""
+    view: View | None = None
+    """Where the camera is; home if left out."""
+
+
 @dataclass(frozen=True)
 class Scenery:
     """The fluid of one state, in the frame of the picture."""
 
+    stage: Stage
+    """With solids and the camera where they are."""
     surface: Surface
     shadow: tuple[Points, Points, float]
     """As `floor_shadow` returns it."""
 
 
-def scenery(stage: Stage, positions: Points, colours: Points) -> Scenery:
-    """That of particles at positions (n, 3) [m], in the scene's axes, with colours (n, 3)."""
-    placed = stage.placed(np.asarray(positions, dtype=np.float64))
-    colours = np.asarray(colours, dtype=np.float64)
+def scenery(home: Stage, state: State) -> Scenery:
+    """That of a state in 3-D."""
+    stage, colours = home.at(state.pose, state.view), np.asarray(state.colours, dtype=np.float64)
+    placed = stage.placed(np.asarray(state.positions, dtype=np.float64))
     if stage.picture.surface == "liquid":
         wet, of = stage.wetting(placed)
         surface = liquid(wet, colours[of], stage.spacing)
     else:
         surface = spheres(placed, colours, stage.spacing)
-    return Scenery(surface, floor_shadow(stage, placed, colours))
+    return Scenery(stage, surface, floor_shadow(stage, placed, colours))
 
 
 def sceneries(stage: Stage, states: Iterable[State], processes: int) -> Iterator[Scenery]:
@@ -56,17 +72,17 @@ def sceneries(stage: Stage, states: Iterable[State], processes: int) -> Iterator
         ComputationError: one of the processes was stopped.
     """
     if processes == 1:
-        yield from (scenery(stage, *state) for state in states)
+        yield from (scenery(stage, state) for state in states)
         return
     left = iter(states)
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_worker)
     try:
         begun: deque[Future[Scenery]] = deque(
-            pool.submit(scenery, stage, *state) for state in islice(left, 2 * processes)
+            pool.submit(scenery, stage, state) for state in islice(left, 2 * processes)
         )
         while begun:
             found = begun.popleft().result()
-            begun.extend(pool.submit(scenery, stage, *state) for state in islice(left, 1))
+            begun.extend(pool.submit(scenery, stage, state) for state in islice(left, 1))
             yield found
     except BrokenProcessPool as problem:
         raise ComputationError(

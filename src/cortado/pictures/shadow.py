@@ -30,7 +30,7 @@ def floor_shadow(stage: Stage, positions: Points, colours: Points) -> tuple[Poin
     near, least = np.exp(-height[:, 0] / (0.15 * stage.size)), 0.8 * stage.spacing
     key = _thickness(cast, colours, corner, cell, volume, max(0.022 * stage.size, least))
     around = _thickness(positions[:, ::2], colours, corner, cell, volume * near, max(0.05 * stage.size, least))
-    light = 1.0 - 0.48 * _hidden(stage, *key) - 0.32 * _hidden(stage, *around)
+    light = 1.0 - stage.picture.sun_and_sky.shadow * _hidden(stage, *key) - 0.32 * _hidden(stage, *around)
     return light, corner, cell
 
 
@@ -52,7 +52,7 @@ def solid_shadow(stage: Stage, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -
         key = _thickness(cast, colours, corner, cell, thick * towards, 0.022 * stage.size)
         around = _thickness(middle[:, ::2], colours, corner, cell, thick * flat, 0.05 * stage.size)
         hidden = [1.0 - np.exp(-thickness / (0.75 * stage.spacing)) for thickness, _ in (key, around)]
-        kept_off = (1.0 - shown.transparency) * (0.48 * hidden[0] + 0.32 * hidden[1])
+        kept_off = (1.0 - shown.transparency) * (stage.picture.sun_and_sky.shadow * hidden[0] + 0.32 * hidden[1])
         light = np.minimum(light, 1.0 - kept_off[..., None])
     return light
 

@@ -63,7 +63,7 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
     if reached.is_cut:
         n = wall_normal(s, o + reached.t * d)
         met.normal = wp.where(wp.dot(n, d) > 0.0, -n, n)
-        met.light = 0.35 * (s.horizon + s.zenith) + 0.62 * wp.vec3(wp.max(wp.dot(met.normal, s.sun), 0.0))
+        met.light = 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(met.normal, s.sun), 0.0)
     return met
 
 

@@ -1,7 +1,6 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
 from collections.abc import Iterable, Iterator
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.trace import Eye, find_contrast, trace_kernel
-from cortado.scene.scene import Scene
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -39,44 +37,37 @@ class SpacePainter:
     def __init__(self, stage: Stage, particles: int, device: Any = "cpu"):
         self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
         self._launch = BandLauncher(self.device)
-        self._surroundings, self._eye = _surroundings(stage), _eye(stage)
         self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
         kinds = self._solids.kinds if self._solids is not None else (False, False)
         self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
         self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
         self._lamps_of_solids = self._rays_to_light(*SOLID_RAYS)
 
-    def image(self, positions: Points, colours: Points) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 3) [m] with colours (n, 3)."""
-        return self._traced(scenery(self.stage, positions, colours))
+    def image(self, *state: Any) -> Points:
+        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
+        return self._traced(scenery(self.stage, State(*state)))
 
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state in their order; surfaces of large fluids are computed in several processes."""
         return map(self._traced, sceneries(self.stage, states, self.at_once))
 
-    def posed(self, scene: Scene) -> "SpacePainter":
-        """The same with the solids where a scene has them."""
-        found = copy(self)
-        found.stage = self.stage.posed(scene)
-        return found
-
     def _traced(self, fluid: Scenery) -> Points:
-        s = self._surroundings
-        light, corner, cell = fluid.shadow
+        s, (light, corner, cell) = _surroundings(fluid.stage), fluid.shadow
         s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
         if self._solids is not None:
-            light = np.minimum(light, self._solids.shadow(self.stage.solids))
+            light = np.minimum(light, self._solids.shadow(fluid.stage.solids))
         shadow = wp.array(light, dtype=wp.vec3, device=self.device)
         with WARP:
-            return self._rays(fluid.surface, s, shadow)
+            return self._rays(fluid.stage, fluid.surface, s, shadow)
 
-    def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
-        picture, device = self.stage.picture, self.device
+    def _rays(self, stage: Stage, surface: Surface, s: Any, shadow: wp.array) -> Points:
+        picture, device, eye = stage.picture, self.device, _eye(stage)
         seen = DeviceSurface.of(surface.points, surface.triangles, surface.normals, surface.colours, device)
         seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
+        seen.lit.is_flat = int(not picture.shaded)
         given, solids = {"s": s, "surface": seen.lit}, list[tuple[DeviceSurface, SolidMesh]]()
         if self._solids is not None:
-            s.solids, solids = self._solids.on_device(self.stage.solids)
+            s.solids, solids = self._solids.on_device(stage.solids)
         self._illuminate(seen, self._lamps, given)
         for one, mesh in solids:
             self._illuminate(one, self._lamps_of_solids, given)
@@ -87,7 +78,7 @@ class SpacePainter:
             asked = wp.array(pixels, dtype=wp.int32, device=device)
             where = wp.vec2(*offset)
             self._launch(
-                self._trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
+                self._trace, len(pixels), **given, eye=eye, shadow=shadow, pixels=asked, offset=where, image=found
             )
             return found
 
@@ -128,11 +119,12 @@ def _directions(count: int) -> Points:
 
 
 def _surroundings(stage: Stage) -> Any:
-    picture, s = stage.picture, Environment()
-    horizon = np.asarray(picture.background)
+    picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
+    horizon = np.asarray(light.background)
     s.size, s.nearest = stage.size, 1e-4 * stage.size
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
-    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * (0.62, 0.72, 0.84)))
+    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * light.zenith))
+    s.lamp, s.strip, s.sunlight = wp.vec3(*light.lamp), wp.vec3(*light.strip), wp.vec3(*light.sunlight)
     s.has_floor, s.floor_height = int(picture.floor), float(stage.lower[1])
     s.floor_colour = wp.vec3(*(0.93 * horizon))
     s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))

@@ -9,6 +9,7 @@ import numpy as np
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.mirrored import mirrored
 from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
+from cortado.scene.camera_paths import View
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
 from cortado.scene.picture import Picture
@@ -16,6 +17,8 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.10
 """How much wider a picture is than what it shows."""
+AROUND = 1.08
+"""How much further off a camera is that goes around, as what is shown is not in its middle from all sides."""
 AIR = 0.1
 """Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
@@ -43,6 +46,8 @@ class Stage:
     """(3,) where the camera is [m]"""
     look_at: Points
     """(3,) [m]"""
+    azimuth: float
+    """From which the camera looks at home: the lamps stay where they are when it moves [degrees]."""
     picture: Picture
     container: Any
     spacing: float
@@ -82,15 +87,41 @@ class Stage:
             eye = frame @ (picture.camera - origin)
         transparency = picture.transparency
         if transparency is None:
-            transparency = 0.0 if several or picture.colour_by is not None else 0.9
+            transparency = 0.0 if several or picture.colour != "phase" else 0.9
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
-        own = cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts, ())
-        return own.posed(scene)
+        back = eye - look_at
+        seen = eye, look_at, float(np.degrees(np.arctan2(back[0], back[2])))
+        own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, cuts, ())
+        return own.at(scene, None)
 
-    def posed(self, scene: Scene) -> "Stage":
-        """The same with the solids where a scene has them."""
-        return replace(self, solids=tuple(one.within(self.frame, self.origin) for one in shown_solids(scene)))
+    @property
+    def home(self) -> View:
+        """Where the camera is, in the scene's axes."""
+        return View(*(self.frame.T @ place + self.origin for place in (self.eye, self.look_at)))
+
+    @property
+    def home_around(self) -> View:
+        """The same, but as far off, if nobody said where, as it has to be to see everything from all sides."""
+        if self.picture.camera is not None:
+            return self.home
+        back, middle = self.eye - self.look_at, 0.5 * (self.lower + self.upper)
+        elevation = float(np.degrees(np.arcsin(back[1] / np.linalg.norm(back))))
+        sides = (fitted(self.lower, self.upper, elevation, self.picture, turn) for turn in np.arange(0.0, 180.0, 15.0))
+        off = AROUND * max(float(np.linalg.norm(eye - look_at)) for eye, look_at in sides)
+        eye = middle + off * back / np.linalg.norm(back)
+        return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
+
+    def at(self, pose: Scene | None, view: View | None) -> "Stage":
+        """The same with solids where a scene has them, and with the camera at a view, each if it is given."""
+        found = self
+        if pose is not None:
+            solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
+            found = replace(found, solids=solids)
+        if view is not None:
+            eye, look_at = (self.frame @ (place - self.origin) for place in (view.eye, view.look_at))
+            found = replace(found, eye=eye, look_at=look_at)
+        return found
 
     @property
     def cuts_solids(self) -> bool:
@@ -116,6 +147,21 @@ class Stage:
     def placed(self, positions: Points) -> Points:
         """Positions (n, 3) [m] of the scene in the frame of the picture."""
         return (positions - self.origin) @ self.frame.T
+
+    def on_screen(self, points: Points) -> Points:
+        """(n, 2) the column and the row, counted in pixels from the upper left corner, where points (n, 3) [m] of the
+        scene are in the picture."""
+        forward = self.look_at - self.eye
+        forward = forward / np.linalg.norm(forward)
+        off = self.placed(points) - self.eye
+        scale = 0.5 * self.picture.width / np.tan(0.5 * np.radians(self.picture.field_of_view))
+        right, up = (off @ axis / (off @ forward) * scale for axis in screen_axes(forward))
+        return np.stack([0.5 * self.picture.width + right, 0.5 * self.picture.height - up], axis=1)
+
+    @property
+    def up_axis(self) -> int:
+        """Which axis of the scene is upright."""
+        return int(np.abs(self.frame[1]).argmax())
 
     def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
         """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
@@ -188,7 +234,8 @@ class Stage:
     @property
     def sun(self) -> Points:
         """(3,) unit vector towards the lamp: behind the camera, on its left."""
-        return self._direction(-62.0, 50.0)
+        light = self.picture.sun_and_sky
+        return self._direction(light.azimuth, light.elevation)
 
     @property
     def fill(self) -> Points:
@@ -196,9 +243,8 @@ class Stage:
         return self._direction(70.0, 28.0)
 
     def _direction(self, azimuth: float, elevation: float) -> Points:
-        """(3,) unit vector; the azimuth [degrees] counts from the camera, to the right."""
-        back = self.eye - self.look_at
-        return _towards(np.degrees(np.arctan2(back[0], back[2])) + azimuth, elevation)
+        """(3,) unit vector; the azimuth [degrees] counts from the camera at home, to the right."""
+        return _towards(self.azimuth + azimuth, elevation)
 
 
 def extent_of(positions: Points) -> tuple[Points, Points]:
@@ -229,9 +275,11 @@ def _towards(azimuth: float, elevation: float) -> Points:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def fitted(lower: Points, upper: Points, elevation: float, picture: Picture) -> tuple[Points, Points]:
+def fitted(
+    lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH
+) -> tuple[Points, Points]:
     """A place for the camera and one to look at, (3,) each [m], for a box to fill the picture."""
-    back, box = _towards(AZIMUTH, elevation), corners(lower, upper)
+    back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
     halves = half, half * picture.height / picture.width
     right, up = screen_axes(-back)

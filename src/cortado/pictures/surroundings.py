@@ -47,6 +47,12 @@ class Environment:
     """Unit vector towards the lamp."""
     fill: wp.vec3
     """Unit vector towards a second, weak one, which is only seen in reflections."""
+    lamp: wp.vec3
+    """What is seen of the first in reflections."""
+    strip: wp.vec3
+    """What is seen of the second."""
+    sunlight: wp.vec3
+    """The light of the lamp that falls on what faces it."""
     horizon: wp.vec3
     zenith: wp.vec3
     has_floor: wp.int32
@@ -105,7 +111,7 @@ def sky(s: Environment, d: wp.vec3):
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
-    return base + wp.vec3(7.0, 6.8, 6.4) * lamp + wp.vec3(1.6, 1.7, 1.8) * strip
+    return base + s.lamp * lamp + s.strip * strip
 
 
 @wp.func

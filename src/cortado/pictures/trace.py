@@ -156,6 +156,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                     strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
                     found += strength * (wp.cw_mul(image.colour, image.light) - instead_of)
             return toned(found)
+        if surface.is_flat > 0:
+            return met.colour
         p = o + met.t * d
         n = met.normal
         cosine = -wp.dot(n, d)

@@ -1,6 +1,6 @@
 """What can be read of a simulation's states: quantities of its particles."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -16,9 +16,8 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import OVER_TIME
-from cortado.scene.quantities import check_quantity, sizes
+from cortado.scene.quantities import check_quantity
 from cortado.scene.restart import RestartState
-from cortado.scene.scene import Scene
 
 FIRST = names(Role.STATE)
 """Parameters that a state has, and a step from it does not take."""
@@ -92,17 +91,6 @@ class Measuring:
         if name in rollout.initial.names:
             return rollout.initial.numpy(own.dimension, only=[name])[name].astype(np.float64)
         return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
-
-
-def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Callable[[], Measuring]) -> NDArray | None:
-    """(frames, n) what the pictures of a scene colour particles by, recorded or computed by a simulation of it; None
-    where they have the colours of phases."""
-    name = None if scene.picture is None else scene.picture.colour_by
-    if name is None:
-        return None
-    is_there = name == "speed" or name in trajectory.quantities
-    values = trajectory.quantity(name) if is_there else simulation().quantity(name, trajectory)
-    return sizes(name, values, scene.dimension)
 
 
 def _at(controls: Mapping[str, Any] | None, trajectory: Trajectory, frame: int) -> dict[str, Any]:

@@ -1,21 +1,24 @@
 """Pictures of a simulation's frames."""
 
+from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-
 from cortado.errors import InputError, shown
-from cortado.particles.fields import Entry, StateField
+from cortado.particles.fields import Entry
 from cortado.particles.state import State
-from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.scale import Scale
+from cortado.pictures.film import Film
+from cortado.pictures.shaded_picture import ShadedPicture
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import Pictured, scene_renderer
+from cortado.runs.drawing import alone, film_of, page_of
 from cortado.runs.frame import Frame
-from cortado.runs.solid_motion import posed, solid_motions
+from cortado.runs.measuring import Measuring
+from cortado.runs.picture_settings import shown_as
+from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.picture import Picture
-from cortado.scene.quantities import NAMES, sizes
+from cortado.scene.quantities import NAMES
 from cortado.scene.scene import Scene
 
 
@@ -44,36 +47,33 @@ class Picturing:
         """
         return scene_renderer(cast(Pictured, self), **settings)
 
-    def picture(self, frame: Frame, **settings: Any) -> np.ndarray:
+    def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
         """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
-        says; ``settings`` replace keys of it: ``width=640, height=360``. ``colour_by`` may also name a field of the
-        particles that a part of one's own keeps.
+        says; ``settings`` replace keys of it: ``width=640, height=360``, as those of `film` do.
 
         Raises:
             SceneError: settings that do not fit.
-            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D; or the frame has not recorded what
-                ``colour_by`` names.
+            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D; or what ``colour`` names was not
+                recorded in the frame, or is the age, which one frame does not tell.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
-        given = {} if self.scene.picture is None else self.scene.picture.model_dump()
-        wanted = {**given, **settings}
-        own = self._own_field(wanted.get("colour_by"))
-        judged = {**wanted, "colour_by": None} if own else wanted
-        table = Picture(**judged).in_dimension(self.dimension, ("picture",))
-        if own:
-            table = table.model_copy(update={"colour_by": own.name})
-        scene = self.scene.model_copy(update={"picture": table})
-        motions = solid_motions(scene, {name: values[None] for name, values in frame.others.items()})
-        draws = painter(posed(scene, motions, 0), frame.positions, self.device)
-        if table.colour_by is None:
-            return draws.image(frame.positions, colours_of(scene, frame.mass_fractions, self.particles))
-        values, unit = sizes(table.colour_by, frame[table.colour_by], self.dimension), own.unit if own else None
-        scale = Scale.of(table.colour_by, values, unit)
-        return scale.beside(draws.image(frame.positions, scale.colours(values)))
+        scene, units = shown_as(self.scene, settings, self._units), self._units
+        if (scene.picture or Picture()).colour == "age":
+            raise InputError('One frame does not tell how old its fluid is: take trajectory.picture(k, colour="age").')
+        return ShadedPicture.of(page_of(alone(frame), self.scene, self.device, settings, units).image(0))
 
-    def _own_field(self, name: Any) -> StateField | None:
-        """The field of the particles by that name that is no quantity of all scenes."""
+    def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
+        """Write a film of a run of this simulation; as `Trajectory.film`, on the device of the simulation, which also
+        computes what ``colour`` names where it was not recorded, such as the pressure."""
+        if not isinstance(trajectory, Trajectory):
+            raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
+        measuring = partial(cast, Measuring, self)
+        return film_of(trajectory, self.scene, path, self.device, settings, self._units, measuring)
+
+    @property
+    def _units(self) -> dict[str, str]:
+        """Those of the fields of particles that a part of one's own keeps, by their names."""
         drawn = (Entry.NUMBER, Entry.VECTOR)
         known = (field for field in self.initial.fields if field.entry in drawn and field.axis is Axis.PARTICLE)
-        return next((field for field in known if field.name == name and name not in NAMES), None)
+        return {field.name: field.unit for field in known if field.name not in NAMES}

@@ -30,6 +30,7 @@ def recorded(
             mass_fractions=own.pop("mass_fractions", None),
             others=own,
             solids=solid_motions(scene, own),
+            scene=scene,
             constants={name: array[at[1:]] for name, array in constants.items()},
             substeps=rollout.substeps,
             origin=rollout.origins[number],

@@ -9,18 +9,23 @@ from typing import Any
 from cortado.errors import InputError
 from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
-from cortado.scene.picture import MOST_FRAMES
 
+FORMER_FRAMES = 120
+"""The default of film_frames in folders without a format."""
 LARGEST = 2**31
 """Bytes of a file that is read again when a run goes on."""
 
 
-def asked_for(scene_json: str) -> str:
-    """A scene of a folder without a format, whose default of film_frames, 120, was written as if it were asked for."""
+def in_present_words(scene_json: str, has_format: bool) -> str:
+    """A scene of a folder of before: `colour` of [picture] was called colour_by, and in folders without a format the
+    default of film_frames, 120, was written as if it were asked for."""
     try:
         scene = json.loads(scene_json)
-        if scene["picture"]["film_frames"] == MOST_FRAMES:
-            del scene["picture"]["film_frames"]
+        picture = scene["picture"]
+        if "colour_by" in picture:
+            picture["colour"] = picture.pop("colour_by") or "phase"
+        if not has_format and picture["film_frames"] == FORMER_FRAMES:
+            del picture["film_frames"]
     except (ValueError, RecursionError, LookupError, TypeError):
         return scene_json  # an error is reported where it is read
     return json.dumps(scene)

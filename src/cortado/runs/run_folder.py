@@ -13,7 +13,7 @@ from typing import Any, Self
 from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.runs.run_environment import as_json, plain, require_same, session
-from cortado.runs.run_files import asked_for, bytes_of, computed, cut_torn_line, finite, read_json
+from cortado.runs.run_files import bytes_of, computed, cut_torn_line, finite, in_present_words, read_json
 from cortado.runs.sensors.log import Readings, as_csv
 from cortado.scene.parameters.values import NAMES
 from cortado.scene.scene import Scene
@@ -197,8 +197,7 @@ class RunFolder:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CortadoWarning)
             try:
-                if "format" not in read_json(self.environment):
-                    text = asked_for(text)
+                text = in_present_words(text, "format" in read_json(self.environment))
                 return Scene.from_json(text, overrides)
             except SceneError as error:
                 raise error.in_file(str(self.scene)) from None

@@ -20,6 +20,7 @@ from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.sensors.log import Readings
+from cortado.runs.showing import Showing
 from cortado.runs.solid_motion import SolidMotion, motions_in
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
@@ -35,7 +36,7 @@ SUFFIXES = (".vtkhdf", ".hdf")
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Showing):
     """What a run leaves: recorded frames, and what the solver noted of every step.
 
     ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
@@ -73,6 +74,8 @@ class Trajectory:
     """what sensors have read in every step, by their names; it is not in files"""
     solids: Mapping[str, SolidMotion] = field(default_factory=dict)
     """where solids that move are, by their names"""
+    scene: Scene | None = None
+    """what it is a run of; None of a file"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
     scene: Scene | None = field(default=None, repr=False)

@@ -153,7 +153,13 @@ class SceneTables(Table):
             return {**data, "discretisation": {**given, **chosen}}
         return data
 
-    @field_validator("emitter", "container", "forces", "schedule", "render", "picture")
+    @field_validator("picture")
+    @classmethod
+    def _resolve_picture(cls, table: Any, info: ValidationInfo) -> Any:
+        given = table is not None and {"dimension", "solid"} <= set(info.data)
+        return table.in_scene(info.data["dimension"], [one.name for one in info.data["solid"]]) if given else table
+
+    @field_validator("emitter", "container", "forces", "schedule", "render")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data

@@ -18,9 +18,9 @@ from cortado.errors import DivergedError, InputError
 from cortado.files.atomic import sentences
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
-from cortado.pictures.figures import particles
+from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.plan import plan
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
@@ -174,12 +174,10 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 
 
 def _drawn(simulation: Simulation, path: Path) -> Path:
-    """Where the fluid is at the start, in the colours of its phases."""
-    scene = simulation.scene
-    colours = colours_of(scene, simulation.mass_fractions, simulation.particles)
-    title = f"{scene.name}, the first state{', seen along the third axis' * (scene.dimension == 3)}"
-    ends, lines = scene.container.extent(), solid_outline(scene)
-    return particles([simulation.positions], [title], path, colours=[colours], container=ends, lines=[lines])
+    """The scene with its fluid where it is at the start, in the colours of its phases."""
+    free = slice(simulation.free_particles)
+    colours = colours_of(simulation.scene, simulation.mass_fractions, simulation.particles)
+    return write_picture(path, plan(simulation.scene, simulation.positions[free], colours[free], simulation.device))
 
 
 def _as_text(found: dict[str, Any]) -> str:

@@ -1,11 +1,16 @@
 """``cortado picture``: a shaded picture, or a film, of a run that is there."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from cortado.errors import InputError
+from cortado.files.interruption import keeping
 from cortado.pictures.film import film, lacking
 from cortado.pictures.image_files import write_picture
-from cortado.runs.measuring import coloured_by
+from cortado.pictures.pace import pace_of
+from cortado.runs.colouring import coloured_by
+from cortado.runs.picture_settings import shown_as
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
@@ -13,14 +18,30 @@ from cortado.scene.picture import Picture
 from cortado.simulation import Simulation
 
 
-def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: list[str], device: str) -> str:
+def picture_settings(lines: int | None, camera: str | None, colour: str | None) -> dict[str, Any]:
+    """Keys of [picture] that are given by options, as those of `Trajectory.film`."""
+    kind, _, solid = (camera or "").partition(":")
+    path = {"kind": kind, **({"solid": solid} if solid else {})} if camera else None
+    given = {"lines": lines, "camera_path": path, "colour": colour}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def draw_run(
+    run: Path,
+    frame: int,
+    as_film: bool,
+    out: Path | None,
+    overrides: list[str],
+    device: str,
+    settings: Mapping[str, Any],
+) -> str:
     """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; returns a sentence
     that says where it is."""
     folder = RunFolder.open(run)
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
-    scene = folder.read_scene(overrides)
+    scene = shown_as(folder.read_scene(overrides), settings)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
     trajectory = Trajectory.load(folder.trajectory)
@@ -30,8 +51,9 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
     page = run_page(scene, trajectory, device, coloured_by(scene, trajectory, lambda: Simulation(scene, device)))
     if as_film:
         path = out or folder.figures / "film.mp4"
-        film(path, page, range(len(trajectory)), (scene.picture or Picture()).film_frames or None)
-        return f"The film is in {path}."
+        with keeping(lambda: f"what is drawn is in {path}, and the same command goes on with it"):
+            made = film(path, page, range(len(trajectory)), pace_of(trajectory.times, scene.picture or Picture()))
+        return f"The film is in {path}: {made.pace}."
     if frame not in range(-len(trajectory), len(trajectory)):
         raise InputError(f"--frame is {frame}, but the run has {len(trajectory)} frames, from 0.")
     path = out or folder.figures / "picture.png"

@@ -9,13 +9,14 @@ import numpy as np
 from cortado.cli.commands.run_summary import simulated, sizes_in_words
 from cortado.files.interruption import keeping
 from cortado.files.terminal import say
-from cortado.files.video import MOST_FRAMES, write_video
+from cortado.files.video import write_video
 from cortado.pictures.figures import images, particles
 from cortado.pictures.film import lacking
+from cortado.pictures.pace import Pace
 from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.outcome import not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.runs.measuring import coloured_by
+from cortado.runs.colouring import coloured_by
 from cortado.runs.report import Figures, Section, write_report
 from cortado.runs.run_figures import density_errors, readings
 from cortado.runs.run_folder import RunFolder
@@ -57,7 +58,7 @@ def write_run_report(
         say(missing)
     elif pictures:
         with keeping(
-            lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film draws it"
+            lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film goes on with it"
         ):
             values = coloured_by(scene, trajectory, lambda: simulation)
             write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
@@ -94,8 +95,9 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     path = images(map(image, shown), titles, folder / "rendered.png")
     figures: Figures = [("The same, rendered.", path)]
     if len(trajectory.times) > 1 and find_spec("av"):
-        frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
-        figures.append(("The same, in motion.", write_video(folder / "run.mp4", map(image, frames), 20)))
+        pace = Pace.of(trajectory.times)
+        path = write_video(folder / "run.mp4", map(image, pace.frames), pace.frames_per_second)
+        figures.append((f"The same, {pace.in_words}.", path))
     return figures
 
 

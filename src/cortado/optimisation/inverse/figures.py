@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.files.video import MOST_FRAMES, write_video
+from cortado.files.video import write_video
 from cortado.optimisation.inverse.setup import Setup
+from cortado.optimisation.inverse.shaded import step_pace
 from cortado.optimisation.inverse.task import Task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
@@ -62,12 +63,14 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
     shown = [image(result.history[k].parameters) for k in evaluations]
     path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
     search: Figures = [("The last image during the optimisation.", path)]
-    steps = made.problem.steps
-    if steps > 0 and (made.task.scene.picture or Picture()).most_frames and find_spec("av"):
-        numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
-        states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
-        path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
-        compared.append(("The run with the parameters that were found.", path))
+    steps, picture = made.problem.steps, made.task.scene.picture or Picture()
+    if steps > 0 and picture.film_frames != 0 and find_spec("av"):
+        numbers = np.unique(np.linspace(0, steps, max(picture.searched_frames, 2)).astype(int)).tolist()
+        states = made.problem.states(made.search.parameters(result.parameters), numbers)
+        pace = step_pace(made.task.scene, numbers)
+        moving = (made.image(states[numbers[k]]) for k in pace.frames)
+        path = write_video(folder / "estimate.mp4", moving, pace.frames_per_second)
+        compared.append((f"The run with the parameters that were found, {pace.in_words}.", path))
     return TaskFigures(compared=compared, search=search)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.shapes import Points
+from cortado.files.progress import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures
@@ -15,11 +16,14 @@ from cortado.optimisation.optimise import Result
 from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import labelled, side_by_side
+from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scenery import State
+from cortado.runs.emitted import is_out
 from cortado.runs.report import Figures
 from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
 
 EVALUATIONS = (1, 5, 20, 100)
 """Whose runs are shown, as far as the search went; 0 is the first guess."""
@@ -30,7 +34,7 @@ Run = Mapping[int, Snapshot]
 def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     """Draw them into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
-    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.most_frames, 2)).astype(int)).tolist()
+    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.searched_frames, 2)).astype(int)).tolist()
 
     def run(parameters: Mapping[str, Any]) -> Run:
         return made.problem.states(dict(parameters), steps)
@@ -52,13 +56,24 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     path = folder / "search.png"
     write_picture(path, searched.image(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", path)]
-    if not picture.most_frames or len(steps) < 2:
+    if picture.film_frames == 0 or len(steps) < 2:
         return TaskFigures(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
     two = page(list(pair), list(pair.values()))
-    motion = film(folder / "found.mp4", two, steps, picture.film_frames)
-    search.insert(0, ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)))
-    return TaskFigures(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
+    pace = step_pace(made.task.scene, steps)
+    motion = film(folder / "found.mp4", two, steps, pace)
+    announce(str(motion))
+    sought = film(folder / "search.mp4", searched, steps, pace)
+    search.insert(0, (f"The search in motion, {pace.in_words}.", sought.path))
+    found_figures: Figures = [(f"The run, {pace.in_words}: {' and '.join(pair)}.", motion.path)]
+    return TaskFigures(found=found_figures, compared=compared, search=search)
+
+
+def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
+    """That of films of states after so many steps."""
+    if scene.solver.chooses:
+        return Pace.unknown(len(steps))
+    return pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
 
 
 def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
@@ -78,4 +93,7 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
 
 def _state(made: Setup, run: Run, step: int) -> State:
     state = run[step]
-    return state.positions, colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
+    colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
+    emitted = state.state["emitted"].numpy() if "emitted" in state.state.names else None
+    out = is_out(made.task.scene, emitted, len(colours))
+    return State(state.positions[out], colours[out])

@@ -1,0 +1,82 @@
+"""A scene before it is run, as one looks at it to see whether it is what was meant: fluid, walls, solids, what will
+move, and sizes."""
+
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points, corners
+from cortado.pictures.labels import Text, lined, written
+from cortado.pictures.painter import painter
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+
+MOVING = np.array([0.75, 0.20, 0.02])
+"""Linear colour of paths and of what comes out of an emitter."""
+ARROW = 0.18
+"""How long an arrow is, in sizes of what is shown, and its head, in lengths of it."""
+HEAD = 0.22
+
+
+def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
+    """A picture (rows, columns, 3), linear: particles at positions (n, d) [m] with colours (n, 3) as spheres, the
+    opening of an emitter with an arrow, paths of solids and of the opening, and how large it is along each axis."""
+    look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
+    scene = scene.model_copy(update={"picture": look})
+    spacing, paths = scene.discretisation.spacing, _paths(scene)
+    if scene.emitter is not None:
+        opening = scene.emitter.opening(spacing)
+        paths += [opening] if scene.dimension == 2 else []
+        shown = opening if scene.dimension == 3 or not len(positions) else opening[:0]
+        positions = np.concatenate([positions, shown])
+        colours = np.concatenate([colours, np.tile(MOVING, (len(shown), 1))])
+    draws = painter(scene, np.concatenate([positions, *paths]), device, _poses(scene))
+    image, stage = draws.image(positions, colours), draws.stage
+    ends = scene.container.extent() or (positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing)
+    size = float(np.max(ends[1] - ends[0]))
+    if scene.emitter is not None:
+        paths.append(_arrow(np.array(scene.emitter.outlet), np.array(scene.emitter.direction), ARROW * size))
+    thin = max(round(look.height / 240), 1)
+    image = lined(image, [stage.on_screen(path) for path in paths], MOVING, thin)
+    return written(image, _sizes(stage, *ends), max(round(0.030 * look.height), 10))
+
+
+def _paths(scene: Scene) -> list[Points]:
+    """(k, d) [m] those of solids' middles, and that of an emitter's opening."""
+    found = [np.array(table.positions) for table in scene.solid if table.positions is not None]
+    course = scene.schedule.courses.get("nozzle_path")
+    return found if course is None else [*found, np.array(course.values, dtype=np.float64)]
+
+
+def _poses(scene: Scene) -> list[Scene]:
+    """The scene with each of its solids along its path."""
+    found = []
+    for k, table in enumerate(scene.solid):
+        for place in table.positions or ():
+            moved = (*scene.solid[:k], table.model_copy(update={"position": place}), *scene.solid[k + 1 :])
+            found.append(scene.model_copy(update={"solid": moved}))
+    return found
+
+
+def _arrow(start: Points, direction: Points, length: float) -> Points:
+    """(5, d) [m] a line and its head, in one stroke."""
+    tip = start + length * direction
+    aside = np.eye(len(start))[int(np.abs(direction).argmin())]
+    aside = aside - (aside @ direction) * direction
+    barbs = [tip - HEAD * length * (direction + sign * 0.5 * aside / np.linalg.norm(aside)) for sign in (1.0, -1.0)]
+    return np.array([start, tip, barbs[0], tip, barbs[1]])
+
+
+def _sizes(stage: Any, lower: Points, upper: Points) -> list[Text]:
+    """How long the box is along each axis, beside those of its edges that are outermost on the screen."""
+    box, found, middle = corners(lower, upper), list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
+    for axis in range(len(lower)):
+        pairs = [(a, b) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
+        places = np.array([stage.on_screen(np.array(pair)).mean(axis=0) for pair in pairs])
+        sought = (0.0, 1.0) if axis != stage.up_axis else (-1.0, 0.0)  # below, and on the left
+        best = places[int((places @ sought).argmax())]
+        away = best - middle
+        place = best + 0.035 * stage.picture.height * away / max(float(np.linalg.norm(away)), 1e-9)
+        text = f"{'xyz'[axis]}: {upper[axis] - lower[axis]:.3g} m"
+        found.append(((round(place[0]), round(place[1])), text, "rm" if axis == stage.up_axis else "mm"))
+    return found

@@ -1,0 +1,67 @@
+"""Pictures and films of a trajectory."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from cortado.device.driver import device_named
+from cortado.device.kernel_cache import start_warp
+from cortado.errors import InputError, shown
+from cortado.pictures.film import Film
+from cortado.pictures.shaded_picture import ShadedPicture
+from cortado.scene.scene import Scene, as_scene
+
+if TYPE_CHECKING:
+    from cortado.runs.trajectory import Trajectory
+
+
+class Showing:
+    """What shows a trajectory."""
+
+    scene: Scene | None
+    """What it is a run of; None of a file."""
+
+    def picture(
+        self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
+    ) -> ShadedPicture:
+        """A shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera is
+        where it sees the fluid in every frame. Arguments and errors as of `film`."""
+        from cortado.runs.drawing import page_of
+
+        own = cast("Trajectory", self)
+        if k not in range(-len(own), len(own)):
+            raise InputError(f"k is {shown(k)}, but must be the number of one of {len(own)} frames, such as 0 or -1.")
+        page = page_of(own, self._scene(scene), _device(device), settings)
+        return ShadedPicture.of(page.image(k % len(own)))
+
+    def film(
+        self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
+    ) -> Film:
+        """Write a film of the run, an mp4, and return it; a notebook plays it. One that is stopped (Ctrl-C) keeps its
+        frames, and the same call goes on after them. See `docs/pictures.md`.
+
+        Args:
+            path: ends in .mp4.
+            scene: that of the run, or the path of its file; needed of a trajectory that was loaded from a file.
+            device: of the rays, "cpu" or "cuda:0".
+            settings: keys of the scene's table [picture], such as ``colour="speed"``, ``film_speed=0.25`` or
+                ``film_frames=100``; ``lines=1080`` sets width and height; ``camera=pictures.Orbit()`` moves the camera.
+
+        Raises:
+            SceneError: settings that do not fit.
+            InputError: a package is missing, or what ``colour`` names was not recorded and cannot be computed.
+        """
+        from cortado.runs.drawing import film_of
+
+        return film_of(cast("Trajectory", self), self._scene(scene), path, _device(device), settings)
+
+    def _scene(self, given: Scene | str | Path | None) -> Scene:
+        found = self.scene if given is None else as_scene(given)
+        if found is None:
+            raise InputError("The trajectory does not know its scene, as it was loaded: give it, as scene=scene.")
+        return found
+
+
+def _device(name: str) -> Any:
+    """Warp's device of that name; raises `InputError` where there is none."""
+    start_warp()
+    return device_named(name)

@@ -1,0 +1,234 @@
+"""Films and pictures of trajectories: cameras that move, colours that stand for numbers, emitters."""
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado.discretise.shapes import corners
+from cortado.errors import InputError, SceneError
+from cortado.files.srgb import to_srgb
+from cortado.pictures import Dolly, Follow, Keyframes, Orbit
+from cortado.pictures.painter import painter
+from cortado.pictures.plan import MOVING, plan
+from cortado.pictures.scale import Scale
+from cortado.pictures.shadow import floor_shadow
+from cortado.pictures.stage import Stage, screen_axes
+from cortado.runs.curl import vorticity
+from cortado.runs.emitted import ages, is_out
+from cortado.scene.camera_paths import Moment, View
+from cortado.scene.lights import LIGHTS
+from cortado.scene.picture import Picture
+from scenes import jet, plane, pour, scene
+
+SMALL = {"width": 160, "height": 90}
+HOME = View(np.array([0.0, 1.0, 4.0]), np.array([0.0, 1.0, 0.0]))
+KEYS = {"kind": "keyframes", "times": [0, 1], "cameras": [[0] * 3, [1] * 3]}
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def moment(share, time=0.0, **solids):
+    return Moment(share, time, UP, solids)
+
+
+def frames_of(path):
+    with pytest.importorskip("av").open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_an_orbit_goes_around_what_it_looks_at():
+    quarter = Orbit().view(HOME, moment(0.25))
+    np.testing.assert_allclose(quarter.eye, [4.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(quarter.look_at, HOME.look_at)
+    np.testing.assert_allclose(Orbit(turns=-0.5).view(HOME, moment(0.5)).eye, [-4.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(Orbit(turns=2.0).view(HOME, moment(1.0)).eye, HOME.eye, atol=1e-12)
+
+
+def test_a_dolly_comes_near():
+    distances = [np.linalg.norm(Dolly(distance=0.5).view(HOME, moment(s)).eye - HOME.look_at) for s in (0.0, 0.5, 1.0)]
+    np.testing.assert_allclose(distances, [4.0, 4.0 * 0.5**0.5, 2.0])
+
+
+def test_keyframes_are_gone_through_and_rested_at():
+    path = Keyframes(times=[1.0, 2.0, 4.0], cameras=[[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 2.0, 1.0]])
+    for time, place in ((0.0, [0, 0, 1]), (1.0, [0, 0, 1]), (2.0, [1, 0, 1]), (4.0, [1, 2, 1]), (9.0, [1, 2, 1])):
+        np.testing.assert_allclose(path.view(HOME, moment(0.0, time)).eye, place, atol=1e-12)
+    np.testing.assert_allclose(path.view(HOME, moment(0.0, 1.5)).look_at, HOME.look_at)
+
+
+def test_who_follows_a_solid_has_it_in_the_middle():
+    seen = Follow(solid="raft", distance=0.5).view(HOME, moment(0.3, raft=np.array([3.0, 0.0, 1.0])))
+    np.testing.assert_allclose(seen.look_at, [3.0, 0.0, 1.0])
+    np.testing.assert_allclose(seen.eye, [3.0, 0.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("maker", "table", "sentence"),
+    [
+        (scene, {"camera_path": {"kind": "orbit", "turns": "fast"}}, "picture.camera_path.turns is 'fast'"),
+        (scene, {"camera_path": {"kind": "fly"}}, 'camera_path.kind is .fly., but must be "dolly" or "follow"'),
+        (scene, {"camera_path": {"kind": "follow", "solid": "raft"}}, "solid is 'raft', but must be left out"),
+        (scene, {"camera_path": Orbit().model_dump() | {"turns": np.nan}}, "turns is nan"),
+        (
+            scene,
+            {"camera_path": KEYS | {"times": [1, 1]}},
+            "at least two times",
+        ),
+        (scene, {"camera_path": KEYS | {"cameras": [[0] * 3]}}, "2 places of 3 comp"),
+        (plane, {"camera_path": {"kind": "orbit"}}, "camera_path .*left out, as the scene has 2 dimensions"),
+        (scene, {"colour": "rho"}, 'picture.colour is \'rho\', but must be "phase" or "density"'),
+        (scene, {"film_speed": 0.0}, "film_speed is 0.0, but must be greater than 0"),
+    ],
+)
+def test_a_wrong_table_is_a_sentence(maker, table, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        maker(picture=table)
+
+
+def test_a_trajectory_makes_films_and_pictures(tmp_path):
+    simulation = cortado.Simulation(scene(picture=SMALL))
+    trajectory = simulation.run(2)
+    made = trajectory.film(tmp_path / "a.mp4", camera=Orbit(turns=0.5), film_speed=0.01, lines=64)
+    shown = frames_of(made.path)
+    assert [frame.shape for frame in shown] == [(64, 114, 3)] * 3
+    assert "3 frames" in repr(made) and "0.01 x" in repr(made) and "data:video/mp4" in made._repr_html_()
+    last = to_srgb(trajectory.picture(lines=64)).astype(int)
+    assert np.abs(shown[-1] - last).mean() > 3.0  # it is seen from the other side
+    picture = trajectory.picture(0, lines=64)
+    assert picture.shape == (64, 114, 3) and picture._repr_png_()[:4] == b"\x89PNG" and picture[0]._repr_png_() is None
+    trajectory.save(tmp_path / "run.vtkhdf")
+    loaded = cortado.Trajectory.load(tmp_path / "run.vtkhdf")
+    again = loaded.picture(0, scene=simulation.scene, lines=64)
+    np.testing.assert_allclose(again, picture, atol=1e-4)  # the surface adds up in an order of its own
+    with pytest.raises(InputError, match=r"does not know its scene.*scene=scene"):
+        loaded.picture()
+
+
+def test_what_cannot_be_drawn_is_a_sentence(tmp_path):
+    simulation = cortado.Simulation(plane(picture=SMALL))
+    trajectory = simulation.run(1)
+    for call, sentence in (
+        (lambda: trajectory.picture(5), "k is 5, but must be the number of one of 2 frames"),
+        (lambda: trajectory.picture("last"), "k is 'last'"),
+        (lambda: trajectory.film("a.avi"), "must end in .mp4"),
+        (lambda: trajectory.film(None), "path is None"),
+        (lambda: trajectory.film("absent/a.mp4"), "cannot be written"),
+        (lambda: trajectory.film("a.mp4", device="tpu"), "device is 'tpu'"),
+        (lambda: trajectory.film("a.mp4", scene=5), "scene is 5"),
+        (lambda: trajectory[:0].film("a.mp4"), "has no frames"),
+        (lambda: trajectory.film("a.mp4", frames=5), "picture.frames is not a key"),
+        (lambda: trajectory.picture(colour="pressure"), "pressure was not recorded.*simulation.film"),
+        (lambda: simulation.picture(trajectory[0], colour="age"), "trajectory.picture"),
+        (lambda: simulation.film(trajectory[0], "a.mp4"), "trajectory is Frame"),
+        (lambda: trajectory.picture(lines=10), "lines is 10"),
+        (lambda: trajectory.picture(camera=Orbit()), "camera_path .*2 dimensions"),
+    ):
+        with pytest.raises((InputError, SceneError), match=sentence):
+            call()
+    made = simulation.film(trajectory, tmp_path / "a.mp4", colour="pressure")
+    assert len(frames_of(made.path)) == 2
+
+
+@pytest.mark.parametrize("make", [plane, scene])
+def test_the_curl_of_positions_and_velocities_is_the_vorticity(make):
+    """Within the fluid, where the sum of the kernel is that of the lattice."""
+    simulation = cortado.Simulation(make(), precision="float64")
+    trajectory = simulation.run(20, record=["vorticity", "density"])
+    frame = trajectory[-1]
+    found = vorticity(simulation.scene, frame.positions, frame.velocities)
+    known = frame["vorticity"]
+    share = frame["density"] / 1000.0
+    share = share if known.ndim == 1 else share[:, None]
+    np.testing.assert_allclose(found, known * share, atol=1e-6 * np.abs(known).max())
+    assert np.abs(known).max() > 0.1
+
+
+def test_flat_colours_are_those_of_the_scale():
+    simulation = cortado.Simulation(scene(picture={**SMALL, "colour": "speed", "shaded": False}))
+    trajectory = simulation.run(6)
+    colours = Scale.of("speed", trajectory.quantity("speed")).colours(trajectory.quantity("speed")[-1])
+    image = trajectory.picture()
+    middle = image[62:80, 55:75].reshape(-1, 3)
+    nearest = np.abs(middle[:, None] - colours[None]).max(axis=2).min(axis=1)
+    assert np.median(nearest) < 0.03
+    assert np.abs(trajectory.picture(shaded=True) - image).max() > 0.05
+
+
+def test_a_scale_tells_its_numbers_in_its_unit():
+    scale = Scale.of("speed", np.linspace(0.0, 2.0, 1001))
+    image = np.full((360, 640, 3), 0.5)
+    told = scale.beside(image)
+    assert (told != image).any(axis=2).mean() < 0.15
+    assert scale._ticks() == [0.5, 1.0, 1.5]
+    assert Scale.of("age", np.ones(3)).unit == "s" and Scale.of("age", np.ones(3)).beside(image).shape == image.shape
+
+
+def test_what_waits_in_an_emitter_is_not_drawn():
+    simulation = cortado.Simulation(jet(picture=SMALL))
+    trajectory = simulation.run(30)
+    first, last = (
+        is_out(simulation.scene, frame.others["emitted"], trajectory.particles) for frame in trajectory[::30]
+    )
+    assert first.sum() == 48 and 48 < last.sum() < trajectory.particles
+    old = ages(simulation.scene, trajectory)
+    np.testing.assert_allclose(old[-1, :48], trajectory.times[-1])
+    assert (old[-1][~last] == 0.0).all() and (np.diff(old[-1, 48:]) <= 1e-12).all() and old[-1, 48] > 0.0
+    image = trajectory.picture(0)
+    blue = image[..., 2] > 1.5 * image[..., 0]
+    assert blue.any() and np.nonzero(blue)[0].min() > 45  # in the lower half alone
+    assert np.abs(trajectory.picture(colour="age") - trajectory.picture()).max() > 0.1
+
+
+def test_who_goes_around_sees_the_whole_container_from_all_sides():
+    flat = scene(container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [2.0, 0.6, 0.25]}, picture=SMALL)
+    stage = Stage.of(flat, np.array([[0.0, 0.0, 0.0], [0.25, 0.25, 0.25]]))
+    box = corners(*flat.container.extent())
+    for share in np.linspace(0.0, 1.0, 9):
+        seen = stage.at(None, Orbit().view(stage.home_around, moment(share)))
+        forward = (seen.look_at - seen.eye) / np.linalg.norm(seen.look_at - seen.eye)
+        right, up = screen_axes(forward)
+        off = stage.placed(box) - seen.eye
+        across, upwards = (np.abs(off @ axis / (off @ forward)).max() for axis in (right, up))
+        half = np.tan(0.5 * np.radians(stage.picture.field_of_view))
+        assert across < half and upwards < half * 90 / 160
+    np.testing.assert_allclose(seen.sun, stage.sun)
+
+
+def test_a_low_sun_casts_a_longer_shadow_and_a_light_has_its_own_background():
+    positions, shaded = np.array([[0.1, 0.2, 0.1]]), {}
+    for name in LIGHTS:
+        stage = Stage.of(scene(picture={**SMALL, "light": name}), positions)
+        light, corner, cell = floor_shadow(stage, stage.placed(positions), np.ones((1, 3)))
+        dark = np.argwhere(light[..., 0] < 1.0 - 0.5 * (1.0 - light.min()))
+        shaded[name] = np.linalg.norm(corner[[0, 2]] + cell * dark.mean(axis=0) - stage.placed(positions)[0, ::2])
+    assert shaded["evening"] > 1.5 * shaded["studio"] > 1.5 * shaded["noon"]
+    assert Picture(light="evening").sun_and_sky.background == LIGHTS["evening"].background
+    assert Picture(light="evening", background=(0.1, 0.2, 0.3)).sun_and_sky.background == (0.1, 0.2, 0.3)
+    with pytest.raises(SceneError, match='light is \'dawn\', but must be "studio" or "noon"'):
+        Picture(light="dawn")
+
+
+@pytest.mark.parametrize("make", [jet, pour])
+def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
+    made = make(picture={"width": 320, "height": 180})
+    simulation = cortado.Simulation(made)
+    free = simulation.positions[: simulation.free_particles]
+    image = plan(made, free, np.tile([0.1, 0.3, 0.8], (len(free), 1)))
+    stage = painter(made, simulation.positions).stage
+    emitter = made.emitter
+    column, row = stage.on_screen(np.array([np.add(emitter.outlet, np.multiply(0.03, emitter.direction))]))[0].round()
+    around = image[int(row) - 6 : int(row) + 7, int(column) - 6 : int(column) + 7].reshape(-1, 3)
+    assert np.abs(around - MOVING).max(axis=1).min() < 0.2
+    low, high = stage.on_screen(np.array([made.container.lower, made.container.upper]))
+    assert low[1] > high[1]  # upwards is upwards
+    box = image[max(int(low[1]) + 2, 0) :]
+    assert (box.max(axis=2) < 0.4).any()  # words below
+
+
+def test_a_fluid_at_rest_does_not_flicker():
+    made = scene(picture={"width": 320, "height": 180})
+    simulation, noise = cortado.Simulation(made), np.random.default_rng(0)
+    moved = simulation.positions + 0.02 * 0.05 * noise.standard_normal(simulation.positions.shape)
+    stirred = moved + 1e-4 * 0.05 * noise.standard_normal(moved.shape)
+    artist, colours = painter(made, moved), np.tile([0.1, 0.3, 0.8], (len(moved), 1))
+    one, other = (to_srgb(artist.image(positions, colours)).astype(int) for positions in (moved, stirred))
+    assert (np.abs(one - other).max(axis=2) > 1).mean() < 1e-3
