@@ -1,6 +1,6 @@
 """An experiment: a simulation of it, and what was measured."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from cortado.arrays import check_steps, require_table
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.losses import FinalPositions, Snapshot
-from cortado.optimisation.fitting.observation import Direction, Frames, Observation
+from cortado.optimisation.fitting.observation import Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays, Values
@@ -53,6 +53,13 @@ class Experiment:
         """The observations' own parameters, such as "camera.rotation", as a fit starts."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
+    def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
+        """The same experiment, in the same arrays, with other numbers measured, (frames, m) by name."""
+        found = object.__new__(Experiment)
+        again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
+        found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
+        return found
+
     def predicted(self, parameters: Values) -> dict[str, np.ndarray]:
         """By the name of each observation, what the simulation says of it, (frames, m)."""
         return self._read(self.problem.states(self._shared(parameters), self._steps), parameters)
@@ -61,51 +68,51 @@ class Experiment:
         self, parameters: Values, directions: Sequence[Values]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """The same, and its derivatives along directions, (frames, m, directions), by forward mode."""
-        columns, ends = [], dict[int, Any]()
+        values, along, ends = self._shared(parameters), [], dict[int, Any]()
         for direction in directions:
-            shared = self._shared(direction)
-            if shared or not ends:
-                ends, dots = self._along(parameters, shared)
-            columns.append(self._tangents(ends, dots, parameters, direction))
-        found = {name: np.stack([column[name] for column in columns], axis=-1) for name in self.observations}
+            moved = self._shared(direction)
+            if moved or not ends:
+                ends, dots = self._along(values, moved)
+            along.append((direction, moved, dots if moved else self._still(ends)))
+        found = {}
+        for name, one in self.observations.items():
+            own, slopes = self._own(name, parameters), {}
+            for step in self._frames[name].needed:
+                each = [
+                    Direction(dots[step], moved, self._own(name, direction), self._quantities(ends[step], *rest))
+                    for direction, moved, dots in along
+                    for rest in [(dots[step], values, moved)]
+                ]
+                slopes[step] = one.tangents(ends[step], own, each)
+            found[name] = self._frames[name].between(slopes)
         return self._read(ends, parameters), found
 
-    def _along(self, parameters: Values, direction: Values) -> tuple[dict[int, Any], dict[int, Arrays]]:
+    def _along(self, values: Values, moved: Values) -> tuple[dict[int, Any], dict[int, Arrays]]:
         """States, and their tangents by fields, by the number of steps before them."""
         dots: dict[int, Arrays] = {}
+        if not moved:
+            return self.problem.states(values, self._steps), dots
         wanted, dimension = set(self._steps), self.simulation.dimension
 
         def observe(step: int, dot: State) -> None:
             if step in wanted:
                 dots[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
 
-        shared = self._shared(parameters)
-        if direction:
-            return self.problem.tangents(shared, direction, observe, self._steps), dots
-        ends = self.problem.states(shared, self._steps)  # only the camera moves
-        still = {step: end.state.like().numpy(dimension) for step, end in ends.items()}
-        return ends, still
+        return self.problem.tangents(values, moved, observe, self._steps), dots
 
-    def _tangents(
-        self, ends: Mapping[int, Snapshot], dots: Mapping[int, Arrays], parameters: Values, direction: Values
-    ) -> dict[str, np.ndarray]:
-        shared, values = self._shared(direction), self._shared(parameters)
-        moved = set(shared)
-        found = {}
-        for name, one in self.observations.items():
-            own, along = self._own(name, parameters), self._own(name, direction)
-            read = {}
-            for step in self._frames[name].needed:
-                dot = dots[step] if moved else {key: np.zeros_like(a) for key, a in dots[step].items()}
+    def _still(self, ends: Mapping[int, Snapshot]) -> dict[int, Arrays]:
+        """Tangents of states where only an observation's own parameters change, such as those of a camera."""
+        return {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
 
-                def quantities(names: Any, at: Snapshot = ends[step], dot: Arrays = dot) -> Arrays:
-                    if not moved:
-                        return {key: np.zeros_like(at[key]) for key in names}
-                    return self.problem.along(at, names, dot, values, shared)
+    def _quantities(self, at: Snapshot, dot: Arrays, values: Values, moved: Values) -> Callable[..., Arrays]:
+        """What gives tangents of quantities of a state along its own tangent."""
 
-                read[step] = one.tangent(ends[step], own, Direction(dot, shared, along, quantities))
-            found[name] = self._frames[name].between(read)
-        return found
+        def tangents(names: Iterable[str]) -> Arrays:
+            if not moved:
+                return {name: np.zeros_like(at[name]) for name in names}
+            return self.problem.along(at, names, dot, values, moved)
+
+        return tangents
 
     def _read(self, ends: Mapping[int, Snapshot], parameters: Values) -> dict[str, np.ndarray]:
         found = {}

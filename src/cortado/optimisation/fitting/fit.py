@@ -11,7 +11,7 @@ from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import doubts
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.fitted import Fit, FittedPart
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.least_squares import ROUGHLY, LeastSquares, Linearised, Weighting
 from cortado.optimisation.fitting.noise import ScoreCovariance, correlation_time, independent_frames, score_covariance
 from cortado.scene.parameters.parameter import Range
 
@@ -62,7 +62,7 @@ def fit(
     weights = [
         Weighting(part.observation.noise or _spread(r) or 1.0) for part, r in zip(problem.parts, first, strict=True)
     ]
-    u, outcome = problem.solve(coordinates.start, weights, iterations)
+    u, _ = problem.solve(coordinates.start, weights, iterations, enough=ROUGHLY)
     weights = _noise_of(problem, problem.linearised(u), weights)
     u, outcome = problem.solve(u, weights, iterations)
     return _fitted(problem, problem.linearised(u), weights, outcome)
@@ -109,7 +109,7 @@ def _fitted(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting],
         coordinates=coordinates,
         u=at.u,
         coordinate_covariance=covariance,
-        naive_covariance=inverse * squares / max(sum(r.size for r in at.residuals) - len(at.u), 1),
+        naive_covariance=_counted(problem, at, weights),
         degrees_of_freedom=freedom,
         parts=tuple(parts),
         doubts=doubts(problem, at, weights, scores, coordinates.labels),
@@ -146,6 +146,12 @@ def _inverse(problem: LeastSquares, hessian: np.ndarray) -> np.ndarray:
             "measure something else besides."
         )
     return np.asarray((axes / eigenvalues) @ axes.T / np.outer(size, size))
+
+
+def _counted(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+    """The covariance where every number was taken for independent of all others."""
+    alone = [Weighting(_spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
+    return _inverse(problem, _hessian(problem, at, alone))
 
 
 def _freedom(scores: Sequence[ScoreCovariance], inverse: np.ndarray, direction: np.ndarray) -> float:

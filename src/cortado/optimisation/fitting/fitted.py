@@ -159,7 +159,7 @@ class Fit:
         for shift in shifts:
             begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
             begun[k] = self.u[k] + shift
-            ended, _ = self.problem.solve(begun, weights, 5, fixed=[k])
+            ended, _ = self.problem.solve(begun, weights, 2, fixed=[k])
             squares = self.problem.sum_of_squares(self.problem.residuals(ended), weights)
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])

@@ -12,9 +12,11 @@ from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.noise import whitened
 from cortado.optimisation.fitting.observation import Observation
 
-ENOUGH = 1e-8
-"""A search ends where the sum of squares changes by less, relative to itself."""
-NEAR = 1e-5
+ENOUGH = 1e-6
+"""A search ends where the sum of squares changes by less, relative to itself: by far less than an error bar."""
+ROUGHLY = 1e-3
+"""The same of a search whose end only tells the weights of the next."""
+NEAR = 1e-6
 """Or where a step is shorter than this, relative to the size of the coordinates."""
 
 
@@ -100,7 +102,12 @@ class LeastSquares:
         return self._last
 
     def solve(
-        self, u: np.ndarray, weights: Sequence[Weighting], iterations: int, fixed: Sequence[int] = ()
+        self,
+        u: np.ndarray,
+        weights: Sequence[Weighting],
+        iterations: int,
+        fixed: Sequence[int] = (),
+        enough: float = ENOUGH,
     ) -> tuple[np.ndarray, Any]:
         """Lower the sum of the squared residuals by the trust-region method of Branch, Coleman and Li (1999), from a
         point, with the coordinates of some numbers ``fixed``: where it ended, and what SciPy says of it. A step to
@@ -131,7 +138,7 @@ class LeastSquares:
         if not len(free):
             return u, None
         lower, upper = (ends[free] for ends in self.coordinates.bounds)
-        settings: dict[str, Any] = {"ftol": ENOUGH, "xtol": NEAR, "gtol": None, "x_scale": "jac"}
+        settings: dict[str, Any] = {"ftol": enough, "xtol": NEAR, "gtol": None, "x_scale": "jac"}
         settings |= {"bounds": (lower, upper), "max_nfev": iterations}
         found = least_squares(residuals, u[free], jacobian, **settings)
         return whole(found.x), found

@@ -1,6 +1,6 @@
 """What was measured of an experiment, and what a simulation says of the same."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -48,8 +48,21 @@ class Observation(Protocol):
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         """(m,) what a state predicts, given values of its own parameters."""
 
-    def tangent(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Direction) -> np.ndarray:
-        """(m,) the derivative of `value` along a direction."""
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        """(m, directions) the derivatives of `value` along directions."""
+
+
+class Again:
+    """An observation with other numbers measured."""
+
+    def __init__(self, observation: Observation, measured: np.ndarray):
+        own = Measurement.of(observation.times, measured, observation.noise)
+        if own.measured.shape != observation.measured.shape:
+            raise InputError(f"measured has shape {own.measured.shape}, but must be {observation.measured.shape}.")
+        self._observation, self.measured = observation, own.measured
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._observation, name)
 
 
 @dataclass(frozen=True)

@@ -53,12 +53,12 @@ class SensorSeries:
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         return value_of(self.sensor, at)[self._picked]
 
-    def tangent(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Direction) -> np.ndarray:
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
         """By the adjoint of each number, which is all that sensors have."""
-        found = []
-        for k in self._picked:
-            bars = self.sensor.adjoint(at, np.eye(self._width)[k])
-            others = [name for name in bars if name not in along.fields]
-            dots = {**along.fields, **along.quantities(others)}
-            found.append(sum(float((bar * dots[name]).sum()) for name, bar in bars.items()))
-        return np.array(found)
+        rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
+        others = [name for name in rows[0] if along and name not in along[0].fields]
+        found = np.zeros((len(rows), len(along)))
+        for k, one in enumerate(along):
+            dots = {**one.fields, **one.quantities(others)}
+            found[:, k] = [sum(float((bar * dots[name]).sum()) for name, bar in row.items()) for row in rows]
+        return found

@@ -1,6 +1,6 @@
 """Paths of tracers that swim with the fluid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,5 +54,5 @@ class Tracks:
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         return (self._offset + self._weights @ at.positions).ravel()
 
-    def tangent(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Direction) -> np.ndarray:
-        return np.asarray(self._weights @ along.fields["positions"]).ravel()
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        return np.stack([(self._weights @ one.fields["positions"]).ravel() for one in along], axis=1)

@@ -1,6 +1,6 @@
 """Pictures of an experiment, as the renderer shows the fluid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,11 +63,13 @@ class Video:
         return self.picture(at, own)[self.mask].ravel()
 
     @WARP
-    def tangent(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Direction) -> np.ndarray:
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
         self.picture(at, own)
-        given = along.fields["positions"], along.fields["mass_fractions"], along.parameters.get("colours")
-        found = self._renderer(own).tangent(*given, self.calibration.tangent(own, along.own))
-        return found[self.mask].ravel()
+        renderer, found = self._renderer(own), []
+        for one in along:
+            given = one.fields["positions"], one.fields["mass_fractions"], one.parameters.get("colours")
+            found.append(renderer.tangent(*given, self.calibration.tangent(own, one.own))[self.mask].ravel())
+        return np.stack(found, axis=1)
 
     def _renderer(self, own: Mapping[str, np.ndarray]) -> Renderer:
         """That of the view with these values; the last one is kept."""
