@@ -33,7 +33,7 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
     Raises:
         InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
     """
-    av = _pyav()
+    av = pyav()
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise InputError(f"The video {path} must end in .mp4.")
@@ -58,7 +58,8 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
     return path
 
 
-def _pyav() -> Any:
+def pyav() -> Any:
+    """The library; raises `InputError` where it is missing."""
     try:
         import av
     except ModuleNotFoundError as problem:

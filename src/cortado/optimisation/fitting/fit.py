@@ -1,11 +1,11 @@
 """`cortado.fit`: the parameters of measured experiments, with error bars."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import whole_number
+from cortado.arrays import require_function, whole_number
 from cortado.errors import ComputationError, InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import doubts
@@ -25,6 +25,7 @@ def fit(
     start: Mapping[str, Any],
     bounds: Mapping[str, tuple[Any, Any]] | None = None,
     iterations: int = 50,
+    on_trial: Callable[[], None] | None = None,
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, and say how certain they are.
 
@@ -39,6 +40,7 @@ def fit(
         bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None. A number whose
             bounds are the same is not searched.
         iterations: greatest number of trial points of each of the two fits.
+        on_trial: called after each trial point.
 
     Raises:
         InputError: a start, bounds or experiments that do not fit.
@@ -51,13 +53,14 @@ def fit(
             raise InputError(f"experiments has {shown(one)}, but must be made of cortado.measured.Experiment.")
     if not each:
         raise InputError("experiments is empty, but must have one experiment at least.")
+    require_function("on_trial", on_trial)
     iterations = whole_number("iterations", iterations, 1)
     known = each[0].simulation.known
     own = {name: value for one in each for name, value in one.start.items()}
-    given = {**own, **start}
+    given = {**start, **{name: value for name, value in own.items() if name not in start}}
     positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
     coordinates = Coordinates.of(given, positive, bounds)
-    problem = LeastSquares(each, coordinates)
+    problem = LeastSquares(each, coordinates, on_trial)
     first = problem.residuals(coordinates.start)
     weights = [
         Weighting(part.observation.noise or _spread(r) or 1.0) for part, r in zip(problem.parts, first, strict=True)

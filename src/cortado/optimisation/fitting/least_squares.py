@@ -1,6 +1,6 @@
 """The least-squares problem of several experiments: residuals and Jacobian as functions of one vector."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,8 +59,14 @@ class Linearised:
 class LeastSquares:
     """Counts what it costs."""
 
-    def __init__(self, experiments: Sequence[Experiment], coordinates: Coordinates):
+    def __init__(
+        self,
+        experiments: Sequence[Experiment],
+        coordinates: Coordinates,
+        on_trial: Callable[[], None] | None = None,
+    ):
         self.experiments, self.coordinates = tuple(experiments), coordinates
+        self._on_trial = on_trial
         several = len(self.experiments) > 1
         self.parts = [
             Part(k, name, f"{name} of experiment {k + 1}" if several else name, one)
@@ -77,6 +83,8 @@ class LeastSquares:
         for k, experiment in enumerate(self.experiments):
             self.runs += 1
             found.append(experiment.predicted(self._values(k, self.coordinates.values(u))))
+        if self._on_trial is not None:
+            self._on_trial()
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
 
     def linearised(self, u: np.ndarray) -> Linearised:

@@ -3,21 +3,21 @@
 import json
 from typing import Any
 
-from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.tables import FitTables, TaskTables
 from cortado.scene.scene import Scene
 
 
 def file_schema() -> dict[str, Any]:
     """Of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what must fit together."""
-    scene, task = (model.model_json_schema() for model in (Scene, TaskTables))
-    tables = {**scene["$defs"], **task["$defs"]}
+    scene, task, fit = (model.model_json_schema() for model in (Scene, TaskTables, FitTables))
+    tables = {**scene["$defs"], **task["$defs"], **fit["$defs"]}
     for table in tables.values():
         _require_shape(table)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **{key: value for key, value in scene.items() if key != "$defs"},
         "title": "A scene of Cortado, or a task",
-        "properties": {**scene["properties"], **task["properties"]},
+        "properties": {**scene["properties"], **task["properties"], **fit["properties"]},
         "$defs": tables,
     }
 
