@@ -39,7 +39,18 @@ if TYPE_CHECKING:
     from cortado.simulation import Simulation as Simulation
 
 
-_MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "measured", "optimisers", "pictures", "render", "sensors")
+_MODULES = (
+    "executors",
+    "forces",
+    "gradients",
+    "image_losses",
+    "losses",
+    "measured",
+    "optimisers",
+    "pictures",
+    "render",
+    "sensors",
+)
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",

@@ -14,7 +14,7 @@ MOST_BYTES = 2**28
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """(lines,) by the names in the first line; an entry that is left out is NaN. Raises `InputError` in one sentence."""
+    """(lines,) by the names in the first line; an entry that is left out is NaN. Raises `InputError`."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]

@@ -76,7 +76,8 @@ class AbsorptionKernels:
 
 @cache
 def absorption_kernels(precision: Precision) -> AbsorptionKernels:
-    """Kernels over pixels: ``forward``, ``tangent`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of samples."""
+    """Kernels over pixels: ``forward``, ``tangent`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of
+    samples."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     camera_tangent = camera_tangent_type(precision)

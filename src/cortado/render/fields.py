@@ -105,8 +105,8 @@ class ColourField:
         )
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
-        """The tangent (nz, ny, nx) of the last field, along those of positions (n,), fractions (n,) and colours (phases,
-        3). The next call overwrites it, and what `adjoint` returned."""
+        """The tangent (nz, ny, nx) of the last field, along those of positions (n,), fractions (n,) and colours
+        (phases, 3). The next call overwrites it, and what `adjoint` returned."""
         own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
         along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
         self._colours_dot.assign(colours_dot[None])

@@ -1,6 +1,7 @@
 """``cortado fit``: parameters with error bars from measured experiments."""
 
 from pathlib import Path
+from typing import Any
 
 from cortado.cli.commands.fit_report import for_machines, sections
 from cortado.errors import ComputationError
@@ -27,8 +28,8 @@ def fit_task(
     experiments = [one.experiment(device, precision) for one in task.experiments]
     with locked(out):
         settings = {"precision": precision, "fit": task.fit.model_dump()}
-        noted = {"kind": "fit", "settings": settings, "device": device, "overwrite": overwrite}
-        folder = RunFolder.create(out, task.scene.to_json(), command, **noted)
+        noted: dict[str, Any] = {"kind": "fit", "settings": settings, "device": device}
+        folder = RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
         with track(2 * task.fit.iterations, "fit") as advance:
             fitted = fit(experiments, task.fit.start, task.fit.bounds, task.fit.iterations, lambda: advance(1))
         announce(str(fitted))

@@ -23,7 +23,9 @@ def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Pa
         Section("What was found", fitted.lines(), [*_apart(fitted), *fitted.doubts]),
         Section("In numbers", [COUNTED], head=head, rows=_rows(fitted)),
         Section("Measured and found", figures=video_figures(fitted, folder)),
-        Section("Residuals", figures=residual_figure(fitted, folder / "residuals.png"), head=noise, rows=_parts(fitted)),
+        Section(
+            "Residuals", figures=residual_figure(fitted, folder / "residuals.png"), head=noise, rows=_parts(fitted)
+        ),
         Section("Profiles", figures=profile_figure(profiles, folder / "profiles.png")),
         Section("Correlations", head=("", *fitted.labels), rows=_correlations(fitted)),
         Section("The fit", [_effort(fitted)]),
@@ -31,8 +33,8 @@ def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Pa
 
 
 COUNTED = (
-    "The last column is what the error would be if every number that was measured were independent of all others: it is "
-    "there to see how much correlation matters."
+    "The last column is what the error would be if every number that was measured were independent of all others: it "
+    "shows how much correlation matters."
 )
 
 

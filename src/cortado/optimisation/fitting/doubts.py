@@ -54,9 +54,7 @@ def _halves(
     steps, variances = [], []
     for half in (0, 1):
         N, s, B = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
-        for part, r, J, weight, score in zip(
-            problem.parts, at.residuals, at.jacobians, weights, scores, strict=True
-        ):
+        for part, r, J, weight, score in zip(problem.parts, at.residuals, at.jacobians, weights, scores, strict=True):
             times = part.observation.times
             chosen = np.array_split(np.arange(len(times)), 2)[half]
             slopes, white = weight.of(J, times)[chosen], weight.of(r, times)[chosen]
@@ -70,8 +68,8 @@ def _halves(
         variances.append(np.diag(inverse @ B @ inverse))
     away = np.abs(steps[0] - steps[1]) / np.sqrt(variances[0] + variances[1] + 1e-300)
     return [
-        f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the error "
-        "of the difference. The model is wrong, in a way that changes over time."
+        f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the "
+        "error of the difference. The model is wrong, in a way that changes over time."
         for label, off in zip(labels, away, strict=True)
         if off > TOO_FAR
     ]

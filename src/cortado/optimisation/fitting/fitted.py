@@ -143,7 +143,10 @@ class Fit:
         reach = student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom)
         reach = reach * np.sqrt(np.diag(self.coordinate_covariance))
         ends = [self.coordinates.values(self.u + way * reach) for way in (-1.0, 1.0)]
-        return {n: (float(a), float(b)) if not a.shape else (a, b) for (n, a), b in zip(ends[0].items(), ends[1].values())}
+        return {
+            n: (float(a), float(b)) if not a.shape else (a, b)
+            for (n, a), b in zip(ends[0].items(), ends[1].values(), strict=True)
+        }
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
         """The sum of squares over values of one number, with all others fitted anew at each: where it is not the

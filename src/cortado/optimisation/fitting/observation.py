@@ -81,7 +81,7 @@ class Frames:
         places = times / time_step
         if places[-1] > steps + 1e-6:
             raise InputError(
-                f"times go up to {times[-1]:g} s, but must end with the run, which has {steps} steps of {time_step:g} s."
+                f"times go up to {times[-1]:g} s, but must end with the run, after {steps} steps of {time_step:g} s."
             )
         whole = np.minimum(np.floor(places + 1e-6).astype(int), steps)
         shares = np.clip(places - whole, 0.0, 1.0)
@@ -95,7 +95,7 @@ class Frames:
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
         """(frames, ...) of what was read of the states."""
         last = max(read)
-        after = [read[min(int(k) + 1, last)] if share else read[int(k)] for k, share in zip(self.steps, self.shares)]
+        after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
         shares = self.shares.reshape(-1, *[1] * (before.ndim - 1))
         return (1.0 - shares) * before + shares * np.array(after)
@@ -121,7 +121,9 @@ class Measurement:
         if not np.isfinite(moments).all() or moments[0] < 0.0:
             raise InputError(f"times begin with {moments[0]:g} s, but must be finite and not before the run.")
         if values.ndim != 2 or len(values) != len(moments):
-            raise InputError(f"measured has shape {values.shape}, but must have {len(moments)} rows, one for each time.")
+            raise InputError(
+                f"measured has shape {values.shape}, but must have {len(moments)} rows, one for each time."
+            )
         if np.isinf(values).any() or np.isnan(values).all():
             raise InputError("measured must be finite, or NaN for what does not count, but not for all of it.")
         if noise is not None and not 0.0 < as_one_number("noise", noise) < np.inf:

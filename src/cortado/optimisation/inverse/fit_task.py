@@ -76,7 +76,9 @@ def _also(path: Path) -> MeasuredScene:
     """One more experiment, whose file may have a table [fit] of its own, which is not looked at."""
     found, _ = _read(read_toml(path), os.fspath(path), ExperimentTables)
     if found.problem.also:
-        raise SceneError(found.file, "problem.also", list(found.problem.also), "left out, as another file names this one")
+        raise SceneError(
+            found.file, "problem.also", list(found.problem.also), "left out, as another file names this one"
+        )
     return found
 
 

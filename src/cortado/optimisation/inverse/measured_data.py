@@ -23,7 +23,8 @@ LIGHT = 0.5
 
 @singledispatch
 def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """What a table describes, up to the ``last`` time of the run [s]; its files are in a folder. Raises `InputError`."""
+    """What a table describes, up to the ``last`` time of the run [s]; its files are in a folder. Raises
+    `InputError`."""
     raise NotImplementedError(type(table))
 
 

@@ -60,7 +60,9 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
             tables = TaskTables.model_validate(given, context={"names": names})
         problem, optimise = tables.problem, tables.optimise
         if problem.measured:
-            raise SceneError(None, "problem.measured", Words("given"), "left out: measured data is fitted by cortado fit")
+            raise SceneError(
+                None, "problem.measured", Words("given"), "left out: measured data is fitted by cortado fit"
+            )
         true, steps = problem.target or {}, problem.steps
         for name in optimise.start:
             if problem.picture is None and name not in true:
