@@ -1,5 +1,5 @@
-"""``python -m benchmarks.fits``: how often error bars hold the truth, what a fit costs beside a search by gradients, and
-what it says of a wrong model.
+"""``python -m benchmarks.fits``: how often error bars hold the truth, what a fit costs beside a search, and what it
+says of a wrong model.
 
 Each experiment is simulated with known parameters, in the plane with some 125 particles and 20 steps; noise that is
 correlated within a frame and over time is added, again and again, and fitted each time. What is done is kept in --out,
@@ -207,8 +207,8 @@ def cost_beside_search(evaluations: int) -> str:
         f"A run with a tangent costs as much as {tangent:.2g} forward runs, one with a gradient {gradient:.2g}.\n"
         f"The fit: {fitted.runs - fitted.tangents} forward runs and {fitted.tangents} with a tangent, as much as "
         f"{own:.0f} forward runs.\n"
-        f"L-BFGS: {needed} gradients until the loss was within 1e-6 of the least, {len(found.history)} until it ended: as "
-        f"much as {needed * gradient:.0f} and {len(found.history) * gradient:.0f} forward runs.\n"
+        f"L-BFGS: {needed} gradients until the loss was within 1e-6 of the least, {len(found.history)} until it ended: "
+        f"as much as {needed * gradient:.0f} and {len(found.history) * gradient:.0f} forward runs.\n"
         f"The fit needed {own / (needed * gradient):.2g} of that."
     )
 

@@ -48,7 +48,8 @@ def _command(path: Path) -> str:
     """How an example is run."""
     if path.suffix == ".py":
         return f"python {path}"
-    return f"cortado {'optimise' if 'optimise' in tomllib.loads(path.read_text('utf-8')) else 'run'} {path}"
+    tables = tomllib.loads(path.read_text("utf-8"))
+    return f"cortado {next((name for name in ('optimise', 'fit') if name in tables), 'run')} {path}"
 
 
 def _line(path: Path) -> str:
