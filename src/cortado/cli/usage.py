@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from cortado.errors import LONGEST
 
 _COMMAND = re.compile(
-    r"(new|examples|describe|run|compare|optimise|picture|view|sweep|schema|completion|gradients( check)?"
+    r"(new|examples|describe|run|compare|optimise|fit|picture|view|sweep|schema|completion|gradients( check)?"
     r"|figure|study)(?= |$)"
 )
 _EDGES = "│|╭╮╰╯─-+ "
