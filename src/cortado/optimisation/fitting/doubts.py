@@ -9,7 +9,7 @@ from cortado.optimisation.fitting.noise import ScoreCovariance
 
 TOO_LARGE = 1.3
 """Residuals over the noise that was given."""
-TOO_SLOW = 0.25
+TOO_SLOW = 0.35
 """Correlation time of residuals, over the length of the record."""
 TOO_FAR = 3.0
 """Distance between what two halves of a record say, over its error."""
