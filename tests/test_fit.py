@@ -83,11 +83,14 @@ def test_bars_hold_the_truth_where_a_count_of_pixels_does_not():
 
 
 def test_of_one_number_per_frame_it_is_the_textbook_formula():
+    """But for the factor 1 + 2 / n of a correlation time that is estimated."""
     random = np.random.default_rng(1)
     J, y = random.standard_normal((30, 1, 3)), random.standard_normal((30, 1))
     _, r, inverse = linear_fit(J, y)
     score = score_covariance(J, r, inverse, 30.0)
-    assert inverse @ score.B @ inverse == pytest.approx(inverse * (r**2).sum() / 27.0, rel=0.05)
+    assert inverse @ score.B @ inverse == pytest.approx(
+        inverse * (r**2).sum() / 27.0 * (1.0 + 2.0 / 30.0), rel=0.03, abs=2e-4
+    )
     assert score.degrees_of_freedom(inverse, np.eye(3)[0]) == pytest.approx(27.0, rel=0.02)
 
 
