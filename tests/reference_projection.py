@@ -72,6 +72,9 @@ class Projection:
         _, wall_W, wall_g = self.pairs(x, self.walls)
         normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
         gamma = np.einsum("b,iba,ba,bc->ic", self.wall_weights, wall_g, normal, normal)
+        whole, least = np.einsum("b,iba->ia", self.wall_weights, wall_g), 5e-4 * self.constants(d)[1]
+        off = ((whole**2).sum(1) - (gamma**2).sum(1)) / ((whole**2).sum(1) + least)
+        gamma = gamma + between(off, 0.1, 0.4)[:, None] * (whole - gamma)
         nu = wall_W @ self.wall_weights
         M = -np.einsum("ija,ijb->iab", g, apart)
         if d == 2:

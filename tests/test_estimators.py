@@ -713,6 +713,26 @@ def test_an_average_of_too_few_is_refused(made, calls, words):
         made.estimate(Stub(function, simulation_of("2-D")), POINT)
 
 
+def test_a_member_with_a_parameter_out_of_its_range_is_left_out_too():
+    """A real problem: of the viscosities that are drawn some are below 0, of a wider ensemble too many are."""
+    simulation = simulation_of("2-D")
+    problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions + 0.01))
+    mean = gradients.EnsembleMean(0.2, samples=20, position_noise=0.0, seed=1, estimator=gradients.Exact())
+    drawn = mean.around(problem, {"viscosity": 0.18})
+    pairs = [abs(float(0.2 * drawn.offset()[0])) for _ in range(10)]
+    kept = [u for u in pairs if u <= 0.18]
+    assert 7 < len(kept) < 10
+    with pytest.warns(
+        CortadoWarning, match=r"runs of the ensemble cannot be run, by which \d of 10 antithetic pairs are"
+    ):
+        found = mean.estimate(problem, {"viscosity": 0.18})
+    assert found.left_out == 2 * (10 - len(kept))
+    slopes = [problem.value_and_gradient({"viscosity": 0.18 + s * u})[1]["viscosity"] for u in kept for s in (1, -1)]
+    assert found.gradient["viscosity"] == pytest.approx(np.mean(slopes), rel=1e-12)
+    with pytest.raises(InputError, match=r"cannot be averaged, .* logarithm .* The first: parameter viscosity is -4"):
+        replace(mean, spread=5.0).estimate(problem, {"viscosity": 0.18})
+
+
 def test_a_run_at_the_parameters_themselves_that_diverges_ends_an_average():
     stub = Stub(Diverging(quadratic, 0), simulation_of("2-D"))
     with pytest.raises(DivergedError, match=r"^The simulation diverged in step 3: particle 0"):

@@ -20,7 +20,7 @@ from cortado.cli.commands.executor import Where
 from cortado.device.cores import usable_cores
 from cortado.device.executors import calls, local
 from cortado.device.executors import distributed as of_dask
-from cortado.errors import CortadoError
+from cortado.errors import CortadoError, OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers
 from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
 from dask_processes import PATIENCE, scheduler
@@ -274,6 +274,34 @@ def test_what_diverges_is_nan_and_the_others_are_there(problem, request, gradien
         assert np.isnan(one.loss) and isinstance(one.diverged, DivergedError)
         assert all(np.isnan(value).all() for value in one.gradient.values()) and len(one.gradient) == bool(gradient)
     assert sorted(told) == [0, 1, 2, 3] and np.isnan(told[1].loss)
+
+
+@pytest.mark.filterwarnings("ignore:time_step is")
+@pytest.mark.parametrize("gradient", [None, Exact()])
+def test_what_is_out_of_range_is_treated_as_what_diverges(problem, gradient):
+    """A viscosity below 0, a number that is none, fluid outside; but a wrong name is a mistake."""
+    first, far = problem.simulation.positions, np.full_like(problem.simulation.positions, 1e5)
+    points = [{"viscosity": mu} for mu in (0.1, -0.1, np.nan)] + [{"initial_positions": first + 10.0}]
+    words = r"^3 of 4 points cannot be run, and .* point 1: parameter viscosity is -0.1, but must be at least 0\.$"
+    with pytest.warns(CortadoWarning, match=words):
+        found = cortado.evaluate(problem, points, gradient)
+    assert found[0].loss == problem.value(points[0]) and [np.isnan(one.loss) for one in found] == [False] + 3 * [True]
+    assert all(isinstance(one.diverged, OutOfRangeError) for one in found[1:])
+    both = [points[0], points[1], {"initial_velocities": far}]
+    with pytest.warns(CortadoWarning, match="^2 of 3 points diverged or cannot be run"):
+        cortado.evaluate(problem, both)
+    assert [one.loss for one in cortado.evaluate(problem, points[1:3], loss_if_diverged=np.inf)] == [np.inf, np.inf]
+    with pytest.raises(InputError, match="parameter 'viscous' is unknown"):
+        cortado.evaluate(problem, [*points, {"viscous": 0.1}])
+
+
+@pytest.mark.filterwarnings("ignore:time_step is")
+def test_where_no_point_has_a_run_the_first_error_is_raised(problem):
+    far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
+    with pytest.raises(DivergedError, match=r"^The simulation diverged in step 1: "):
+        cortado.evaluate(problem, [far, {"viscosity": -1.0}])
+    with pytest.raises(InputError, match=r"^parameter viscosity is -1\.0, but must be at least 0\.$"):
+        cortado.evaluate(problem, [{"viscosity": -1.0}, far])
 
 
 @pytest.mark.filterwarnings("ignore:time_step is")

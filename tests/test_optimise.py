@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
+from cortado.gradients import EnsembleMean, Estimate
 from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
 from cortado.runs.run_folder import REPLAY_LOG
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
+from scenes import plane
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS(), LineSearch()]
 
@@ -513,8 +515,12 @@ class Walled:
 
 
 def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
-    with pytest.raises(ComputationError, match=r"In evaluation 3 the search came to .* x is 0.7") as caught:
-        optimise(Walled(0.75), {"x": 1.0}, Adam(learning_rate=0.1), 10, checkpoint=tmp_path)
+    """The step to them is refused and halved, until it is next to nothing."""
+    found = optimise(Walled(0.75), {"x": 1.0}, Adam(learning_rate=0.1), 3)
+    assert found.parameters["x"] == pytest.approx(0.75, abs=2e-3) and found.refused == 1
+    assert found.message.endswith("It refused 1 step, as runs diverged or parameters were out of their range.")
+    with pytest.raises(ComputationError, match=r"In evaluation 1 the search came to .* x is 0.7499") as caught:
+        optimise(Walled(0.75), {"x": 0.75}, Adam(learning_rate=0.1), 10, checkpoint=tmp_path)
     assert str(tmp_path) in str(caught.value)
     with pytest.raises(InputError, match="x is 1, but"):
         optimise(Walled(2.0), {"x": 1.0}, Adam(learning_rate=0.1), 10)
@@ -588,7 +594,10 @@ def test_a_search_goes_on_past_runs_that_diverge(optimiser, tmp_path):
     if not isinstance(optimiser, LineSearch):  # whose trials are no evaluations
         assert found.refused == found.history[-1].refused == whole.lost
         assert found.history[0].refused == 0 and whole.calls == found.evaluations + found.refused
-        assert re.search(rf" It refused {found.refused} steps?, as the run there diverged\.$", found.message)
+        assert re.search(
+            rf" It refused {found.refused} steps?, as runs diverged or parameters were out of their range\.$",
+            found.message,
+        )
     for calls in range(0, whole.calls, 4):
         folder = tmp_path / str(calls)
         with pytest.raises(Interrupted):
@@ -647,6 +656,42 @@ def test_an_ensemble_too_much_of_which_diverges_is_refused_too():
 
     found = optimise(Problem(), {"x": 0.0}, LineSearch(scale=0.4), 10, bounds={"x": (None, 2.0)})
     assert found.refused > 0 and 0.9 < found.parameters["x"] <= 0.97
+
+
+class Members:
+    """A slope whose runs have members of an ensemble that diverge, one of 8 at each gradient."""
+
+    def __init__(self):
+        self.simulation = cortado.Simulation(plane(), precision="float64")
+
+    def value(self, parameters):
+        return float(parameters["gravity"][0])
+
+    def value_and_gradient(self, parameters, gradient=None):
+        found = gradient.estimate(self, parameters)
+        return found.loss, found.gradient
+
+
+@dataclass(frozen=True)
+class OneOfEight:
+    """An estimator of which every eighth gradient diverges."""
+
+    count: list
+
+    def estimate(self, problem, parameters, observe=None):
+        self.count.append(0)
+        if len(self.count) % 8 == 0:
+            raise DivergedError(len(self.count), 0, "try less")
+        return Estimate(problem.value(parameters), {"gravity": np.array([1.0, 0.0])})
+
+
+def test_a_search_counts_what_its_averages_leave_out_and_warns_once():
+    mean = EnsembleMean(0.1, samples=8, position_noise=0.0, estimator=OneOfEight([]))
+    with pytest.warns(CortadoWarning) as said:
+        found = optimise(Members(), {"gravity": [0.0, -9.81]}, GradientDescent(1.0), 2, gradient=mean)
+    assert [str(one.message)[:44] for one in said] == ["1 of 8 runs of the ensemble diverged, by whi"]
+    assert found.left_out == 6 and [one.left_out for one in found.history] == [2, 4, 6]
+    assert "updates. It left 6 runs out of its averages, as runs diverged or" in found.message
 
 
 # Wrong input

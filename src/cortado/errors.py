@@ -19,6 +19,11 @@ class InputError(CortadoError):
     """What the user gave is wrong; takes the sentence that says so. Exit code 2."""
 
 
+class OutOfRangeError(InputError):
+    """A parameter has a value with which there can be no run: out of its range, beyond what a precision holds, or a
+    place where no fluid can be. Where it is one of many points, the others are computed all the same."""
+
+
 class Words(str):
     """Words of a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
 
@@ -113,6 +118,17 @@ class EngineMissingError(CortadoError, ImportError):
             "The reference engine is not installed: pip install cortado-reference, or from a clone of the repository "
             "pip install ./reference, which needs a C++17 compiler (g++, for all precisions)."
         )
+
+
+class ExtraMissingError(InputError, ImportError):
+    """A library that comes with an extra of Cortado is not installed. Exit code 2."""
+
+    def __init__(self, name: str, extra: str):
+        super().__init__(name, extra)
+
+    def __str__(self) -> str:
+        name, extra = self.args
+        return f"{name} is needed for that, but is not installed: pip install 'cortado-sph[{extra}]'."
 
 
 class LibraryMissingError(CortadoError, ImportError):

@@ -225,6 +225,27 @@ def picture(
 
 
 @command(app)
+def export(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    to: Literal["usd", "glb", "ply", "obj", "vtp"],
+    out: Path | None = None,
+    every: int = 1,
+) -> Work:
+    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
+
+    Args:
+        run: The folder of the run.
+        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
+        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
+        every: Frames of the run from one that is written to the next.
+    """
+    require_at_least(1, every, "--every")
+    from cortado.cli.commands.export import export_run
+
+    return partial(export_run, run, to, out, every)
+
+
+@command(app)
 def view(
     path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
     overrides: Overrides = (),
@@ -277,6 +298,37 @@ def sweep(
     from cortado.cli.commands.sweep import run_sweep
 
     return partial(run_sweep, file, combinations, steps, time, out, device, precision, Where(scheduler, workers))
+
+
+@command(app)
+def dataset(
+    file: Annotated[Positional[Path], arg(metavar="SCENE.toml|TASK.toml")],
+    runs: int = 100,
+    out: Path = Path("runs/dataset"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: Precision = "float32",
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Work:
+    """Compute many runs of a scene with varied values, to train learned simulators on; the same command goes on with
+    those that are missing.
+
+    Args:
+        file: A file with the table [dataset], which says what varies.
+        runs: How many, those for validation and tests included.
+        out: Folder of the data set: train.h5, valid.h5, test.h5 and metadata.json, as LagrangeBench reads them.
+        overrides: Replace a value of the file, such as dataset.steps=200; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+    """
+    words = as_text(overrides)
+    require_toml(file, words)
+    from cortado.cli.commands.dataset import make_dataset
+    from cortado.cli.commands.executor import Where
+
+    return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
 
 
 @command(app, answers=True)

@@ -29,9 +29,11 @@ class Estimate:
     degrees_of_freedom: float | None = None
     """Of the standard error: the number of independent samples less one; of `Guided` those of its two parts."""
     left_out: int = 0
-    """Runs of an ensemble that the average leaves out, as they diverged, or the runs that they belong to did."""
+    """Runs of an ensemble that the average leaves out, as they, or runs that they belong to, diverged or are out of
+    range."""
     diverged: Exception | None = None
-    """Why there was no run, of a point of `cortado.evaluate`; its loss and its gradient are then no numbers."""
+    """Why there was no run, of a point of `cortado.evaluate`: a `DivergedError`, or an `OutOfRangeError`. Its loss and
+    its gradient are then no numbers."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """The lower and the upper end, by parameter, of an interval for each component of the gradient.

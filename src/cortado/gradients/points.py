@@ -1,6 +1,6 @@
 """Points of the space of parameters at which a problem is evaluated, each on its own, wherever an executor computes."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, islice
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.executors.executor import Executor, OnResult
-from cortado.errors import DivergedError, InputError
+from cortado.errors import DivergedError, InputError, OutOfRangeError
 from cortado.gradients.estimator import (
     AdjointEstimator,
     Batchable,
@@ -19,6 +19,9 @@ from cortado.gradients.estimator import (
 )
 from cortado.rollout.rollout import Observer
 from cortado.scene.parameters.values import Values
+
+NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
+"""Errors that say that there is no run at a point, which is no mistake where the point is one of many."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,10 @@ class Point:
 
 @dataclass(frozen=True)
 class FalliblePoint(Point):
-    """A point that may diverge."""
+    """A point at which there may be no run, as it diverges or the scene does not allow it."""
 
     loss_if_diverged: float = np.nan
-    errors: tuple[type[Exception], ...] = (DivergedError,)
+    errors: tuple[type[Exception], ...] = NO_RUN
     """Those after which it has this loss."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
@@ -63,18 +66,17 @@ class FalliblePoint(Point):
 
 @dataclass(frozen=True)
 class Sample(Point):
-    """A point that an ensemble has drawn, which may diverge."""
+    """A point that an ensemble has drawn, at which there may be no run."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """See `Point.found`, as a gradient with respect to perturbed first positions need not be there; an `InputError`
         says that the user did not choose this point."""
         try:
             return self.found(problem, observe)
-        except DivergedError as error:
+        except NO_RUN as error:
             return self.without_a_run(error)
         except InputError as error:
-            advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
-            raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
+            raise InputError(f"A sample of the ensemble does not fit: {error}") from error
 
 
 Group = tuple[Point, ...]
@@ -135,6 +137,13 @@ def evaluated(
                 on_result(firsts[number] + k, one)
 
     return [one for group in executor.map(evaluation, groups(), tell) for one in group]
+
+
+def without_runs(errors: Sequence[Exception], of: str) -> str:
+    """How many of something had no run, and why, in words: "2 of 4 points diverged"."""
+    diverged = sum(isinstance(error, DivergedError) for error in errors)
+    why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
+    return f"{len(errors)} of {of} {' or '.join(why)}"
 
 
 def _kind(point: Point) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ from cortado.device.executors.executor import Executor, InProcess, OnResult, che
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
-from cortado.gradients.points import FalliblePoint, evaluated
+from cortado.gradients.points import FalliblePoint, evaluated, without_runs
 from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
@@ -31,12 +31,14 @@ def evaluate(
         gradient: how the gradient is computed at each point, such as `gradients.Exact()`; left out, the ``gradient`` of
             each `Estimate` is empty, and points are run forward only.
         executor: where they are computed, see `cortado.executors`; one after the other in this process if left out.
-        loss_if_diverged: the loss of a point whose run diverges, such as infinity for a search that leaves it aside.
-            Left out, it is NaN, and a `CortadoWarning` says how many points diverged, and what became of the first of
-            them. The gradient of such a point is NaN, and its `Estimate.diverged` has the error.
+        loss_if_diverged: the loss of a point that has no run, as it diverges or a parameter is out of its range, such
+            as infinity for a search that leaves it aside. Left out, it is NaN, and a `CortadoWarning` says how many
+            such points there are, and what became of the first of them. The gradient of such a point is NaN, and its
+            `Estimate.diverged` has the error.
         on_result: called with the number of a point and its `Estimate` as they arrive, in whatever order.
 
-    Raises the error of the first point that has another one.
+    Raises the error of the first point that has another one; and that of the first point where no point has a run,
+    unless they are given a loss.
     """
     require_function("on_result", on_result)
     require_methods("problem", problem, ("value",), "a cortado.Problem")
@@ -49,14 +51,14 @@ def evaluate(
     loss = np.nan if loss_if_diverged is None else loss_if_diverged
     made = (FalliblePoint(_by_name(values), estimator, loss) for values in points)
     found = evaluated(problem, made, chosen, on_result=on_result)
-    lost = [number for number, one in enumerate(found) if one.diverged is not None]
+    lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
     if lost and loss_if_diverged is None:
-        warnings.warn(
-            f"{len(lost)} of {counted(len(found), 'point')} diverged, and their losses are NaN. The first of them is "
-            f"point {lost[0]}: {found[lost[0]].diverged}",
-            CortadoWarning,
-            stacklevel=2,
-        )
+        first, error = next(iter(lost.items()))
+        if len(lost) == len(found):
+            raise error
+        said = without_runs([*lost.values()], counted(len(found), "point"))
+        sentence = f"{said}, and their losses are NaN. The first of them is point {first}: {error}"
+        warnings.warn(sentence, CortadoWarning, stacklevel=2)
     return found
 
 

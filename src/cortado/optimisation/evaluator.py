@@ -10,6 +10,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.executors.executor import InProcess
 from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.gradients.left_out import Tally
 from cortado.gradients.points import FalliblePoint, evaluated
 from cortado.optimisation.differentiable import Optimisable, loss_and_gradient
 from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
@@ -37,9 +38,14 @@ class Evaluator:
     updates: int = 0
     """Made by the optimiser so far."""
     refused: int = 0
-    """Evaluations that diverged so far, after which the search went on."""
+    """Evaluations so far of which there is no run, after which the search went on."""
     logged: int = 0
     """Entries of the log that this run has come to: evaluations, and losses that were tried."""
+
+    @property
+    def left_out(self) -> int:
+        """Runs that averages over ensembles have left out, of the evaluations that were not replayed."""
+        return self.estimator.left_out if isinstance(self.estimator, Tally) else 0
 
     def count_update(self) -> None:
         """Called by the optimiser after each update."""
@@ -52,14 +58,14 @@ class Evaluator:
         return self._noted(self._kept(self._compute(vector)), replayed=False)
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """The same, or None where the run diverges: in the log its loss is infinite, and its gradient 0."""
+        """The same, or None where there is no run: in the log its loss is infinite, and its gradient 0."""
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)
         else:
             try:
-                evaluation = self._kept(self._compute(vector))
-            except DivergedError:
+                evaluation = self._kept(self._computed(vector))
+            except REFUSED:
                 evaluation = self._kept(LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector)))
         if math.isfinite(evaluation.loss):
             return self._noted(evaluation, replayed)
@@ -83,6 +89,7 @@ class Evaluator:
             parameters=as_given(self.layout.unravel(evaluation.parameters), self.start),
             replayed=replayed,
             refused=self.refused,
+            left_out=self.left_out,
         )
         self.history.append(record)
         if self.on_iteration is not None:
@@ -142,7 +149,7 @@ class Evaluator:
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
         """
         try:
-            loss, gradients = self._evaluated(self.layout.unravel(vector))
+            return self._computed(vector)
         except InputError as error:
             if not self.history:
                 raise
@@ -155,6 +162,10 @@ class Evaluator:
             if not self.history:
                 raise
             raise error.with_advice(self._shorter(error.advice, vector)) from error
+
+    def _computed(self, vector: Vector) -> LoggedEvaluation:
+        """The evaluation, which is finite; raises what the problem raises, or a `ComputationError`."""
+        loss, gradients = self._evaluated(self.layout.unravel(vector))
         evaluation = LoggedEvaluation(
             vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients)
         )

@@ -15,8 +15,8 @@ class Iterate:
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Go to a vector (size,), or, where its run diverges, half of the way there, or a quarter, and so on, which is
-        one update. Returns which part of the way it was; raises DivergedError where the last part diverges too."""
+        """Go to a vector (size,), or, where it has no run, half of the way there, or a quarter, and so on, which is one
+        update. Returns which part of the way it was; raises the error of the last part where that has no run either."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)

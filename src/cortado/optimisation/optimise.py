@@ -15,6 +15,7 @@ import numpy as np
 from cortado.arrays import require_function, require_truth
 from cortado.errors import InputError
 from cortado.files.input_files import as_path
+from cortado.gradients.left_out import tallied
 from cortado.optimisation.differentiable import LossFunction, Optimisable, as_differentiable
 from cortado.optimisation.evaluator import Evaluator, as_given
 from cortado.optimisation.named_optimisers import as_optimiser
@@ -57,13 +58,15 @@ def optimise(
             The line search of L-BFGS may evaluate several times an iteration; all of them are recorded. The losses
             that `LineSearch` tries are in the checkpoint alone.
 
-    Where the run of an evaluation diverges, the step there is refused: Adam and gradient descent go half of the way
-    instead, or a quarter, and so on, and keep to shorter steps from then on; the line searches take shorter trials.
-    `Result.refused` counts such evaluations, `Result.message` says so, and the checkpoint has them.
+    Where the run of an evaluation diverges, or a parameter is out of its range, the step there is refused: Adam and
+    gradient descent go half of the way instead, or a quarter, and so on, and keep to shorter steps from then on; the
+    line searches take shorter trials. `Result.refused` counts such evaluations, `Result.message` says so, and the
+    checkpoint has them. `Result.left_out` counts runs that averages over ensembles left out for the same reasons, of
+    which the first time alone is warned.
 
     Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run;
-    DivergedError if the start diverges, or a step that was halved ten times;
-    ComputationError if the loss or its gradient is not finite; what came before is in the checkpoint.
+    DivergedError if the start diverges, or a step that was halved ten times; ComputationError where such a step has a
+    parameter out of its range, or if the loss or its gradient is not finite; what came before is in the checkpoint.
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)
@@ -83,7 +86,7 @@ def optimise(
         "problem": str(getattr(differentiable, "fingerprint", "")),
     }
     with closing(_open_log(checkpoint, resume, layout, identity)) as log:
-        evaluator = Evaluator(differentiable, gradient, layout, start, log, on_iteration)
+        evaluator = Evaluator(differentiable, tallied(gradient), layout, start, log, on_iteration)
         search = Search(
             evaluate=evaluator,
             attempt=evaluator.attempt,
@@ -105,7 +108,8 @@ def optimise(
         updates=evaluator.updates,
         evaluations=len(evaluator.history),
         refused=evaluator.refused,
-        message=outcome.message + _refused_in_words(evaluator.refused),
+        left_out=evaluator.left_out,
+        message=outcome.message + _without_runs_in_words(evaluator.refused, evaluator.left_out),
         converged=outcome.converged,
         problem=problem if hasattr(problem, "simulation") else None,
     )
@@ -131,9 +135,11 @@ def _description(setting: object) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
 
 
-def _refused_in_words(refused: int) -> str:
-    """What to add to the message of a search."""
-    return f" It refused {counted(refused, 'step')}, as the run there diverged." if refused else ""
+def _without_runs_in_words(refused: int, left_out: int) -> str:
+    """What to add to the message of a search that refused steps, and whose averages left runs out."""
+    why = ["refused " + counted(refused, "step")] * bool(refused)
+    why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
+    return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""
 
 
 def _copied(parameters: Parameters) -> Parameters:

@@ -26,7 +26,10 @@ class Record:
     replayed: bool
     """Whether it was read from the checkpoint."""
     refused: int = 0
-    """Evaluations before it that diverged, so that the steps to them were refused."""
+    """Evaluations before it of which there is no run, as it diverged or a parameter was out of its range, so that the
+    steps to them were refused."""
+    left_out: int = 0
+    """Runs that averages over ensembles have left out so far, for the same reasons; replayed ones are not known."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -53,7 +56,10 @@ class Result:
     converged: bool
     """Whether the optimiser's own test was met; Adam and gradient descent have none."""
     refused: int = 0
-    """Evaluations that diverged, so that the steps to them were refused; they are not in the history."""
+    """Evaluations of which there is no run, as it diverged or a parameter was out of its range, so that the steps to
+    them were refused; they are not in the history."""
+    left_out: int = 0
+    """Runs that averages over ensembles left out, for the same reasons; of those that were not replayed."""
     problem: Any = field(default=None, repr=False)
     """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
     and in a result that was pickled."""

@@ -19,9 +19,10 @@ class Search:
     """The problem that an optimiser is given, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Vector (size,) -> loss, gradient (size,); raises DivergedError where the run diverges, which ends the search."""
+    """Vector (size,) -> loss, gradient (size,); raises an error where there is no run, which ends the search."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
-    """The same, but None where the run diverges, which is counted, and the search goes on."""
+    """The same, but None where there is no run, as it diverges or a parameter is out of its range; it is counted, and
+    the search goes on."""
     losses: Callable[[Sequence[Vector]], list[float]]
     """Vectors (size,) -> the loss of each, infinite where there can be no run, as it diverges or parameters
     are out of range; cheaper than so many evaluations."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE
-from cortado.errors import InputError
+from cortado.errors import InputError, OutOfRangeError
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Range
 from cortado.scene.parameters.values import Arrays
@@ -20,15 +20,16 @@ CROWDED = 0.5
 
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
-    """Numbers are no larger than the precision bears, nor smaller where they must be positive; raises `InputError`."""
+    """Numbers are no larger than the precision bears, nor smaller where they must be positive; else it raises
+    `OutOfRangeError`."""
     for name, value in values.items():
         size = np.abs(value)
         if size.max(initial=0.0) > precision.greatest:
             wanted = f"at most {precision.greatest:g} in {precision.name}"
-            raise InputError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
+            raise OutOfRangeError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
         if known[name].range is Range.POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
             wanted = f"at least {1.0 / precision.greatest:g} in {precision.name}"
-            raise InputError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
+            raise OutOfRangeError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.threads import WARP
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import CortadoWarning, InputError, OutOfRangeError, shown
 from cortado.particles.state import Parameters, State
 from cortado.rollout.choosing import begin_choosing
 from cortado.rollout.first_positions import FirstPositions
@@ -290,9 +290,8 @@ class ParameterSpace:
             check_places(values, simulation.scene, simulation.free_particles)
             crowded = self._first_positions.check(values, number)
         except InputError as error:
-            if self._batch is None:
-                raise
-            raise InputError(f"In scene {number} of the batch, {error}") from error
+            place = "" if self._batch is None else f"In scene {number} of the batch, "
+            raise OutOfRangeError(f"{place}{error}") from error
         upright = self._one.upright(values)
         unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
         for sentence in filter(None, (crowded, unstable)):

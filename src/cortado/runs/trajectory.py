@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from operator import index
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self, overload
 
@@ -22,6 +23,7 @@ from cortado.runs.sensors.log import Readings
 from cortado.runs.solid_motion import SolidMotion, motions_in
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.scene import Scene
 from cortado.words import counted
 
 IN_A_NOTEBOOK = 1_000_000
@@ -73,6 +75,8 @@ class Trajectory:
     """where solids that move are, by their names"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
+    scene: Scene | None = field(default=None, repr=False)
+    """of which it is a run; None of a trajectory from a file, which does not hold it"""
 
     def __post_init__(self) -> None:
         if self.begun is None and len(self.steps):
@@ -237,6 +241,38 @@ class Trajectory:
             for k, step in enumerate(self.steps):
                 recorded = {name: array[k] for name, array in self.quantities.items()}
                 append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step), recorded)
+
+    def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
+        """Writes the surface of the fluid, coloured by phase, its particles, and solids for other programs: see
+        `docs/into_blender.md`. Returns the file to open, or the folder of a series.
+
+        ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
+        ``run.pvd`` for ParaView. ``scene``: of a trajectory from a file the scene, or the path of its file. The folder
+        must be empty or missing. In the plane there is no surface, and z is 0.
+
+        Raises:
+            InputError: another format, a folder with files, no scene or another one, or a library that is missing.
+            ComputationError: the disk is full.
+        """
+        from cortado.runs.exports.export import export
+
+        of = self.scene if scene is None else scene
+        if of is None:
+            raise InputError(
+                "scene is missing, but must be given, as a trajectory from a file does not hold its scene."
+            )
+        return export(self, folder, to, of)
+
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset`` of the dimensions time, particle and space, with units: position, velocity, with
+        several phases mass_fraction, recorded quantities, and where solids that move are, along a dimension solid.
+
+        Raises:
+            InputError: xarray is missing.
+        """
+        from cortado.runs.exports.labelled import labelled
+
+        return labelled(self)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

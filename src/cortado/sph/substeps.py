@@ -4,7 +4,7 @@ import numpy as np
 
 from cortado.discretise.calibration import diffusion_limit
 from cortado.discretise.smoothing import smoothing_kernel
-from cortado.errors import InputError
+from cortado.errors import OutOfRangeError
 from cortado.scene.scene import Scene
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 
@@ -21,7 +21,8 @@ def stable_substeps(
     rest_density: np.ndarray,
 ) -> int:
     """Those that are stable in a scene of several phases with a time step [s], a mobility [m2/s], an interface width
-    [m] and rest densities (phases,) [kg/m3]; raises `InputError` where there would be more than `MOST_SUBSTEPS`."""
+    [m] and rest densities (phases,) [kg/m3]; raises `OutOfRangeError` where there would be more than
+    `MOST_SUBSTEPS`."""
     mixture, discretisation = scene.mixture, scene.discretisation
     limit = diffusion_limit(
         smoothing_kernel(discretisation.kernel),
@@ -35,7 +36,7 @@ def stable_substeps(
     )
     number = float(np.ceil(time_step / limit))
     if number > MOST_SUBSTEPS:
-        raise InputError(
+        raise OutOfRangeError(
             f"mobility is {mobility:g} m2/s, which takes {number:.3g} explicit steps of diffusion in a time step, but "
             f"must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
         )

@@ -89,9 +89,11 @@ private:
             for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
                 const Vector<Scalar, D> normal = model.wall_normals[pair->other].template cast<Scalar>();
                 const Scalar volume = model.volume * model.wall_weights[pair->other];
-                of.gamma += (volume * normal.dot(pair->gradient())) * normal;
+                of.normal += (volume * normal.dot(pair->gradient())) * normal;
+                of.whole += volume * pair->gradient();
                 of.nu += volume * pair->w;
             }
+            of.gamma = Edge<Scalar, D>(model, of).gamma();
             moments[i] = of;
             effects[i] = Surroundings<Scalar, D>(model, of).found;
         });

@@ -188,6 +188,7 @@ private:
             bar.g += more.g;
             bar.gamma += more.gamma;
             bar.nu += more.nu;
+            Edge<Real, D>(model_, at_.moments[i]).adjoint(bar);
         });
         each([&](std::size_t i) {
             const Moments<Real, D>& own = moments_bar_[i];
@@ -201,7 +202,7 @@ private:
             for (auto pair = step_.walls.begin_of(i); pair != step_.walls.end_of(i); ++pair) {
                 const Vector<Real, D>& normal = model_.wall_normals[pair->other];
                 const Real volume = model_.volume * model_.wall_weights[pair->other];
-                const Vector<Real, D> along = normal.dot(own.gamma) * normal;
+                const Vector<Real, D> along = normal.dot(own.normal) * normal + own.whole;
                 x_bar_[i] += volume * (pair->hessian_product(along) + own.nu * pair->gradient());
             }
         });

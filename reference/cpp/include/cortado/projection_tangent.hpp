@@ -28,9 +28,12 @@ ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Rea
         for (auto pair = step.walls.begin_of(i); pair != step.walls.end_of(i); ++pair) {
             const Vector<Real, D>& normal = model.wall_normals[pair->other];
             const Real volume = model.volume * model.wall_weights[pair->other];
-            dot.gamma += (volume * normal.dot(pair->hessian_product(dx[i]))) * normal;
+            const Vector<Real, D> dg = volume * pair->hessian_product(dx[i]);
+            dot.normal += normal.dot(dg) * normal;
+            dot.whole += dg;
             dot.nu += volume * pair->gradient().dot(dx[i]);
         }
+        dot.gamma = Edge<Real, D>(model, step.projection.moments[i]).tangent(dot.normal, dot.whole);
         dot.M = even<Real, D>(dot.M);  // which it is over all pairs, but for round-off
     });
     return change;

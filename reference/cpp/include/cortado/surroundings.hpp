@@ -12,11 +12,12 @@ Scalar hundredths(int count) {
     return Scalar(Real(count) / Real(100));
 }
 
-// M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m and g = sum g_ij of fluid, gamma and nu of walls.
+// M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m and g = sum g_ij of fluid; of walls the sums of g_ib, along their
+// normals and whole, gamma, which is between the two, and nu.
 template <class Scalar, int D>
 struct Moments {
     Matrix<Scalar, D> M = Matrix<Scalar, D>::Constant(Scalar(0)), Q = M;
-    Vector<Scalar, D> g = Vector<Scalar, D>::Constant(Scalar(0)), gamma = g;
+    Vector<Scalar, D> g = Vector<Scalar, D>::Constant(Scalar(0)), normal = g, whole = g, gamma = g;
     Scalar nu{0};
 };
 
@@ -42,6 +43,36 @@ struct Smoothstep {
         }
         value = t * t * (Scalar(3) - Scalar(2) * t);
         slope = Scalar(6) * t * (one - t) / width;
+    }
+};
+
+// How much of the whole push of walls counts: none along flat walls, all of it about an edge that sticks out.
+template <class Scalar, int D>
+struct Edge {
+    Vector<Scalar, D> normal, whole;
+    Scalar below, off;
+    Smoothstep<Scalar> share;
+
+    Edge(const Model<Scalar, D>& model, const Moments<Scalar, D>& of)
+        : normal(of.normal),
+          whole(of.whole),
+          below(of.whole.dot(of.whole) + hundredths<Scalar>(1) * model.least_diagonal),
+          off((of.whole.dot(of.whole) - of.normal.dot(of.normal)) / below),
+          share(off, 10, 40) {}
+
+    Vector<Scalar, D> gamma() const { return normal + share.value * (whole - normal); }
+
+    // The tangent of gamma for those of the sums along normals and whole.
+    Vector<Scalar, D> tangent(const Vector<Scalar, D>& dn, const Vector<Scalar, D>& dw) const {
+        const Scalar two(2), doff = (two * (Scalar(1) - off) * whole.dot(dw) - two * normal.dot(dn)) / below;
+        return dn + share.value * (dw - dn) + (share.slope * doff) * (whole - normal);
+    }
+
+    // Adds to the adjoints of the sums for that of gamma.
+    void adjoint(Moments<Scalar, D>& bar) const {
+        const Scalar one(1), off_bar = Scalar(2) * share.slope * bar.gamma.dot(whole - normal) / below;
+        bar.normal += (one - share.value) * bar.gamma - off_bar * normal;
+        bar.whole += share.value * bar.gamma + off_bar * (one - off) * whole;
     }
 };
 

@@ -51,7 +51,8 @@ def _command(path: Path) -> str:
     if path.suffix == ".py":
         return f"python {path}"
     tables = tomllib.loads(path.read_text("utf-8"))
-    return f"cortado {next((name for name in ('optimise', 'fit') if name in tables), 'run')} {path}"
+    command = next((name for name in ("optimise", "fit", "dataset") if name in tables), "run")
+    return f"cortado {command} {path}"
 
 
 def _line(path: Path) -> str:

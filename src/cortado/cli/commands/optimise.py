@@ -28,6 +28,7 @@ from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
 from cortado.runs.report import Section, write_report
 from cortado.runs.run_folder import TO_RESUME, RunFolder
+from cortado.words import counted
 
 LITTLE = 2.0
 """How many times smaller a loss must be for a search to have come to something."""
@@ -132,7 +133,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
     history: list[Record] = []
-    start, shown, updates, refused = made.start, 0, 0, 0
+    start, shown, updates, refused, left_out = made.start, 0, 0, 0, 0
     with track(len(made.searches) * settings.iterations, "optimise") as advance:
 
         def show(made: int, **fields: Any) -> None:
@@ -148,6 +149,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
                 iteration=len(history),
                 updates=updates + record.updates,
                 refused=refused + record.refused,
+                left_out=left_out + record.left_out,
             )
             if record.iteration + 1 == known:
                 announce(_resumed(record, len(made.searches) * settings.iterations))
@@ -157,6 +159,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
                     loss=record.loss,
                     gradient_norm=record.gradient_norm,
                     refused=record.refused,
+                    left_out=record.left_out,
                 )
             history.append(record)
             show(made_updates, loss=record.loss, evaluations=len(history))
@@ -175,8 +178,10 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             )
             if result.updates > result.history[-1].updates:
                 show(result.updates)
-            start, updates, refused = result.last_parameters, updates + result.updates, refused + result.refused
-    return replace(result, history=tuple(history), updates=updates, evaluations=len(history), refused=refused)
+            start, updates = result.last_parameters, updates + result.updates
+            refused, left_out = refused + result.refused, left_out + result.left_out
+    whole: dict[str, Any] = {"updates": updates, "evaluations": len(history), "refused": refused, "left_out": left_out}
+    return replace(result, history=tuple(history), **whole)
 
 
 def _resumed(last: Record, iterations: int) -> str:
@@ -217,7 +222,8 @@ def _summary(made: Setup, estimate: Mapping[str, np.ndarray], result: Result, ve
         reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
     unit = "" if made.renderer else " m²"
-    refused = f" and {result.refused} more that diverged and were refused" if result.refused else ""
+    refused = f" and {result.refused} more that were refused" if result.refused else ""
+    left_out = f", {counted(result.left_out, 'run')} of ensembles left out" if result.left_out else ""
     ends = f", from {verdict.first:.3g}{unit} to {result.loss:.3g}{unit}" if result.loss > 0.0 else unit
-    text = f"The loss {fell}{ends} in {len(result.history)} evaluations{refused}"
+    text = f"The loss {fell}{ends} in {len(result.history)} evaluations{refused}{left_out}"
     return f"{'; '.join([text, *reached])}."

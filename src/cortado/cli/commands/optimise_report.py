@@ -71,7 +71,8 @@ def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
         ("steps", made.problem.steps, ""),
         ("gradients", repr(made.task.optimise.gradient.estimator()), ""),
         ("evaluations", len(result.history), ""),
-        ("refused, as they diverged", result.refused, ""),
+        ("refused", result.refused, ""),
+        ("runs of ensembles left out", result.left_out, ""),
         ("first loss", f"{verdict.first:.4g}", "" if made.renderer else "m²"),
         ("best loss", f"{result.loss:.4g}", "" if made.renderer else "m²"),
         ("loss reduction", f"{verdict.reduction:.4g}", "times"),
@@ -88,6 +89,7 @@ def for_machines(
     found: dict[str, Any] = {
         "evaluations": len(result.history),
         "refused": result.refused,
+        "left_out": result.left_out,
         "first_loss": verdict.first,
         "loss": result.loss,
         "loss_reduction": verdict.reduction,

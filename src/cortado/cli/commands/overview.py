@@ -8,6 +8,7 @@ _GROUPS = {
         ("cortado describe dam.toml", "particles, memory, time, what limits its time step"),
         ("cortado run dam.toml --out runs/dam", "run it; open runs/dam/report.html"),
         ("cortado picture runs/dam", "a shaded picture of it; --film for a film"),
+        ("cortado export runs/dam --to usd", "for Blender, Houdini; --to vtp for ParaView"),
         ("cortado view runs/dam", "play it in the browser; a scene runs there, live"),
         ("cortado examples", "list the examples; --copy NAME brings one here"),
     ),
@@ -17,6 +18,7 @@ _GROUPS = {
         ("cortado optimise task.toml --out runs/found", "find what a task file asks for; --resume goes on"),
         ("cortado fit task.toml --out runs/fit", "a viscosity with an error bar, from a video or a force"),
         ("cortado sweep dam.toml --set phase.0.viscosity=0.05,0.1", "every combination of some values"),
+        ("cortado dataset dam.toml --runs 100 --out data", "varied runs to train on, as LagrangeBench's"),
         ("cortado gradients check dam.toml --steps 20", "are gradients right, and for how long?"),
     ),
     "Set up": (

@@ -8,8 +8,9 @@ from typing import Any
 
 from cortado.errors import InputError, SceneError
 from cortado.optimisation.fitting.experiment import Experiment
+from cortado.optimisation.inverse.fit_tables import FitTable, FitTables
 from cortado.optimisation.inverse.measured_data import observation
-from cortado.optimisation.inverse.tables import FitTable, FitTables, ProblemTable
+from cortado.optimisation.inverse.tables import ProblemTable
 from cortado.scene.fields import MISSING
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.registry import offered

@@ -1,4 +1,4 @@
-"""The tables [problem], [optimise] and [fit] of a task, with the field types that only they have."""
+"""The tables [problem] and [optimise] of a task, with the field types that only they have."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -318,26 +318,6 @@ class OptimiseTable(Table):
         if isinstance(made, LBFGS) and self.tolerance is not None:
             return replace(made, tolerance=self.tolerance)
         return made
-
-
-class FitTable(Table):
-    """[fit]: the parameters that are fitted to measured data, and how long."""
-
-    start: Values
-    """By name the parameters that are fitted, as the fit starts; positive ones are searched by their logarithm."""
-    bounds: Values | None = None
-    """By the name of a parameter the lower and the upper bound; a number whose bounds are the same is not fitted."""
-    iterations: Annotated[int, count(1, 10_000)] = 50
-    """Trial points at most, of each of the two fits."""
-    profiles: Annotated[int, count(0, 100)] = 7
-    """Points of the profile of each number, each with a fit of all others; 0 for no profiles."""
-
-
-class FitTables(Table):
-    """The two tables of a task whose target was measured."""
-
-    problem: ProblemTable
-    fit: FitTable
 
 
 class TaskTables(Table):

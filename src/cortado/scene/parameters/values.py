@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, require_table
-from cortado.errors import InputError, shown
+from cortado.errors import InputError, OutOfRangeError, shown
 from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.parameters.parameter import Axis, Range, Role, Source
 from cortado.scene.parameters.registry import BY_NAME, names
@@ -67,14 +67,14 @@ def is_too_small(array: np.ndarray, allowed: Range) -> bool:
 def checked_value(
     name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
 ) -> np.ndarray:
-    """A value as a float64 array of one of the shapes, finite and in range, or an `InputError` in a sentence. A
-    ``what`` of "direction" may be negative."""
+    """A value as a float64 array of one of the shapes, finite and in range, or an `InputError` in a sentence: an
+    `OutOfRangeError` where only the value is wrong. A ``what`` of "direction" may be negative."""
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""
     if array.shape not in shapes:
         raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")
     if not np.isfinite(array).all():
-        raise InputError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
+        raise OutOfRangeError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
     if what != "direction":
         _check_range(name, array, parameter.range, what)
     return array
@@ -82,10 +82,10 @@ def checked_value(
 
 def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> None:
     if is_too_small(array, allowed):
-        raise InputError(f"{what} {name} is {shown(float(array.min()))}, but must be {allowed.value}.")
+        raise OutOfRangeError(f"{what} {name} is {shown(float(array.min()))}, but must be {allowed.value}.")
     if allowed is Range.FRACTIONS:
         totals = array.sum(axis=-1)
         worst = np.unravel_index(np.abs(totals - 1.0).argmax(), totals.shape)
         if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
             place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
-            raise InputError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")
+            raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")

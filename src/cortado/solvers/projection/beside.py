@@ -1,5 +1,16 @@
-"""What walls are to a particle of the projection, with its derivatives: gamma = sum w_b g_ib, of each wall particle the
-part along the normal of its wall, nu = V sum w_b W_ib, and gamma . v summed over walls that move, their drift."""
+"""What walls are to a particle of the projection, with its derivatives.
+
+With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, sums over wall particles are
+
+    normal = sum w_b n_b n_b^T g_ib,   whole = sum w_b g_ib,   nu = V sum w_b W_ib,
+
+and, as walls may move, their drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls push along
+
+    gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20).
+
+Along a flat wall and in a corner that walls close, e is 0, so that the order of wall particles holds nothing back.
+About an edge that sticks out into the fluid, parts along normals add up to a third of what is missing, and e is 1.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -7,9 +18,17 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.solid_shares import solid_kernel
+from cortado.sph.moment_functions import moment_functions
+
+EDGED = (0.1, 0.4)
+"""The part of a wall's push, squared, off normals, up to which e is 0, and from which it is 1. It is below 0.02 along
+flat walls and in the corners of a box, 0.3 a spacing and a half from an edge, and 0.75 diagonally before it."""
+DIRECTION = 0.01
+"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is not known."""
 
 
 @dataclass(frozen=True)
@@ -17,10 +36,39 @@ class BesideSums:
     """Warp functions."""
 
     sums: Any
-    """gamma, nu and the drift."""
+    """normal, whole, nu and the drifts."""
     tangent: Any
     back: Any
     """What their adjoints give to x."""
+
+
+@dataclass(frozen=True)
+class EdgeFunctions:
+    """Warp functions of one particle."""
+
+    edge: Any
+    """e of normal, whole and 0.05 a_0."""
+    back: Any
+    """The adjoints of normal and whole for that of e."""
+
+
+@cache
+def edge_functions(precision: Precision, dimension: int, module: Any) -> EdgeFunctions:
+    """In 2 or 3 dimensions, in a Warp module."""
+    real, vector, smoothstep = precision.real, precision.vector, moment_functions(precision, dimension).smoothstep
+    e_0, e_1, direction = (wp.constant(real(value)) for value in (*EDGED, DIRECTION))
+
+    @wp.func
+    def edge(normal: vector, whole: vector, least: real) -> real:
+        square = wp.dot(whole, whole)
+        return smoothstep((square - wp.dot(normal, normal)) / (square + direction * least), e_0, e_1)
+
+    @wp.func(module=module)
+    def back(normal: vector, whole: vector, least: real, bar: real):
+        by_normal, by_whole, _least = wp.grad(edge)(normal, whole, least)
+        return bar * by_normal, bar * by_whole
+
+    return EdgeFunctions(edge, back)
 
 
 @cache
@@ -44,9 +92,10 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
     normal = normal_part(discretisation)
 
     @wall_sum(discretisation)
-    def beside(x_ij: vector, v_j: vector, foot: vector, s: neighbourhood) -> tuple[vector, real, real]:
-        push = s.volume * normal(gradient(x_ij, s), foot)
-        return push, s.volume * weight(x_ij, s), wp.dot(push, v_j)
+    def beside(x_ij: vector, v_j: vector, foot: vector, s: neighbourhood) -> tuple[vector, vector, real, real, real]:
+        whole = s.volume * gradient(x_ij, s)
+        part = normal(whole, foot)
+        return part, whole, s.volume * weight(x_ij, s), wp.dot(part, v_j), wp.dot(whole, v_j)
 
     @wall_sum(discretisation)
     def beside_tangent(
@@ -57,32 +106,36 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         foot: vector,
         turn_dot: vector,
         s: neighbourhood,
-    ) -> tuple[vector, real, real]:
+    ) -> tuple[vector, vector, real, real, real]:
         """A wall that turns turns its push; the rest of the way changes it as it does beside one that does not."""
-        G, rest = gradient(x_ij, s), x_dot_ij - wp.cross(turn_dot, x_ij)
-        push = s.volume * normal(G, foot)
-        change = s.volume * normal(hessian_product(x_ij, rest, s), foot) + wp.cross(turn_dot, push)
-        return change, s.volume * wp.dot(G, rest), wp.dot(change, v_j) + wp.dot(push, v_dot_j)
+        rest = x_dot_ij - wp.cross(turn_dot, x_ij)
+        whole, bent = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, rest, s)
+        part = normal(whole, foot)
+        part_dot, whole_dot = normal(bent, foot) + wp.cross(turn_dot, part), bent + wp.cross(turn_dot, whole)
+        part_drift, whole_drift = wp.dot(part_dot, v_j) + wp.dot(part, v_dot_j), wp.dot(whole_dot, v_j)
+        return part_dot, whole_dot, wp.dot(whole, rest), part_drift, whole_drift + wp.dot(whole, v_dot_j)
 
     @wall_sum(discretisation)
     def beside_back(
         x_ij: vector,
         v_j: vector,
-        gamma_bar_i: vector,
+        normal_bar_i: vector,
+        whole_bar_i: vector,
         nu_bar_i: real,
-        drift_bar_i: real,
+        normal_drift_bar_i: real,
+        whole_drift_bar_i: real,
         foot: vector,
         s: neighbourhood,
     ) -> vector:
-        push = hessian_product(x_ij, normal(gamma_bar_i + drift_bar_i * v_j, foot), s)
-        return s.volume * (push + nu_bar_i * gradient(x_ij, s))
+        pushed = normal(normal_bar_i + normal_drift_bar_i * v_j, foot) + whole_bar_i + whole_drift_bar_i * v_j
+        return s.volume * (hessian_product(x_ij, pushed, s) + nu_bar_i * gradient(x_ij, s))
 
     return BesideSums(beside, beside_tangent, beside_back)
 
 
 def beside_solid_kernel(discretisation: Discretisation) -> Any:
-    """The kernel of what they give to solids (`cortado.particles.solid_shares.SolidShares.add`), for the adjoints
-    ``gamma_bar``, ``nu_bar`` and ``drift_bar``."""
+    """The kernel of what they give to solids (`cortado.particles.solid_shares.SolidShares.add`), for the adjoints of
+    the sums."""
     return solid_kernel(discretisation, "projection", _work)
 
 
@@ -93,13 +146,17 @@ def _work(d: Discretisation) -> Any:
     def beside_work(
         x_ij: vector,
         v_j: vector,
-        gamma_bar_i: vector,
+        normal_bar_i: vector,
+        whole_bar_i: vector,
         nu_bar_i: real,
-        drift_bar_i: real,
+        normal_drift_bar_i: real,
+        whole_drift_bar_i: real,
         foot: vector,
         s: neighbourhood_type(d.precision),
     ) -> real:
-        push = normal(gradient(x_ij, s), foot)
-        return s.volume * (wp.dot(push, gamma_bar_i + drift_bar_i * v_j) + nu_bar_i * weight(x_ij, s))
+        whole = gradient(x_ij, s)
+        part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j)
+        part += wp.dot(whole, whole_bar_i + whole_drift_bar_i * v_j)
+        return s.volume * (part + nu_bar_i * weight(x_ij, s))
 
     return beside_work

@@ -67,12 +67,12 @@ class Bodies:
         own = held.known, held.shares, held.whole, begun(body.before), self.part.poses
         return *own, *body.known(context)
 
-    def begin(self, context: StepContext, a: wp.array) -> None:
+    def begin(self, context: StepContext, around: Arrays) -> None:
         """Look at what is around them, and add to the diagonal."""
         for held in self.held:
-            context.launch(self.kernels.hold.forward, *self.known(context, held))
+            context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
             held.add_sizes()
-            context.launch(self.kernels.weigh.forward, *self.known(context, held), a=a)
+            context.launch(self.kernels.weigh.forward, *self.known(context, held), a=around["a"])
 
     def move(self, context: StepContext, held: Held, y: wp.array, moved: Arrays) -> Arrays:
         """Write V, W and L by pressures y, and return the sums of these."""
@@ -114,12 +114,13 @@ class BodiesTangent:
         dots = own.known, own.shares, own.whole, begun(self._changes[k].before), rates
         return *dots, *dot.named, *bodies.known(context, held)
 
-    def begin(self, context: StepContext, dot: Tangents, a_dot: wp.array) -> None:
+    def begin(self, context: StepContext, dot: Tangents, around: Arrays, around_dot: Arrays) -> None:
         kernels = self._bodies.kernels
+        edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
         for k, own in enumerate(self._held):
-            context.launch(kernels.hold.tangent, *self._known(context, dot, k))
+            context.launch(kernels.hold.tangent, *self._known(context, dot, k), edges)
             own.add_sizes()
-            context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=a_dot)
+            context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=around_dot["a_dot"])
 
     def _move(
         self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays
@@ -212,9 +213,10 @@ class BodiesAdjoint:
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()
 
-    def finish(self, context: StepContext, bar: Adjoints, a_bar: wp.array) -> None:
+    def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
         """Of `Bodies.begin`, to what particles and poses are given."""
-        bodies = self._bodies
+        bodies, a_bar = self._bodies, around_bar["a_bar"]
+        edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
         share, weigh, end = bodies.kernels.weigh.adjoint
         for k, held in enumerate(bodies.held):
             known = self._known(context, bar, k)
@@ -223,7 +225,7 @@ class BodiesAdjoint:
             context.launch(weigh, weighed, *known, a_bar=a_bar)
             context.launch(end, weighed, *known, threads=bodies.layout.members)
             given = bar.solids.of(held.body.table.number)
-            context.launch(bodies.kernels.hold.adjoint, given, *known)
+            context.launch(bodies.kernels.hold.adjoint, given, *known, edges)
             turned = self._turned[k]["turned_bar"]
             bar.solids.add_whole(held.body.table.number, self._none["L_bar"], turned)
             turned.zero_()

@@ -1,7 +1,8 @@
 """A rigid body in the projection: it takes part by its velocities, which pressures change as they change those of
 fluid.
 
-Walls of a body push particle i by gamma_i = sum w_b g_ib over its own wall particles. With r_i = x_i - c', the pressure
+Walls of a body push particle i by gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)), N_b = n_b n_b^T, over its own
+wall particles, with e_i of all walls (`cortado.solvers.projection.beside`). With r_i = x_i - c', the pressure
 impulses y, the body's density rho and its volume K in those of a particle,
 
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
@@ -56,21 +57,38 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     held_dots = bundle(gamma_of_dot=vector, arm_dot=vector)
     held_bars = bundle(gamma_of_bar=vector, arm_bar=vector)
 
+    @wp.func
+    def between(a: vector, foot: vector, edge: real) -> vector:
+        """The part along the normal of a wall, and of the rest as much as e says."""
+        part = normal(a, foot)
+        return part + edge * (a - part)
+
     @solid_sum(discretisation)
-    def push(x_ij: vector, foot: vector, solid: int, s: neighbourhood) -> vector:
-        return s.volume * normal(gradient(x_ij, s), foot)
+    def push(x_ij: vector, edge_i: real, foot: vector, solid: int, s: neighbourhood) -> vector:
+        return s.volume * between(gradient(x_ij, s), foot, edge_i)
 
     @solid_sum(discretisation)
     def push_tangent(
-        x_ij: vector, x_dot_ij: vector, foot: vector, turn_dot: vector, solid: int, s: neighbourhood
+        x_ij: vector,
+        x_dot_ij: vector,
+        edge_i: real,
+        edge_dot_i: real,
+        foot: vector,
+        turn_dot: vector,
+        solid: int,
+        s: neighbourhood,
     ) -> vector:
-        rest = x_dot_ij - wp.cross(turn_dot, x_ij)
-        whole = s.volume * normal(gradient(x_ij, s), foot)
-        return s.volume * normal(hessian_product(x_ij, rest, s), foot) + wp.cross(turn_dot, whole)
+        G, rest = gradient(x_ij, s), x_dot_ij - wp.cross(turn_dot, x_ij)
+        change = between(hessian_product(x_ij, rest, s), foot, edge_i) + edge_dot_i * (G - normal(G, foot))
+        return s.volume * (change + wp.cross(turn_dot, between(G, foot, edge_i)))
 
     @solid_sum(discretisation)
-    def push_back(x_ij: vector, bar: vector, foot: vector, solid: int, s: neighbourhood) -> vector:
-        return s.volume * hessian_product(x_ij, normal(bar, foot), s)
+    def push_back(
+        x_ij: vector, edge_i: real, bar_i: vector, foot: vector, solid: int, s: neighbourhood
+    ) -> tuple[vector, real]:
+        G = gradient(x_ij, s)
+        pushed = s.volume * hessian_product(x_ij, between(bar_i, foot, edge_i), s)
+        return pushed, s.volume * wp.dot(G - normal(G, foot), bar_i)
 
     @wp.func
     def direction(a: vector) -> vector:
@@ -86,13 +104,14 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         solid: int,
         after: wp.array2d(dtype=vector),
         x: wp.array(dtype=vector),
+        edge: wp.array(dtype=real),
         # out
         gamma_of: wp.array(dtype=vector),
         arm: wp.array(dtype=vector),
         sizes: wp.array(dtype=pair_of),
     ):
         i = s.first + wp.tid() // LANES
-        total = push(i, x, solid, s)
+        total = push(i, x, edge, solid, s)
         if lane() > 0:
             return
         r = separation(x[i], after[i // s.particles, solid], s)
@@ -107,6 +126,8 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         after_dot: wp.array2d(dtype=vector),
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
+        edge: wp.array(dtype=real),
+        edge_dot: wp.array(dtype=real),
         of: held,
         # out
         gamma_of_dot: wp.array(dtype=vector),
@@ -114,7 +135,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         sizes_dot: wp.array(dtype=pair_of),
     ):
         i = s.first + wp.tid() // LANES
-        total = push_tangent(i, x, x_dot, solid, s)
+        total = push_tangent(i, x, x_dot, edge, edge_dot, solid, s)
         if lane() > 0:
             return
         r, r_dot, gamma = of.arm[i], x_dot[i] - after_dot[i // s.particles, solid], of.gamma_of[i]
@@ -128,19 +149,22 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         s: neighbourhood,
         solid: int,
         x: wp.array(dtype=vector),
+        edge: wp.array(dtype=real),
         of: held,
         own: held_bars,
         # in and out
         x_bar: wp.array(dtype=vector),
+        edge_bar: wp.array(dtype=real),
         force_bar: wp.array(dtype=vector),
         torque_bar: wp.array(dtype=vector),
     ):
         """Of gamma, whose sizes have given to ``own``; a further turn of the body turns gamma and takes it along."""
         i = s.first + wp.tid() // LANES
         bar = own.gamma_of_bar[i]
-        total = push_back(i, x, bar, solid, s)
+        total, edge_part = push_back(i, x, edge, own.gamma_of_bar, solid, s)
         if lane() > 0:
             return
+        edge_bar[i] = edge_bar[i] + edge_part
         x_bar[i] = x_bar[i] + total + own.arm_bar[i]
         force_bar[i] = force_bar[i] - total - own.arm_bar[i]
         torque_bar[i] = torque_bar[i] + wp.cross(of.gamma_of[i], bar) - wp.cross(of.arm[i], total)

@@ -48,7 +48,7 @@ class ProjectionTangent(ParticleTangent):
         known = (*self.dot.named, self._around, solver.around)
         context.launch(kernels.surroundings.tangent, *known, solver.relaxed)
         if self._bodies is not None:
-            self._bodies.begin(context, self.dot, self._around["a_dot"])
+            self._bodies.begin(context, self.dot, solver.around, self._around)
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
         start = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
         steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
@@ -170,7 +170,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)
         if self._bodies is not None:
-            self._bodies.finish(context, self.bar, self._around["a_bar"])
+            self._bodies.finish(context, self.bar, solver.around, self._around)
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
             context.launch(kernel, *known, solver.relaxed)

@@ -156,7 +156,7 @@ class ProjectionSteps(ParticleSolver):
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
         context.launch(kernels.surroundings.forward, self.around, self.relaxed)
         if self.bodies is not None:
-            self.bodies.begin(context, self.around["a"])
+            self.bodies.begin(context, self.around)
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         started = {"k": first["k"], "y": first["y"], "T": self.pull, "k_before": self.carried[IMPULSE]}

@@ -1,8 +1,8 @@
 """What a particle's neighbourhood lets the projection do, from the moments of its neighbours.
 
-With the moments M, Q, g, gamma and nu of `cortado.solvers.projection.sums`, the fullness H of
-`cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 + (nu / 0.05)^4), which is 0
-beside walls:
+With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.beside`,
+the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 +
+(nu / 0.05)^4), which is 0 beside walls:
 
     sigma = S(0.1, 0.5) B    how much tension is let through,
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
@@ -25,7 +25,7 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.solvers.projection.beside import beside_sums
+from cortado.solvers.projection.beside import DIRECTION, beside_sums, edge_functions
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
@@ -39,8 +39,6 @@ ALONG = 0.2
 """How much of what gradients along a wall lack beside it is made up. On the lattice, with Wendland C2, the first row
 lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
 vortex, and with 1, where divergences are right, the second row has 6 % too much and rises."""
-DIRECTION = 0.01
-"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is not known."""
 
 
 @cache
@@ -53,6 +51,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     """Names and types of what is kept of a particle's surroundings."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
+    own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
     return {**own, "L": matrix, "a": real, "weights": weights_type(precision)}
 
 
@@ -184,6 +183,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     weights_of, correction_of, diagonal_of = here.weights, here.correction, here.diagonal
     along = surrounding_functions(precision, dimension, tangent_module).back
     back = surrounding_functions(precision, dimension, adjoint_module).back
+    edge = edge_functions(precision, dimension, module).edge
+    edge_along = edge_functions(precision, dimension, tangent_module).back
+    edge_back = edge_functions(precision, dimension, adjoint_module).back
     around = bundle(**entries(precision))
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -200,9 +202,11 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g = moments(i, x, m, s)
-        gamma, nu, drift = beside(i, x, v, s)
+        normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
         if lane() > 0:
             return
+        e = edge(normal, entire, least)
+        gamma = normal + e * (entire - normal)
         M, Q = whole(diagonal, others), change(square, mixed)
         L = correction_of(M, gamma, nu, least)
         of.M[i] = M
@@ -210,7 +214,12 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.g[i] = g
         of.gamma[i] = gamma
         of.nu[i] = nu
-        of.drift[i] = drift
+        of.drift[i] = normal_drift + e * (whole_drift - normal_drift)
+        of.normal[i] = normal
+        of.whole[i] = entire
+        of.normal_drift[i] = normal_drift
+        of.whole_drift[i] = whole_drift
+        of.edge[i] = e
         of.L[i] = L
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu)
@@ -232,9 +241,15 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
-        gamma_i_dot, nu_i_dot, drift_i_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
+        normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         if lane() > 0:
             return
+        e, off = of.edge[i], of.whole[i] - of.normal[i]
+        by_normal, by_whole = edge_along(of.normal[i], of.whole[i], least, real(1.0))
+        e_dot = wp.dot(by_normal, normal_dot) + wp.dot(by_whole, whole_dot)
+        gamma_i_dot = normal_dot + e * (whole_dot - normal_dot) + e_dot * off
+        drift_i_dot = normal_drift_dot + e * (whole_drift_dot - normal_drift_dot)
+        drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
         M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i]
         L_dot, weights_dot, a_dot = matrix(), weights4(), real(0.0)
@@ -264,6 +279,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.gamma[i] = gamma_i_dot
         dot.nu[i] = nu_i_dot
         dot.drift[i] = drift_i_dot
+        dot.edge[i] = e_dot
         dot.L[i] = L_dot
         dot.a[i] = a_dot
         dot.weights[i] = weights_dot
@@ -286,8 +302,15 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bar.M[i] = bar.M[i] + M_bar
         bar.Q[i] = bar.Q[i] + Q_bar
         bar.g[i] = bar.g[i] + g_bar
-        bar.gamma[i] = bar.gamma[i] + gamma_bar
         bar.nu[i] = bar.nu[i] + nu_bar
+        push_bar, drift_bar, e = bar.gamma[i] + gamma_bar, bar.drift[i], of.edge[i]
+        e_bar = bar.edge[i] + wp.dot(push_bar, of.whole[i] - of.normal[i])
+        e_bar += drift_bar * (of.whole_drift[i] - of.normal_drift[i])
+        normal_bar, whole_bar = edge_back(of.normal[i], of.whole[i], least, e_bar)
+        bar.normal[i] = (real(1.0) - e) * push_bar + normal_bar
+        bar.whole[i] = e * push_bar + whole_bar
+        bar.normal_drift[i] = (real(1.0) - e) * drift_bar
+        bar.whole_drift[i] = e * drift_bar
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def sums_adjoint(
@@ -302,7 +325,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         i = s.first + wp.tid() // LANES
         x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, s)
-        wall_part = beside_back(i, x, v, bar.gamma, bar.nu, bar.drift, s)
+        wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_part + wall_part

@@ -1,0 +1,234 @@
+"""``cortado dataset``: many runs of a scene with varied values, in files of LagrangeBench's layout."""
+
+import json
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cortado.cli.commands.executor import HERE, Where
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError
+from cortado.files.atomic import UNFINISHED, sentences, write_atomically
+from cortado.files.folder_lock import LOCK, locked
+from cortado.files.interruption import keeping
+from cortado.files.progress import track, untracked
+from cortado.optimisation.datasets.layout import METADATA, Parts, assemble, metadata, remove_parts, write_metadata
+from cortado.optimisation.datasets.one_run import one_run
+from cortado.optimisation.datasets.sample import Sample
+from cortado.optimisation.datasets.table import DatasetTable, DatasetTables
+from cortado.runs.run_files import read_json
+from cortado.scene.fields import MISSING
+from cortado.scene.scene import Scene, load_scene
+from cortado.scene.sentences import sentences as in_sentences
+from cortado.scene.toml import read_toml
+from cortado.simulation import Simulation
+from cortado.version import __version__
+from cortado.words import counted
+
+ASKED = "dataset.json"
+"""What a data set is of, so that the same command goes on with it, and another one does not."""
+MOST_RUNS = 100_000
+
+
+@dataclass(frozen=True)
+class Member:
+    """How each run of a data set is computed: what a worker process is sent."""
+
+    file: Path
+    overrides: tuple[str, ...]
+    table: DatasetTable
+    out: Path
+    device: str
+    precision: str
+
+    def scene(self, number: int) -> Scene:
+        """That of a run."""
+        return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides])
+
+    def __call__(self, number: int) -> tuple[bool, list[str]]:
+        """Compute a run and write it; returns whether there is one, and what it was warned of."""
+        if not (self.out / LOCK).exists():
+            raise InputError(
+                f"A worker does not see {self.out}, but the scene and the folder of a data set must be in a file "
+                "system that all machines share."
+            )
+        parts = Parts(self.out)
+        with warnings.catch_warnings(record=True) as caught, untracked():
+            warnings.simplefilter("always", CortadoWarning)
+            try:
+                simulation = Simulation(self.scene(number), self.device, self.precision)
+                found = one_run(simulation, Sample(self.table, number))
+            except (DivergedError, SceneError, InputError) as error:
+                parts.save_failure(number, str(error))
+                return False, []
+        parts.save(number, found)
+        return True, [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
+
+
+def make_dataset(
+    file: Path, runs: int, out: Path, overrides: list[str], device: str, precision: str, where: Where
+) -> str:
+    """Compute the runs that are not there yet, and put them together; returns a sentence that says where they are.
+    Raises `ComputationError` where the disk is full, and where a purpose is left without a run."""
+    table = _table(file, overrides)
+    member = Member(file.absolute(), tuple(overrides), table, out.absolute(), device, precision)
+    split = table.split(_checked_runs(runs, table))
+    asked = _asked(member, runs)
+    if out.suffix in (".h5", ".hdf5"):
+        raise InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
+    parts, absolute = Parts(member.out), member.out
+    with locked(out):
+        for left_behind in absolute.glob(UNFINISHED):  # by a process that was killed
+            left_behind.unlink(missing_ok=True)
+        if _is_complete(absolute, asked):
+            remove_parts(absolute)
+            return f"The data set in {absolute} is complete already: {_sizes(read_json(absolute / METADATA))}."
+        left = [number for number in range(runs) if parts.note(number) is None]
+
+        def kept() -> str:
+            there = sum(parts.note(number) is not None for number in range(runs))
+            return (
+                f"{there} of {counted(runs, 'run')} are finished, in {absolute}; the same command goes on with the rest"
+            )
+
+        told: dict[int, list[str]] = {}
+
+        def note(k: int, result: tuple[bool, list[str]]) -> None:
+            there, told[left[k]] = result
+            failed.extend([left[k]] * (not there))
+            advance(failed=len(failed))
+
+        failed: list[int] = []
+        with (
+            (where if left else HERE).executor(device, len(left)) as executor,
+            keeping(kept),
+            _saying(kept),
+            track(len(left), "data set") as advance,
+        ):
+            executor.map(member, left, note)
+        there, notes, failures = _finished(parts, split)
+        with keeping(kept), _saying(kept):
+            sizes = _put_together(member, there, notes)
+    _warn(told, failures, runs)
+    return f"The data set is in {absolute}: {sizes}."
+
+
+@contextmanager
+def _saying(kept: Callable[[], str]) -> Iterator[None]:
+    """A disk that refuses is said together with what is ``kept``."""
+    try:
+        yield
+    except ComputationError as error:
+        raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
+
+
+def _finished(parts: Parts, split: Mapping[str, range]) -> tuple[dict[str, list[int]], dict[int, Any], dict[int, str]]:
+    """The numbers of the runs that there are for each purpose, what is noted of each, and why others failed; raises
+    `ComputationError` where a purpose has none."""
+    notes = {number: parts.note(number) or {} for own in split.values() for number in own}
+    failures = {number: note["failure"] for number, note in notes.items() if "failure" in note}
+    there = {purpose: [number for number in own if number not in failures] for purpose, own in split.items()}
+    for purpose, numbers in there.items():
+        if split[purpose] and not numbers:
+            first = next(failures[number] for number in split[purpose])
+            raise ComputationError(f"No run of those for {purpose} could be computed. The first: {first}")
+    return there, {number: note for number, note in notes.items() if number not in failures}, failures
+
+
+def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping[int, Any]) -> str:
+    """Write the files of the data set, of runs by purpose with what is noted of each; returns their sizes in words."""
+    out = member.out
+    assemble(out, there)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        most = max(note["statistics"]["particles"] for note in notes.values())
+        content = metadata(member.scene(min(notes)), member.table, there, notes, most)
+    write_metadata(out, content)
+    remove_parts(out)
+    return _sizes(content)
+
+
+def _table(file: Path, overrides: list[str]) -> DatasetTable:
+    """The table [dataset] of a file; raises `SceneError`."""
+    data = read_toml(file, overrides)
+    if "dataset" not in data:
+        raise SceneError(str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one")
+    try:
+        with in_sentences(DatasetTables):
+            return DatasetTables(dataset=data["dataset"]).dataset
+    except SceneError as error:
+        raise error.in_file(str(file)) from None
+
+
+def _checked_runs(runs: int, table: DatasetTable) -> int:
+    least = 1 + (table.valid > 0.0) + (table.test > 0.0)
+    if not least <= runs <= MOST_RUNS or not table.split(runs)["train"]:
+        raise InputError(f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}, with some to train.")
+    return runs
+
+
+def _asked(member: Member, runs: int) -> dict[str, Any]:
+    """What is asked for; the first scene and those with the ends of all ranges are looked at, so that a mistake is
+    found before anything is computed. Raises `SceneError`."""
+    table = member.table
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        for end in (0, 1):
+            ends = [f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()]
+            scene = load_scene(member.file, [*member.overrides, *ends])
+            scene.solver.fixed_time_step("a data set")
+    for key in table.vary:
+        if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
+            raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
+    scene_json = json.loads(_scene(member).to_json())
+    numbers = {"runs": runs, "precision": member.precision, "cortado": __version__}
+    return {"scene": scene_json, "dataset": table.model_dump(mode="json"), **numbers}
+
+
+def _scene(member: Member) -> Scene:
+    """The scene of the file, whose warnings come with the runs."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        return load_scene(member.file, member.overrides)
+
+
+def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
+    """Whether the data set is there; notes what is asked for in a new folder, and raises `InputError` for a folder of
+    something else."""
+    note = out / ASKED
+    if note.exists():
+        if read_json(note) != asked:
+            raise InputError(
+                f"{out} holds a data set of another scene, table, number of runs, precision or version of Cortado; "
+                "choose another --out."
+            )
+        return (out / METADATA).exists()
+    with sentences(out):
+        others = [one.name for one in out.iterdir() if one.name != LOCK]
+    if others:
+        raise InputError(f"{out} holds {others[0]}, but no data set; choose another --out.")
+    write_atomically(note, json.dumps(asked, indent=2) + "\n")
+    return False
+
+
+def _sizes(content: Mapping[str, Any]) -> str:
+    """How many runs there are for each purpose, and how long they are."""
+    runs = ", ".join(f"{content[f'num_trajs_{purpose}']} to {purpose}" for purpose in ("train", "valid", "test"))
+    return f"{counted(content['sequence_length_train'], 'frame')} each, {runs}".replace("to valid", "to validate")
+
+
+def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int) -> None:
+    """Say once what runs were warned of, and which are left out."""
+    warned = {number: sentences for number, sentences in told.items() if sentences}
+    if warned:
+        first = min(warned)
+        said = (
+            f"{len(warned)} of {counted(runs, 'run')} came with a warning. The first is run {first}: {warned[first][0]}"
+        )
+        warnings.warn(said, CortadoWarning, stacklevel=3)
+    if failures:
+        first = min(failures)
+        said = f"{len(failures)} of {counted(runs, 'run')} failed and are left out. The first is run {first}: "
+        warnings.warn(f"{said}{failures[first]}", CortadoWarning, stacklevel=3)

@@ -1,0 +1,17 @@
+"""``cortado export``: a run as files of other programs."""
+
+from pathlib import Path
+
+from cortado.errors import InputError
+from cortado.runs.run_folder import RunFolder
+from cortado.runs.trajectory import Trajectory
+
+
+def export_run(run: Path, to: str, out: Path | None, every: int) -> str:
+    """Write every so many frames of a run that is there in a format; returns a sentence that says where they are."""
+    folder = RunFolder.open(run)
+    if not folder.trajectory.exists():
+        raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")
+    trajectory = Trajectory.load(folder.trajectory)[::every]
+    found = trajectory.export(folder.path / to if out is None else out, to, folder.read_scene())
+    return f"The run is in {found}."

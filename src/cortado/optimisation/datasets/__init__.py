@@ -1,0 +1,1 @@
+"""Data sets of runs with varied scenes, for learned simulators."""

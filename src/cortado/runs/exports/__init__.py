@@ -1,0 +1,1 @@
+"""Runs as files of other programs: meshes, points and solids over time, and labelled arrays."""

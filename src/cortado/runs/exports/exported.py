@@ -1,0 +1,190 @@
+"""What is written of a run for other programs: in every frame the particles, the surface of the fluid, and solids."""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError
+from cortado.pictures.painter import colours_of
+from cortado.pictures.shown_solids import ShownSolid, shown_solids
+from cortado.pictures.solid_mesh import SolidMesh
+from cortado.pictures.stage import upright
+from cortado.pictures.surface import liquid, nearest_colours, spheres
+from cortado.runs.frame import Frame
+from cortado.runs.frame_file import fraction_names
+from cortado.runs.solid_motion import posed
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+
+ROUND = 0.05
+"""How wide faces of round solids are, in sizes of the solid."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in space, outside on the side from which their corners run counterclockwise."""
+
+    points: Points
+    """(p, 3) [m]"""
+    triangles: np.ndarray
+    """(t, 3) numbers of points"""
+    normals: Points
+    """(p, 3) unit vectors outwards"""
+    colours: Points
+    """(p, 3) linear, from 0 to 1"""
+    velocities: Points | None = None
+    """(p, 3) [m/s]; None of a solid, whose motion its poses tell."""
+
+    def moved(self, pose: "Pose") -> "Mesh":
+        """In a pose."""
+        return Mesh(self.points @ pose.turn.T + pose.position, self.triangles, self.normals @ pose.turn.T, self.colours)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a solid is."""
+
+    turn: Points
+    """(3, 3) rotation matrix"""
+    position: Points
+    """(3,) of its middle [m]"""
+
+    @property
+    def matrix(self) -> Points:
+        """(4, 4) for columns: turned, then moved."""
+        return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+@dataclass(frozen=True)
+class ExportedSolid:
+    """One solid, at rest or in motion."""
+
+    name: str
+    part: str
+    """What files and their parts call it: "solid_" and its name, of letters, digits and underscores alone."""
+    mesh: Mesh
+    """About its middle, not turned."""
+    moves: bool
+
+
+@dataclass(frozen=True)
+class ExportedFrame:
+    """One frame, in three dimensions: z is 0 in the plane."""
+
+    time: float
+    """[s]"""
+    positions: Points
+    """(n, 3) of the particles [m]"""
+    velocities: Points
+    """(n, 3) [m/s]"""
+    colours: Points
+    """(n, 3) of the particles, linear, from 0 to 1: those of their phases"""
+    fields: Mapping[str, np.ndarray]
+    """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
+    surface: Mesh | None
+    """Of the fluid; None in the plane, and where the particles are too far from each other to have one."""
+    poses: Mapping[str, Pose]
+    """Of all solids, by their names."""
+
+
+class Exported:
+    """A run and its scene as other programs are given it."""
+
+    def __init__(self, trajectory: Trajectory, scene: Scene):
+        self.times, self.scene = trajectory.times, scene
+        shown = _first_of_each(scene)
+        parts = _part_names(shown)
+        self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
+        self._trajectory = trajectory
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.times)
+
+    @property
+    def spacing(self) -> float:
+        """[m]"""
+        return self.scene.discretisation.spacing
+
+    @property
+    def up(self) -> Points:
+        """(3, 3) the rotation that makes y the axis against gravity; in the plane there is nothing to turn."""
+        return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
+
+    def frames(self) -> Iterator[ExportedFrame]:
+        """One after the other, as surfaces take memory."""
+        return (self._frame(k, frame) for k, frame in enumerate(self._trajectory))
+
+    def _frame(self, number: int, frame: Frame) -> ExportedFrame:
+        positions, velocities = in_space(frame.positions), in_space(frame.velocities)
+        colours = colours_of(self.scene, frame.mass_fractions, len(positions))
+        fractions = np.zeros((len(positions), 0)) if frame.mass_fractions is None else frame.mass_fractions
+        fields = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
+        placed = _first_of_each(posed(self.scene, self._trajectory.solids, number))
+        poses = {name: Pose(_turn_in_space(one.turn), in_space(one.position[None])[0]) for name, one in placed.items()}
+        surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
+        return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
+
+    def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
+        makes = spheres if (self.scene.picture or Picture()).surface == "spheres" else liquid
+        try:
+            found = makes(positions, colours, self.spacing)
+        except ComputationError:
+            return None
+        own = nearest_colours(found.points, positions, velocities, self.spacing)
+        return Mesh(found.points, found.triangles, found.normals, found.colours, own)
+
+
+def in_space(vectors: Points) -> Points:
+    """Vectors (n, d) as (n, 3) in float64, with a 0 behind those of the plane."""
+    return np.pad(np.asarray(vectors, dtype=np.float64), ((0, 0), (0, 3 - vectors.shape[1])))
+
+
+def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
+    """The solids by name, without their images a period away, which come behind."""
+    return {one.name: one for one in reversed(shown_solids(scene))}
+
+
+def _part_names(solids: Iterable[str]) -> dict[str, str]:
+    """What files call solids, by their names: no two alike."""
+    found: dict[str, str] = {}
+    for number, name in enumerate(solids):
+        plain = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
+        found[name] = f"{plain}_{number}" if plain in found.values() else plain
+    return found
+
+
+def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
+    size = float(np.ptp(shown.shape.extent(), axis=0).max())
+    faces = shown.shape.shown_faces(ROUND * size)
+    faces = faces.reversed() if shown.is_tank else faces
+    if len(shown.turn) == 2:
+        points, triangles, normals = _ribbon(faces.vertices, faces.corners, size)
+    else:
+        found = SolidMesh.of(faces, np.inf)
+        points, triangles, normals = found.points, found.triangles, found.normals
+    colours = np.tile(shown.colour, (len(points), 1))
+    return ExportedSolid(shown.name, part, Mesh(points, triangles, normals, colours), moves)
+
+
+def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, np.ndarray, Points]:
+    """Points, triangles and normals of an outline in the plane, a tenth of its size wide across the plane."""
+    start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
+    along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+    outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
+    height = np.array([-0.05, 0.05]) * size
+    ends = np.stack([start, end, end, start], axis=1)
+    points = np.concatenate([ends, np.broadcast_to(height[[0, 0, 1, 1], None], (len(ends), 4, 1))], axis=2)
+    corners = 4 * np.arange(len(ends))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    return points.reshape(-1, 3), corners.reshape(-1, 3), np.repeat(outwards, 4, axis=0)
+
+
+def _turn_in_space(turn: Points) -> Points:
+    """A rotation (d, d) as one of space, about z in the plane."""
+    found = np.eye(3)
+    found[: len(turn), : len(turn)] = turn
+    return found

@@ -1,0 +1,322 @@
+"""Runs as files of other programs, read again by the libraries of these: VTK, OpenUSD, trimesh, xarray."""
+
+import re
+import sys
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+
+import cortado
+from cortado import ComputationError, InputError, Trajectory
+from cortado.runs.exports import by_vtk
+from cortado.runs.exports.by_usd import time_codes
+from cortado.runs.exports.export import FORMATS
+from cortado.runs.run_folder import RunFolder
+from cortado.runs.solid_motion import SolidMotion
+from cortado.scene.scene import scene_from_dict
+from full_disk import largest_file
+
+SPACING = 0.05
+PHASES = [
+    {"name": "water", "rest_density": 1000.0, "viscosity": 0.1, "colour": [0.1, 0.3, 0.8]},
+    {"name": "oil", "rest_density": 900.0, "viscosity": 0.1, "colour": [0.9, 0.7, 0.1]},
+]
+ROTOR = {"name": "my rotor", "shape": "box", "lower": [0.5, 0.0, 0.0], "upper": [0.6, 0.3, 0.2], "motion": "path"}
+STONE = {"name": "stone", "shape": "sphere", "centre": [0.8, 0.1, 0.1], "radius": 0.06, "colour": [0.5, 0.2, 0.2]}
+
+
+@cache
+def scene():
+    """Two fluids beside a box that turns and a ball at rest."""
+    boxes = [
+        {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.2, 0.2, 0.2], "phase": "water"},
+        {"shape": "box", "lower": [0.2, 0.0, 0.0], "upper": [0.4, 0.2, 0.2], "phase": "oil"},
+    ]
+    rotor = {**ROTOR, "velocity": [0.1, 0.0, 0.0], "angular_velocity": [0.0, 1.0, 0.0]}
+    return scene_from_dict(
+        {
+            "name": "two",
+            "dimension": 3,
+            "discretisation": {"spacing": SPACING},
+            "phase": PHASES,
+            "fluid": boxes,
+            "solid": [rotor, STONE],
+            "container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [1.0, 0.6, 0.2]},
+            "forces": {"gravity": [0.0, -9.81, 0.0]},
+            "solver": {"kind": "projection", "time_step": 0.001},
+        }
+    )
+
+
+def lattice():
+    axes = [(np.arange(count) + 0.5) * SPACING for count in (8, 4, 4)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+@cache
+def trajectory():
+    """Made by hand: the fluid rises by 0.1 m a second, the box goes along x and turns about y."""
+    first, times = lattice(), np.array([0.0, 0.5, 1.0])
+    positions = first + (0.1 * times[:, None, None] * [0.0, 1.0, 0.0]).astype(np.float32)
+    is_oil = (first[:, 0] > 0.2).astype(np.float32)
+    fractions = np.tile(np.stack([1.0 - is_oil, is_oil], axis=1), (3, 1, 1))
+    turns = np.array([[0.0, angle, 0.0] for angle in (0.0, 2.0, 4.0)])
+    motion = SolidMotion(np.array([[0.55, 0.15, 0.1], [0.6, 0.15, 0.1], [0.65, 0.15, 0.1]]), turns)
+    velocities = np.broadcast_to(np.float32([0.0, 0.1, 0.0]), positions.shape)
+    return Trajectory(
+        times=times,
+        steps=np.array([0, 500, 1000]),
+        positions=positions,
+        velocities=velocities,
+        diagnostics={"converged": np.ones(1000, dtype=bool)},
+        mass_fractions=fractions,
+        quantities={"density": np.full(positions.shape[:2], 950.0, np.float32)},
+        solids={"my rotor": motion},
+        scene=scene(),
+    )
+
+
+def box_corners(angle, position):
+    """Of the box that turns."""
+    half = 0.5 * (np.array(ROTOR["upper"]) - ROTOR["lower"])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    return corners @ turn.T + position
+
+
+def same_points(found, wanted):
+    """Whether two clouds are the same, points that come twice once."""
+    one, other = (np.unique(np.round(np.asarray(a, dtype=float), 5) + 0.0, axis=0) for a in (found, wanted))
+    return one.shape == other.shape and np.allclose(one, other, atol=2e-5)
+
+
+# ---- for USD -----------------------------------------------------------------------------------------------------
+
+
+def test_usd_has_all_of_it_over_time(tmp_path):
+    usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    path = trajectory().export(tmp_path / "usd", to="usd")
+    assert [one.name for one in path.parent.iterdir()] == ["run.usdc"]
+    stage = usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0.0, 2.0, 2.0)
+    assert geometry.GetStageMetersPerUnit(stage) == 1.0 and geometry.GetStageUpAxis(stage) == "Y"
+    assert stage.GetDefaultPrim().GetPath() == "/run"
+    particles = geometry.Points.Get(stage, "/run/particles")
+    assert particles.GetPointsAttr().GetTimeSamples() == [0.0, 1.0, 2.0]
+    for code in range(3):
+        np.testing.assert_array_equal(particles.GetPointsAttr().Get(code), trajectory().positions[code])
+    np.testing.assert_array_equal(particles.GetVelocitiesAttr().Get(1), trajectory().velocities[1])
+    np.testing.assert_allclose(particles.GetWidthsAttr().Get(), [SPACING])
+    fields = geometry.PrimvarsAPI(particles)
+    np.testing.assert_array_equal(fields.GetPrimvar("density").Get(2), np.full(128, 950.0))
+    np.testing.assert_array_equal(fields.GetPrimvar("mass_fraction_1").Get(0), trajectory().mass_fractions[0, :, 1])
+    colours = np.array(particles.GetDisplayColorAttr().Get(1))
+    np.testing.assert_allclose(np.unique(colours, axis=0), [PHASES[0]["colour"], PHASES[1]["colour"]], rtol=1e-6)
+
+
+def test_usd_has_a_surface_that_encloses_the_fluid_and_solids_in_motion(tmp_path):
+    usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    pytest.importorskip("pysplashsurf")
+    stage = usd.Stage.Open(str(trajectory().export(tmp_path, to="usd")))
+    surface = geometry.Mesh.Get(stage, "/run/surface")
+    for code in range(3):
+        corners = np.array(surface.GetFaceVertexIndicesAttr().Get(code)).reshape(-1, 3)
+        mesh = trimesh.Trimesh(np.array(surface.GetPointsAttr().Get(code)), corners, process=False)
+        assert mesh.is_watertight  # and nearly half a spacing within the faces of the fluid, which are 4 spacings wide
+        assert 0.55 < mesh.volume / (0.2**2 * 0.4) < 0.75
+        assert mesh.center_mass[1] == pytest.approx(0.1 + 0.05 * code, abs=0.01)
+        np.testing.assert_allclose(surface.GetVelocitiesAttr().Get(code)[0], [0.0, 0.1, 0.0], atol=1e-6)
+        assert set(surface.GetFaceVertexCountsAttr().Get(code)) == {3}
+    rotor, time = geometry.Xform.Get(stage, "/run/solid_my_rotor"), [0.0, 1.0, 2.0]
+    assert [list(op.GetTimeSamples()) for op in rotor.GetOrderedXformOps()] == [time, time]
+    own = np.array(geometry.Mesh.Get(stage, "/run/solid_my_rotor/mesh").GetPointsAttr().Get())
+    for code, angle in enumerate((0.0, 2.0, 4.0)):
+        matrix = np.array(rotor.ComputeLocalToWorldTransform(code))  # for rows
+        wanted = box_corners(angle, [0.55 + 0.05 * code, 0.15, 0.1])
+        assert same_points(np.c_[own, np.ones(len(own))] @ matrix[:, :3], wanted)
+    between = np.array(rotor.ComputeLocalToWorldTransform(1.5))  # the short way, at 3 rad
+    assert same_points(np.c_[own, np.ones(len(own))] @ between[:, :3], box_corners(3.0, [0.625, 0.15, 0.1]))
+    stone = geometry.Xform.Get(stage, "/run/solid_stone")
+    assert not any(op.GetTimeSamples() for op in stone.GetOrderedXformOps())
+    extent = geometry.Mesh.Get(stage, "/run/solid_stone/mesh").GetExtentAttr().Get()
+    np.testing.assert_allclose(extent, [[-0.06] * 3, [0.06] * 3], atol=1e-3)
+
+
+def test_time_codes_are_frames_or_times():
+    """Evenly spaced frames have whole numbers in spite of round-off; chosen steps keep their distances."""
+    rate, codes = time_codes(0.1 * np.arange(11) + 3.0)
+    assert rate == pytest.approx(10.0) and codes.tolist() == list(range(11))
+    rate, codes = time_codes(np.array([0.0, 0.1, 0.4]))
+    assert rate == pytest.approx(5.0) and codes == pytest.approx([0.0, 0.5, 2.0])
+    assert time_codes(np.array([0.2]))[1].tolist() == [0.0]
+
+
+# ---- for series --------------------------------------------------------------------------------------------------
+
+
+def test_paraview_reads_times_parts_and_fields(tmp_path):
+    vtk, support = pytest.importorskip("vtkmodules.vtkIOXML"), pytest.importorskip("vtkmodules.util.numpy_support")
+    path = trajectory().export(tmp_path, to="vtp")
+    entries = re.findall(r'timestep="([^"]+)" part="(\d)" name="(\w+)" file="([^"]+)"', path.read_text())
+    assert sorted({float(time) for time, *_ in entries}) == [0.0, 0.5, 1.0] and len(entries) == 12
+    assert {name for _, _, name, _ in entries} == {"particles", "surface", "solid_my_rotor", "solid_stone"}
+
+    def read(name, time):
+        (file,) = [file for when, _, part, file in entries if (part, float(when)) == (name, time)]
+        reader = vtk.vtkXMLPolyDataReader()
+        reader.SetFileName(str(tmp_path / file))
+        reader.Update()
+        data = reader.GetOutput()
+        fields = data.GetPointData()
+        found = {
+            fields.GetArrayName(k): support.vtk_to_numpy(fields.GetArray(k)) for k in range(fields.GetNumberOfArrays())
+        }
+        return data, support.vtk_to_numpy(data.GetPoints().GetData()), found
+
+    data, points, fields = read("particles", 0.5)
+    np.testing.assert_array_equal(points, trajectory().positions[1])
+    assert data.GetNumberOfVerts() == 128 and {"velocity", "colour", "density", "mass_fraction_0"} <= fields.keys()
+    np.testing.assert_array_equal(fields["velocity"], trajectory().velocities[1])
+    data, _, fields = read("surface", 1.0)
+    assert data.GetNumberOfPolys() > 100 and fields["colour"].dtype == np.uint8
+    np.testing.assert_allclose(np.linalg.norm(fields["normals"], axis=1), 1.0, rtol=1e-4)
+    assert same_points(read("solid_my_rotor", 1.0)[1], box_corners(4.0, [0.65, 0.15, 0.1]))
+    assert [file for _, _, name, file in entries if name == "solid_stone"] == ["solid_stone.vtp"] * 3
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj"])
+def test_series_have_a_file_for_each_part_that_changes(ending, tmp_path):
+    assert trajectory()[:2].export(tmp_path, to=ending) == tmp_path
+    names = {f"{part}_0000{k}.{ending}" for part in ("particles", "surface", "solid_my_rotor") for k in range(2)}
+    assert {one.name for one in tmp_path.iterdir()} == names | {f"solid_stone.{ending}"}
+    rotor = trimesh.load_mesh(tmp_path / f"solid_my_rotor_00001.{ending}", process=False)
+    assert same_points(rotor.vertices, box_corners(2.0, [0.6, 0.15, 0.1])) and rotor.volume > 0.0
+    surface = trimesh.load_mesh(tmp_path / f"surface_00000.{ending}", process=False)
+    right = surface.vertices[:, 0] > 0.3  # of oil; bytes are those of sRGB
+    assert np.median(surface.visual.vertex_colors[right][:, :3], axis=0) == pytest.approx([243, 218, 89], abs=2)
+    if ending == "ply":
+        points = trimesh.load(tmp_path / "particles_00001.ply").vertices
+        np.testing.assert_allclose(points, trajectory().positions[1], rtol=1e-6)
+
+
+def test_gltf_has_everything_by_name_and_y_up(tmp_path):
+    on_side = scene().replaced("forces.gravity=[0.0, 0.0, -9.81]")  # z is up
+    trajectory()[:2].export(tmp_path, to="glb", scene=on_side)
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["frame_00000.glb", "frame_00001.glb"]
+    found = trimesh.load(tmp_path / "frame_00001.glb")
+    assert set(found.geometry) == {"surface", "particles", "solid_my_rotor", "solid_stone"}
+    placed = {name: found.graph.get(name)[0] for name in found.geometry}
+    points = trimesh.transform_points(found.geometry["particles"].vertices, placed["particles"])
+    np.testing.assert_allclose(points[:, [2, 0, 1]], trajectory().positions[1], atol=1e-6)
+    corners = trimesh.transform_points(found.geometry["solid_my_rotor"].vertices, placed["solid_my_rotor"])
+    assert same_points(corners[:, [2, 0, 1]], box_corners(2.0, [0.6, 0.15, 0.1]))
+
+
+def flat():
+    """Two particles beside a block, in the plane."""
+    found = scene_from_dict(
+        {
+            "name": "flat",
+            "dimension": 2,
+            "discretisation": {"spacing": 0.1},
+            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.1}],
+            "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.2, 0.2], "phase": "water"}],
+            "solid": [{"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.7, 0.2]}],
+            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+            "solver": {"kind": "pcisph", "time_step": 0.001},
+        }
+    )
+    still = np.tile([[0.05, 0.05], [0.15, 0.05]], (3, 1, 1))
+    steps = np.arange(3)
+    return Trajectory(0.1 * steps, steps, still, 0.0 * still, {"converged": np.ones(2, bool)}, scene=found)
+
+
+def test_the_plane_has_points_and_outlines(tmp_path):
+    made = flat()[:1]
+    made.export(tmp_path, to="ply")
+    assert {one.name for one in tmp_path.iterdir()} == {"particles_00000.ply", "solid_block.ply"}
+    block = trimesh.load_mesh(tmp_path / "solid_block.ply", process=False)
+    np.testing.assert_allclose(block.bounds, [[0.5, 0.0, -0.01], [0.7, 0.2, 0.01]], atol=1e-6)
+    away = block.triangles_center - [0.6, 0.1, 0.0]
+    assert ((block.face_normals * away).sum(axis=1) > 0.0).all()
+    assert made.to_xarray().sizes == {"time": 1, "particle": 2, "space": 2}
+
+
+def test_the_command_line_writes_every_other_frame_of_a_run(tmp_path, cortado_command):
+    folder = RunFolder.create(tmp_path / "run", flat().scene.to_json(), ["cortado", "run"])
+    flat().save(folder.trajectory)
+    code, out, err = cortado_command("export", folder.path, "--to", "obj", "--every", 2)
+    assert (code, out) == (0, f"The run is in {folder.path / 'obj'}.\n"), err
+    names = {"particles_00000.obj", "particles_00001.obj", "solid_block.obj"}
+    assert {one.name for one in (folder.path / "obj").iterdir()} == names
+    code, _, err = cortado_command("export", folder.path, "--to", "obj")
+    assert code == 2 and "is not empty; choose another folder" in err
+    code, _, err = cortado_command("export", tmp_path, "--to", "usd")
+    assert code == 2 and "There is no run in" in err
+
+
+# ---- for xarray --------------------------------------------------------------------------------------------------
+
+
+def test_a_dataset_has_names_and_units(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    found = trajectory().to_xarray()
+    assert dict(found.sizes) == {"time": 3, "particle": 128, "space": 3, "phase": 2, "solid": 1, "rotation_axis": 3}
+    units = {name: found[name].attrs["units"] for name in ("time", "position", "velocity", "mass_fraction", "density")}
+    assert units == {"time": "s", "position": "m", "velocity": "m/s", "mass_fraction": "1", "density": "kg/m3"}
+    np.testing.assert_array_equal(found["position"].sel(time=0.5, space="y"), trajectory().positions[1, :, 1])
+    rotor = found.sel(solid="my rotor")
+    np.testing.assert_array_equal(rotor["solid_position"], trajectory().solids["my rotor"].positions)
+    assert rotor["solid_velocity"].isnull().all() and rotor["solid_rotation"].attrs["units"] == "rad"
+    motion = trajectory().solids["my rotor"]
+    raft = replace(motion, velocities=motion.positions + 1.0, angular_velocities=motion.rotations)
+    both = replace(trajectory(), solids={"raft": raft, "my rotor": motion}).to_xarray()["solid_velocity"]
+    np.testing.assert_array_equal(both.sel(solid="raft"), motion.positions + 1.0)
+    assert both.sel(solid="my rotor").isnull().all()
+    found.to_netcdf(tmp_path / "run.nc")
+    with xarray.open_dataset(tmp_path / "run.nc") as again:
+        assert again["position"].dims == ("time", "particle", "space") and again["position"].attrs["units"] == "m"
+
+
+# ---- what goes wrong ---------------------------------------------------------------------------------------------
+
+
+def test_wrong_calls_are_sentences(tmp_path):
+    with pytest.raises(InputError, match=r"to is 'stl', but must be one of ply, obj, glb, usd, vtp\."):
+        trajectory().export(tmp_path, to="stl")
+    (tmp_path / "mine.txt").write_text("kept")
+    with pytest.raises(InputError, match=r"is not empty; choose another folder"):
+        trajectory().export(tmp_path, to="ply")
+    with pytest.raises(InputError, match="scene is missing, but must be given, as a trajectory from a file"):
+        replace(trajectory(), scene=None).export(tmp_path / "new", to="ply")
+    with pytest.raises(
+        InputError, match=r"scene has 2 dimensions and 1 phases, but must be that of the trajectory, with 3 and 2"
+    ):
+        trajectory().export(tmp_path / "new", "ply", cortado.load_scene("docs/figures/dam_break_plane.toml"))
+    with pytest.raises(InputError, match="has no frame"):
+        trajectory()[:0].export(tmp_path / "new", to="ply")
+    with pytest.raises(InputError, match=r"folder is 3, but must be the path"):
+        trajectory().export(3, to="ply")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(("module", "to"), [("vtkmodules", "vtp"), ("pxr", "usd"), ("xarray", None)])
+def test_a_missing_library_is_named(module, to, tmp_path, monkeypatch):
+    by_vtk._vtk.cache_clear()
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"is not installed: pip install 'cortado-sph\[export\]'\.$"):
+        trajectory().to_xarray() if to is None else trajectory().export(tmp_path, to)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_full_disk_is_a_sentence(to, tmp_path, monkeypatch):
+    pytest.importorskip({"usd": "pxr", "vtp": "vtkmodules"}.get(to, "trimesh"))
+    with (
+        largest_file(200),
+        pytest.raises(ComputationError, match=r"cannot be written: .*free some space, or choose another"),
+    ):
+        trajectory()[:1].export(tmp_path / "out", to)
+    assert not list((tmp_path / "out").iterdir())
