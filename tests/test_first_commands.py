@@ -158,7 +158,10 @@ def test_a_folder_that_may_not_be_written(cortado_command):
 
 def test_examples_are_listed_and_copied(cortado_command):
     code, out, err = cortado_command("examples")
-    assert (code, err) == (0, "") and all(path.name in out for path in (ROOT / "examples").iterdir() if path.is_file())
+    shown = [path.name for path in (ROOT / "examples").iterdir() if path.suffix in (".toml", ".py")]
+    assert (code, err) == (0, "") and all(name in out for name in shown)
+    assert cortado_command("examples", "--copy", "fit_heights", "--to", "fit")[0] == 0
+    assert sorted(os.listdir("fit")) == ["fit_heights.toml", "fit_heights_left.csv", "fit_heights_right.csv"]
     code, out, _ = cortado_command("examples", "--copy", "pour", "--copy", "first_gradient.py", "--to", "a/b")
     assert (code, sorted(os.listdir("a/b"))) == (0, ["first_gradient.py", "pour.toml"])
     assert "cortado optimise a/b/pour.toml" in out and "python a/b/first_gradient.py" in out

@@ -10,6 +10,8 @@ import scene_page
 import task_page
 import trimesh
 
+from cortado.optimisation.inverse.fit_tables import FitTables
+from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.optimisation.inverse.task import load_task
 from cortado.scene.scene import Scene, load_scene
@@ -21,9 +23,9 @@ def test_a_page_is_up_to_date(module):
     assert module.PAGE.read_text(encoding="utf-8") == module.page(), asked
 
 
-@pytest.mark.parametrize("module, model", [(scene_page, Scene), (task_page, TaskTables)])
-def test_every_table_has_an_example_and_every_key_is_explained(module, model):
-    tables = model.model_json_schema()["$defs"]
+@pytest.mark.parametrize("module, models", [(scene_page, [Scene]), (task_page, [TaskTables, FitTables])])
+def test_every_table_has_an_example_and_every_key_is_explained(module, models):
+    tables = {name: table for model in models for name, table in model.model_json_schema()["$defs"].items()}
     assert module.examples().keys() == tables.keys()
     text = module.page()
     for name, table in tables.items():
@@ -65,5 +67,6 @@ def load_scene_of_the_page(folder: Path) -> Scene:
 @pytest.mark.parametrize("model, example", task_page.examples().items())
 def test_an_example_of_a_task_is_one(model, example, tmp_path):
     file = tmp_path / "task.toml"
-    file.write_text(scene_page.WHOLE + replaced(task_page.WHOLE, example))
-    assert load_task(file) is not None
+    is_fit = example in [part[3] for part in task_page.FIT_PARTS]
+    file.write_text(scene_page.WHOLE + replaced(task_page.WHOLE_FIT if is_fit else task_page.WHOLE, example))
+    assert (load_fit if is_fit else load_task)(file) is not None

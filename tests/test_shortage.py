@@ -58,7 +58,7 @@ def test_limits_of_a_shell(tmp_path, limit, word):
 
 
 def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
-    from cortado.files.video import _pyav
+    from cortado.files.video import pyav
 
     real = builtins.__import__
 
@@ -69,4 +69,4 @@ def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", importing)
     with pytest.raises(ImportError, match="failed to map"):
-        _pyav()
+        pyav()

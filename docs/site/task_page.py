@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rows import rows, toml
 
+from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.tables import TaskTables
 
 PAGE = Path(__file__).parents[1] / "task_file.md"
@@ -24,7 +25,32 @@ learning_rate = 1.0
 iterations = 10
 """
 
+WHOLE_FIT = """
+[problem]
+steps = 50
+
+[[problem.measured]]
+name = "scales"
+kind = "sensor"
+sensor = "floor"
+file = "force.csv"
+
+[fit]
+start.viscosity = 0.5               # Pa s
+"""
+
 LINKS = {
+    "measured": ("[list of tables](#what-was-measured-problemmeasured)", "What was measured; for `cortado fit`."),
+    "also": (
+        "list of files",
+        "Files of other experiments with the same fluid, beside the task's own: scenes with a table [problem] of "
+        "measured data; for `cortado fit`.",
+    ),
+    "calibrate": (
+        "list",
+        'What of the camera is searched: "translation", "rotation", "field_of_view" or, in the plane, '
+        '"width", and the fluid\'s "extinction".',
+    ),
     "gradient": ("[table](#which-gradient-optimisegradient)", "The gradient that the search follows."),
     "check": ("[table](#what-has-to-be-reached-optimisecheck)", "What the estimate has to reach."),
 }
@@ -32,7 +58,8 @@ LINKS = {
 BEGINNING = f"""# The task file
 
 A task is an inverse problem: which parameters lead to a given end? It is a [scene](scene_file.md) with two more tables:
-`[problem]` says what is to be reached, `[optimise]` how it is searched. [Tasks](tasks.md) explains them, and has
+`[problem]` says what is to be reached, `[optimise]` how it is searched, or `[fit]` what is fitted to measured data.
+[Tasks](tasks.md) explains them, and has
 examples. Below the scene of the page before, these tables make a task that finds gravity:
 
 {toml(WHOLE)}
@@ -74,19 +101,61 @@ PARTS = [
 ]
 """Of every section its heading, the name of its model, its words, and an example."""
 
+FIT_PARTS = [
+    (
+        "### Video",
+        "VideoTable",
+        "Frames of a video, or of a folder of pictures, beside what `[render]` shows.",
+        '[[problem.measured]]\nname = "camera"\nkind = "video"\nfile = "experiment.mp4"\n'
+        "start = -0.4                        # s: the fluid is let go 0.4 s after the video begins\n"
+        "crop = [120, 40, 1400, 1000]        # pixels\n"
+        'mask = "mask.png"\ncalibrate = ["translation", "field_of_view"]',
+    ),
+    (
+        "### Sensor",
+        "SensorSeriesTable",
+        'A CSV file with a column "time" and columns named as the numbers of a [sensor](sensors.md#sensors).',
+        '[[problem.measured]]\nname = "scales"\nkind = "sensor"\nsensor = "floor"\nfile = "force.csv"\n'
+        "noise = 0.2                         # N",
+    ),
+    (
+        "### Tracks",
+        "TracksTable",
+        'A CSV file with columns "time", "tracer" (a number), "x", "y" and in 3-D "z". Each tracer needs a line '
+        "for the start of the run.",
+        '[[problem.measured]]\nname = "tracers"\nkind = "tracks"\nfile = "tracks.csv"',
+    ),
+    (
+        "## What is fitted: `[fit]`",
+        "FitTable",
+        "Which parameters are fitted to what was measured.",
+        "[fit]\nstart.viscosity = 0.5               # Pa s\nbounds.viscosity = [0.01, 10.0]\nprofiles = 0",
+    ),
+]
+"""The same of tasks with measured data."""
+MEASURED = """
+## What was measured: `[[problem.measured]]`
+
+In the place of a target: [fits of experiments](fits.md) explains it. Each table is something that was measured; below a
+scene that has the sensor, these tables make a task for `cortado fit`:
+
+"""
+
 
 def examples() -> dict[str, str]:
     """By the name of the model."""
-    return {model: example for _, model, _, example in PARTS}
+    return {model: example for _, model, _, example in [*PARTS, *FIT_PARTS]}
 
 
 def page() -> str:
     """The whole page."""
-    tables = TaskTables.model_json_schema()["$defs"]
-    text = BEGINNING
-    for heading, model, words, example in PARTS:
-        text += f"\n{heading}\n\n{words}\n\n{rows(tables[model], LINKS)}\n{toml(example)}"
-    return text
+    tables = {**TaskTables.model_json_schema()["$defs"], **FitTables.model_json_schema()["$defs"]}
+    sections = [
+        f"\n{heading}\n\n{words}\n\n{rows(tables[model], LINKS)}\n{toml(example)}"
+        for heading, model, words, example in [*PARTS, *FIT_PARTS]
+    ]
+    fit = f"{MEASURED}{toml(WHOLE_FIT)}\n    cortado fit task.toml --out runs/fit\n"
+    return "".join([BEGINNING, *sections[: len(PARTS)], fit, *sections[len(PARTS) :]])
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from cortado import image_losses as image_losses
     from cortado import jax as jax
     from cortado import losses as losses
+    from cortado import measured as measured
     from cortado import optimisers as optimisers
     from cortado import pictures as pictures
     from cortado import render as render
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
     from cortado.optimisation.evaluate import evaluate as evaluate
+    from cortado.optimisation.fitting.fit import fit as fit
+    from cortado.optimisation.fitting.fitted import Fit as Fit
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.problem import Problem as Problem
@@ -36,12 +39,24 @@ if TYPE_CHECKING:
     from cortado.simulation import Simulation as Simulation
 
 
-_MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "optimisers", "pictures", "render", "sensors")
+_MODULES = (
+    "executors",
+    "forces",
+    "gradients",
+    "image_losses",
+    "losses",
+    "measured",
+    "optimisers",
+    "pictures",
+    "render",
+    "sensors",
+)
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",
     "CortadoWarning": "errors",
     "DivergedError": "errors",
+    "Fit": "optimisation.fitting.fitted",
     "InputError": "errors",
     "Problem": "problem",
     "Scene": "scene.scene",
@@ -50,6 +65,7 @@ _HOMES = {
     "Trajectory": "runs.trajectory",
     "certify": "certificate",
     "evaluate": "optimisation.evaluate",
+    "fit": "optimisation.fitting.fit",
     "load_scene": "scene.scene",
     "optimise": "optimisation.optimise",
     "optimize": "optimisation.optimise",

@@ -178,6 +178,30 @@ def optimise(
 
 
 @command(app)
+def fit(
+    task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
+    out: Path = Path("runs/fit"),
+    overrides: Overrides = (),
+    device: Device = "cpu",
+    precision: Precision = "float32",
+    overwrite: Flag = False,
+) -> Work:
+    """Fit parameters to measured experiments, such as a video or a series of forces, with error bars.
+
+    Args:
+        task: A scene file with the tables [problem], of measured data, and [fit].
+        out: Folder of the run.
+        overrides: Replace a value of the file, such as fit.profiles=0; may be given again.
+        overwrite: Replace an earlier run in the same folder.
+    """
+    words, told = as_text(overrides), command_line()
+    require_toml(task, words)
+    from cortado.cli.commands.fit import fit_task
+
+    return partial(fit_task, task, out, words, device, precision, overwrite, told)
+
+
+@command(app)
 def picture(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
     frame: int = -1,

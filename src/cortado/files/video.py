@@ -96,7 +96,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
         InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
         ComputationError: the disk is full.
     """
-    av, path = _pyav(), Path(path)
+    av, path = pyav(), Path(path)
     if path.suffix.lower() != ".mp4":
         raise InputError(f"The video {path} must end in .mp4.")
     if not 0.0 < frames_per_second < np.inf:
@@ -155,7 +155,8 @@ def _end(video: Video, container: Any, file: Any) -> None:
         os.fsync(file.fileno())
 
 
-def _pyav() -> Any:
+def pyav() -> Any:
+    """The library; raises `InputError` where it is missing."""
     try:
         import av
     except ModuleNotFoundError as problem:

@@ -97,10 +97,23 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
     Raises:
         InputError: there is no such file, no picture in it, or one of too many pixels.
     """
+    shape = None if resolution is None else _columns_and_rows(resolution)
+    picture = open_picture(path, MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS)
+    if shape is None:
+        return _whole(picture)
+    _warn_of_cropping(path, picture.size, shape)
+    return resized(picture, shape)
+
+
+def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
+    """The largest part in the middle of a picture of Pillow's that has these proportions, resampled in linear light."""
+    return _whole(picture) if resolution == picture.size else _resampled(picture, *resolution)
+
+
+def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
+    """The picture of a file as Pillow has it, of ``most`` pixels; raises `InputError` as `read_picture`."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
-    most = MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS
-    shape = None if resolution is None else _columns_and_rows(resolution)
     try:
         regular_file(as_path("path", path), MOST_BYTES)
         with warnings.catch_warnings():
@@ -109,7 +122,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
                 _check_header(path, file, most)
                 file.load()
                 ImageOps.exif_transpose(file, in_place=True)
-                picture = _whole(file) if shape in (None, file.size) else _resampled(file, *shape)
+                return file.copy()
     except InputError:
         raise
     except Image.DecompressionBombError:
@@ -118,9 +131,6 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
         raise InputError(f"The picture {path} cannot be read: it is none of {', '.join(FORMATS)}.") from None
     except Exception as problem:  # of many types, where a file is damaged
         raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
-    if shape is not None:
-        _warn_of_cropping(path, file.size, shape)
-    return picture
 
 
 def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int, int]) -> None:

@@ -19,7 +19,7 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.interpolation import interpolation_functions
-from cortado.render.rays import camera_type, ray_functions
+from cortado.render.rays import camera_tangent_type, camera_type, ray_functions
 
 
 @cache
@@ -66,22 +66,27 @@ def brightness_functions(precision: Precision) -> BrightnessFunctions:
 
 @dataclass(frozen=True)
 class AbsorptionKernels:
-    """The kernels that march along rays, and back."""
+    """The kernels that march along rays, along a tangent, and back."""
 
     forward: Any
+    tangent: Any
     adjoint: Any
     gather: Any
 
 
 @cache
 def absorption_kernels(precision: Precision) -> AbsorptionKernels:
-    """Kernels over pixels: ``forward`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of samples."""
+    """Kernels over pixels: ``forward``, ``tangent`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of
+    samples."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
+    camera_tangent = camera_tangent_type(precision)
     rays, interpolation = ray_functions(precision), interpolation_functions(precision)
     start, direction, distance = rays.start, rays.direction, rays.distance
+    start_tangent, direction_tangent = rays.start_tangent, rays.direction_tangent
     samples_within, pixels_before = rays.samples_within, rays.pixels_before
     value, gradient, trilinear_weight = interpolation.value, interpolation.gradient, interpolation.trilinear_weight
+    derivative = interpolation.derivative
     shining = brightness_functions(precision)
     brightness, brightness_derivative = shining.brightness, shining.brightness_derivative
     place = node_functions(precision).place
@@ -120,6 +125,45 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
             transmitted = transmitted * passed
         image[pixel] = total + transmitted * background
         spans[pixel] = span
+
+    @wp.kernel(module=module, enable_backward=False)
+    def march_tangent(
+        camera: camera_struct,
+        nodes: nodes_struct,
+        thickness: real,
+        background: vector,
+        spans: wp.array(dtype=wp.vec2i),
+        field: wp.array3d(dtype=rgba),
+        camera_dot: camera_tangent,
+        field_dot: wp.array3d(dtype=rgba),
+        # out
+        image_dot: wp.array(dtype=vector),
+    ):
+        pixel = wp.tid()
+        o = start(pixel, camera)
+        d = direction(pixel, camera)
+        o_dot = start_tangent(pixel, camera, camera_dot)
+        d_dot = direction_tangent(pixel, camera, camera_dot)
+        total_dot = vector()
+        transmitted = real(1.0)
+        transmitted_dot = real(0.0)
+        span = spans[pixel]
+        for s in range(span[0], span[1]):
+            x = o + distance(s, camera) * d
+            q = value(x, field, nodes)
+            q_dot = value(x, field_dot, nodes)
+            q_dot += derivative(x, o_dot + distance(s, camera) * d_dot, field, nodes)
+            u = thickness * q[3]
+            u_dot = thickness * q_dot[3] + camera_dot.thickness * q[3]
+            passed = wp.exp(-u)
+            shine = brightness(u, passed)
+            seen_dot = (transmitted_dot * thickness + transmitted * camera_dot.thickness) * shine
+            seen_dot += transmitted * thickness * brightness_derivative(u, passed) * u_dot
+            total_dot += seen_dot * vector(q[0], q[1], q[2])
+            total_dot += (transmitted * thickness * shine) * vector(q_dot[0], q_dot[1], q_dot[2])
+            transmitted_dot = (transmitted_dot - transmitted * u_dot) * passed
+            transmitted = transmitted * passed
+        image_dot[pixel] = total_dot + transmitted_dot * background
 
     @wp.kernel(module=module, enable_backward=False)
     def march_adjoint(
@@ -190,4 +234,4 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
                     total += trilinear_weight(o + distance(s, camera) * d, x_g, nodes) * samples_bar[s - span[0], pixel]
         field_bar[k, j, i] = total
 
-    return AbsorptionKernels(forward=march, adjoint=march_adjoint, gather=gather)
+    return AbsorptionKernels(forward=march, tangent=march_tangent, adjoint=march_adjoint, gather=gather)

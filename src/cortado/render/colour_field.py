@@ -92,15 +92,16 @@ def node_functions(precision: Precision) -> NodeFunctions:
 
 @dataclass(frozen=True)
 class ColourFieldKernels:
-    """The kernel of the field of colours, and its adjoint."""
+    """The kernel of the field of colours, its tangent and its adjoint."""
 
     forward: Any
+    tangent: Any
     adjoint: Any
 
 
 @cache
 def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
-    """Kernels ``forward``, over nodes, and ``adjoint``, over sorted particles."""
+    """Kernels ``forward`` and ``tangent``, over nodes, and ``adjoint``, over sorted particles."""
     precision = discretisation.precision
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
@@ -160,6 +161,40 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
                 total += row_sum(row, c[0], x_g, x, colour, nodes, grid, h, per_h, sigma)
         field[k, j, i] = volume * total
 
+    @wp.kernel(module=module, enable_backward=False)
+    def colour_field_tangent(
+        nodes: nodes_struct,
+        grid: grid_type,
+        h: real,
+        per_h: real,
+        sigma: real,
+        volume: real,
+        x: wp.array(dtype=vector),
+        colour: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        colour_dot: wp.array(dtype=vector),
+        # out
+        field_dot: wp.array3d(dtype=rgba),
+    ):
+        k, j, i = wp.tid()
+        x_g = place(i, j, k, nodes)
+        c = cell_of(x_g, grid)
+        n = grid.shape
+        total = rgba()
+        for o_z in range(below(n[2]), above(n[2])):
+            for o_y in range(below(n[1]), above(n[1])):
+                row = (wrap(c[2] + o_z, n[2]) * n[1] + wrap(c[1] + o_y, n[1])) * n[0]
+                for o_x in range(below(n[0]), above(n[0])):
+                    cell = row + wrap(c[0] + o_x, n[0])
+                    for p in range(grid.starts[cell], grid.starts[cell + 1]):
+                        x_gp = nearest(x_g - x[p], nodes)
+                        if wp.dot(x_gp, x_gp) < h * h:
+                            moved = -wp.dot(gradient(x_gp, per_h, sigma), x_dot[p])
+                            tinted = weight(x_gp, per_h, sigma)
+                            total += moved * rgba(colour[p][0], colour[p][1], colour[p][2], real(1.0))
+                            total += tinted * rgba(colour_dot[p][0], colour_dot[p][1], colour_dot[p][2], real(0.0))
+        field_dot[k, j, i] = volume * total
+
     @wp.func
     def first_node(s: real, n: int) -> int:
         """The first of n nodes that is not below s, in node distances."""
@@ -200,4 +235,4 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         x_scene_bar[order[p]] = volume * x_bar
         colour_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
 
-    return ColourFieldKernels(forward=colour_field, adjoint=colour_field_adjoint)
+    return ColourFieldKernels(forward=colour_field, tangent=colour_field_tangent, adjoint=colour_field_adjoint)

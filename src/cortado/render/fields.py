@@ -1,6 +1,6 @@
-"""The colour field of particles on a device, and the way back from it."""
+"""The colour field of particles on a device, with its tangent and the way back from it."""
 
-from functools import partial
+from functools import cached_property, partial
 from math import prod
 from typing import Any
 
@@ -68,7 +68,7 @@ class ColourField:
         self._particles = particles
         self._tint = phase_colour_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
-        self._device = device
+        self._device, self._precision = device, precision
         grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
         self._sort = CellSort(grid, particles, precision, device)
         sigma = smoothing.normalisation(len(lower), support)
@@ -82,7 +82,8 @@ class ColourField:
             zeros(particles, dtype=precision.vector) for _ in range(4)
         )
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
-        self._colours, self._colours_bar = zeros(1, dtype=palette), zeros(particles, dtype=palette)
+        self._colours, self._colours_dot = zeros(1, dtype=palette), zeros(1, dtype=palette)
+        self._colours_bar = zeros(particles, dtype=palette)
         self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
         self._sum = sum_of(palette, particles, device)
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
@@ -102,6 +103,22 @@ class ColourField:
         launch(
             self._field.forward, shape, self._device, self._kernel, own, nodes=self.nodes, grid=grid, field=self.values
         )
+
+    def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
+        """The tangent (nz, ny, nx) of the last field, along those of positions (n,), fractions (n,) and colours
+        (phases, 3). The next call overwrites it, and what `adjoint` returned."""
+        own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
+        along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
+        self._colours_dot.assign(colours_dot[None])
+        launch(self._tint.tangent, self._particles, self._device, self._known, own, along)
+        out = {"nodes": self.nodes, "grid": self._sort.grid, "field_dot": self._values_dot}
+        launch(self._field.tangent, self.values.shape, self._device, self._kernel, own, out)
+        return self._values_dot
+
+    @cached_property
+    def _values_dot(self) -> wp.array:
+        require(field_parts(prod(self.nodes.shape), self._precision.bytes), "take a larger cell", self._device)
+        return wp.zeros_like(self.values)
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
         """The derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with respect

@@ -19,12 +19,14 @@ class InterpolationFunctions:
 
     value: Any
     gradient: Any
+    derivative: Any
     trilinear_weight: Any
 
 
 @cache
 def interpolation_functions(precision: Precision) -> InterpolationFunctions:
-    """Warp functions ``value`` at a point, ``gradient`` (of bar . value) and ``trilinear_weight`` (of one node)."""
+    """Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
+    direction) and ``trilinear_weight`` (of one node)."""
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
 
@@ -55,6 +57,15 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         return total
 
     @wp.func
+    def slope(f: vector, a: int, b: int, c: int) -> vector:
+        """The gradient of a corner's weight, in node distances."""
+        return vector(
+            real(2 * a - 1) * part(f[1], b) * part(f[2], c),
+            real(2 * b - 1) * part(f[2], c) * part(f[0], a),
+            real(2 * c - 1) * part(f[0], a) * part(f[1], b),
+        )
+
+    @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
         """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
         s = nodes.frequency * (x - nodes.origin)
@@ -66,12 +77,22 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         for a in range(2):
             for b in range(2):
                 for c in range(2):
-                    w = vector(
-                        real(2 * a - 1) * part(f[1], b) * part(f[2], c),
-                        real(2 * b - 1) * part(f[2], c) * part(f[0], a),
-                        real(2 * c - 1) * part(f[0], a) * part(f[1], b),
-                    )
-                    total += wp.dot(bar, node(i + a, j + b, k + c, field, nodes)) * w
+                    total += wp.dot(bar, node(i + a, j + b, k + c, field, nodes)) * slope(f, a, b, c)
+        return nodes.frequency * total
+
+    @wp.func
+    def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+        """Of the value at a point that moves; on the face of a cell as `gradient`."""
+        s = nodes.frequency * (x - nodes.origin)
+        i = int(wp.floor(s[0]))
+        j = int(wp.floor(s[1]))
+        k = int(wp.floor(s[2]))
+        f = s - vector(real(i), real(j), real(k))
+        total = rgba()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    total += wp.dot(slope(f, a, b, c), x_dot) * node(i + a, j + b, k + c, field, nodes)
         return nodes.frequency * total
 
     @wp.func
@@ -83,4 +104,6 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
         return w_x * w_y * w_z
 
-    return InterpolationFunctions(value=value, gradient=gradient, trilinear_weight=trilinear_weight)
+    return InterpolationFunctions(
+        value=value, gradient=gradient, derivative=derivative, trilinear_weight=trilinear_weight
+    )

@@ -1,4 +1,4 @@
-"""A picture of a colour field on a device, and the way back from it."""
+"""A picture of a colour field on a device, with its tangent and the way back from it."""
 
 from functools import cached_property, partial
 from math import prod
@@ -11,9 +11,10 @@ from cortado.device.launching import launch, sum_of
 from cortado.device.memory import field_parts, picture_parts, require, sample_parts
 from cortado.device.precision import Precision
 from cortado.render.absorption import absorption_kernels, pose_type
+from cortado.render.calibration import ViewTangent
 from cortado.render.cameras import Camera
 from cortado.render.colour_field import rgba_type
-from cortado.render.rays import camera_type
+from cortado.render.rays import camera_tangent_type, camera_type
 from cortado.render.views import View
 
 SAMPLES_PER_CELL = 2
@@ -32,12 +33,21 @@ def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
     return struct
 
 
+def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any:
+    """What kernels see of how a view changes whose samples are so far apart [m]."""
+    struct = camera_tangent_type(precision)()
+    struct.position, struct.turn = precision.vector(*along.translation), precision.vector(*along.rotation)
+    struct.half_width, struct.growth = along.half_width
+    struct.thickness = along.extinction * step
+    return struct
+
+
 class RayMarcher:
     """Makes pictures of one view of fields. What `adjoint` returns is overwritten by its next call."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
         """``nodes`` as `ColourField.nodes`."""
-        step = nodes.cell / SAMPLES_PER_CELL
+        self._step = step = nodes.cell / SAMPLES_PER_CELL
         self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
         self._kernels = absorption_kernels(precision)
@@ -61,6 +71,14 @@ class RayMarcher:
     def march(self, field: wp.array) -> None:
         """Make the image of a field (nz, ny, nx)."""
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
+
+    def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
+        """The tangent (pixels,) of the image of the field, along that of the field and that of the view. The next call
+        overwrites it, and so does `adjoint`."""
+        camera_dot = camera_tangent(along, self._step, self._precision)
+        given = {"background": self._background, "field": field, "field_dot": field_dot, "camera_dot": camera_dot}
+        launch(self._kernels.tangent, self.pixels, self._device, self._known, given, image_dot=self._image_bar)
+        return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
         """The derivative with respect to the field and to the pose (6,), from that with respect to the image (pixels,

@@ -17,15 +17,16 @@ def colours_type(precision: Precision, phases: int) -> Any:
 
 @dataclass(frozen=True)
 class PhaseColourKernels:
-    """The kernel of particles' colours, and its adjoint."""
+    """The kernel of particles' colours, its tangent and its adjoint."""
 
     forward: Any
+    tangent: Any
     adjoint: Any
 
 
 @cache
 def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernels:
-    """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
+    """Kernels ``forward`` and ``tangent`` (which sort positions besides), and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
     module = wp.get_module(f"cortado_phase_colour_{phases}_{precision.name}")
@@ -47,6 +48,23 @@ def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernel
         colour[i] = wp.transpose(colours[0]) * c_scene[j]
 
     @wp.kernel(module=module, enable_backward=False)
+    def phase_colour_tangent(
+        colours: wp.array(dtype=colours_matrix),
+        order: wp.array(dtype=wp.int32),
+        c_scene: wp.array(dtype=fractions),
+        x_scene_dot: wp.array(dtype=vector),
+        c_scene_dot: wp.array(dtype=fractions),
+        colours_dot: wp.array(dtype=colours_matrix),
+        # out
+        x_dot: wp.array(dtype=vector),
+        colour_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        j = order[i]
+        x_dot[i] = x_scene_dot[j]
+        colour_dot[i] = wp.transpose(colours[0]) * c_scene_dot[j] + wp.transpose(colours_dot[0]) * c_scene[j]
+
+    @wp.kernel(module=module, enable_backward=False)
     def phase_colour_adjoint(
         colours: wp.array(dtype=colours_matrix),
         c_scene: wp.array(dtype=fractions),
@@ -61,4 +79,4 @@ def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernel
         c_scene_bar[j] = colours[0] * bar
         colours_bar[j] = wp.outer(c_scene[j], bar)
 
-    return PhaseColourKernels(forward=phase_colour, adjoint=phase_colour_adjoint)
+    return PhaseColourKernels(forward=phase_colour, tangent=phase_colour_tangent, adjoint=phase_colour_adjoint)

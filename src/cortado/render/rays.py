@@ -42,6 +42,22 @@ def camera_type(precision: Precision) -> Any:
     return wp.struct(Camera)
 
 
+@cache
+def camera_tangent_type(precision: Precision) -> Any:
+    """The Warp struct of how a view changes; see `cortado.render.calibration.ViewTangent`."""
+    real, vector = precision.real, precision.vector
+
+    class CameraTangent:
+        position: vector
+        turn: vector
+        half_width: real
+        growth: real
+        thickness: real
+
+    CameraTangent.__name__ = CameraTangent.__qualname__ = f"CameraTangent_{precision.name}"
+    return wp.struct(CameraTangent)
+
+
 @dataclass(frozen=True)
 class RayFunctions:
     """Warp functions of a camera's rays."""
@@ -49,6 +65,8 @@ class RayFunctions:
     start: Any
     direction: Any
     distance: Any
+    start_tangent: Any
+    direction_tangent: Any
     samples_within: Any
     pixels_before: Any
 
@@ -56,9 +74,10 @@ class RayFunctions:
 @cache
 def ray_functions(precision: Precision) -> RayFunctions:
     """Warp functions ``start`` and ``direction`` of a pixel's ray, ``distance`` of a sample along it,
+    ``start_tangent`` and ``direction_tangent`` as the view changes,
     ``samples_within`` a box, and ``pixels_before`` a box: the range of pixels whose rays may hit it."""
     real, vector = precision.real, precision.vector
-    camera_struct = camera_type(precision)
+    camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
 
     @wp.func
@@ -75,6 +94,19 @@ def ray_functions(precision: Precision) -> RayFunctions:
     @wp.func
     def direction(pixel: int, c: camera_struct) -> vector:
         return c.orientation * wp.normalize(c.growth * on_screen(pixel, c) - vector(real(0.0), real(0.0), real(1.0)))
+
+    @wp.func
+    def start_tangent(pixel: int, c: camera_struct, c_dot: tangent_struct) -> vector:
+        turned = wp.cross(c_dot.turn, c.orientation * (c.half_width * on_screen(pixel, c)))
+        return c_dot.position + turned + c.orientation * (c_dot.half_width * on_screen(pixel, c))
+
+    @wp.func
+    def direction_tangent(pixel: int, c: camera_struct, c_dot: tangent_struct) -> vector:
+        uv = on_screen(pixel, c)
+        ahead = c.growth * uv - vector(real(0.0), real(0.0), real(1.0))
+        d = wp.normalize(ahead)
+        d_dot = (c_dot.growth / wp.length(ahead)) * (uv - wp.dot(d, uv) * d)
+        return wp.cross(c_dot.turn, c.orientation * d) + c.orientation * d_dot
 
     @wp.func
     def distance(sample: int, c: camera_struct) -> real:
@@ -146,6 +178,8 @@ def ray_functions(precision: Precision) -> RayFunctions:
         start=start,
         direction=direction,
         distance=distance,
+        start_tangent=start_tangent,
+        direction_tangent=direction_tangent,
         samples_within=samples_within,
         pixels_before=pixels_before,
     )

@@ -15,6 +15,7 @@ from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.particles.arrays import padded
+from cortado.render.calibration import ViewTangent
 from cortado.render.cameras import positive, vector
 from cortado.render.fields import ColourField
 from cortado.render.marching import RayMarcher
@@ -136,6 +137,10 @@ class Renderer:
         """Another one, of the same pictures in that precision."""
         return Renderer(self.view, **self._settings, precision=precision)
 
+    def seen_by(self, view: View) -> "Renderer":
+        """Another one, of the same particles as another view shows them."""
+        return Renderer(view, **self._settings, precision=self._precision)
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Of a picture: rows, columns, 3."""
@@ -179,11 +184,34 @@ class Renderer:
         return self._rays.image.numpy().astype(np.float64).reshape(self.shape)
 
     @WARP
+    def tangent(
+        self, positions: Any = None, fractions: Any = None, colours: Any = None, view: ViewTangent | None = None
+    ) -> np.ndarray:
+        """The derivative (rows, columns, 3) of the last picture along a direction; what is left out of it is 0.
+
+        Args:
+            positions: (n, d) [m], the direction of the positions.
+            fractions: (n, phases) [-], that of the mass fractions.
+            colours: (phases, 3) [-], that of the colours of the phases.
+            view: that of the view.
+        """
+        self._require_picture("tangent")
+        directions = {"positions": positions, "fractions": fractions, "colours": colours}
+        x_dot, c_dot, colours_dot = (
+            np.zeros(shape) if directions[name] is None else _of_shape(name, directions[name], shape)
+            for name, shape in self.inputs.items()
+        )
+        x = self._on_device("positions", x_dot, self._dimension, self._precision.vector)
+        c = self._on_device("fractions", c_dot, self._phases, self._precision.fractions(self._phases))
+        field_dot = self._field.tangent(x, c, colours_dot)
+        image_dot = self._rays.tangent(self._field.values, field_dot, ViewTangent() if view is None else view)
+        return image_dot.numpy().astype(np.float64).reshape(self.shape)
+
+    @WARP
     def adjoint(self, image_bar: np.ndarray) -> RenderAdjoint:
         """The derivative of a function of the last picture, from its derivative with respect to that picture (rows,
         columns, 3)."""
-        if not self._rendered:
-            raise InputError("There is no picture to go back from; call render before adjoint.")
+        self._require_picture("adjoint")
         image_bar = _of_shape("image_bar", image_bar, self.shape)
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
         return RenderAdjoint(*self._field.adjoint(field_bar), pose[:3], pose[3:])
@@ -199,6 +227,10 @@ class Renderer:
         nodes = self._field.nodes
         indices = np.moveaxis(np.indices(tuple(nodes.shape)), 0, -1)
         return np.array(nodes.origin, dtype=np.float64) + nodes.cell * indices
+
+    def _require_picture(self, method: str) -> None:
+        if not self._rendered:
+            raise InputError(f"There is no picture to differentiate; call render before {method}.")
 
     def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
         """What `render` was given, a frame taken apart, and what was left out filled in."""

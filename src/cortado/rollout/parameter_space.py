@@ -35,6 +35,7 @@ class ParameterSpace:
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
+        self._parameters_dot: tuple[Rollout, Parameters] | None = None
         self._known = simulation.known
         self._one = SceneParameters(simulation, steps)
         self._first_positions = FirstPositions(simulation)
@@ -178,8 +179,11 @@ class ParameterSpace:
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state, 0 of one that was given, and of the parameters, at
-        ``values``."""
-        dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
+        ``values``. The next call for this rollout overwrites those of the parameters: what was captured with them is
+        launched again."""
+        if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
+            self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
+        dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
         self.set_direction(rollout, values, along, dot, parameters)
         return dot, parameters
 

@@ -26,10 +26,13 @@ _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "re
 REPLAY_LOG = "replay.log"
 """In which a search notes its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
-_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
+_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", "residuals", "profiles", *NAMES)
 _SHADED = ("first", "last", "picture", "found", "search")
 _FILMS = ("run", "estimate", "film", "found", "search")
-FIGURES = (*(f"{name}.png" for name in (*_PICTURES, *_SHADED)), *(f"{name}.mp4" for name in _FILMS))
+FIGURES = (
+    *(f"{name}.png" for name in (*_PICTURES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
+    *(f"{name}.mp4" for name in _FILMS),
+)
 """Every file that a run may have in its figures; whatever else is there is the user's."""
 TO_RESUME = "; choose another --out, or begin one without --resume"
 """How a sentence ends that finds no run to go on with."""

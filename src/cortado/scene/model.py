@@ -24,7 +24,7 @@ from cortado.scene.solid_shapes import AnySolid
 from cortado.scene.solvers import AnySolver, smoothing_of
 from cortado.scene.tables import Table
 
-OTHER_TABLES = ("problem", "optimise", "dataset")
+OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
 """Tables that a scene file may hold for other modules."""
 
 

@@ -94,7 +94,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
     """Read a scene from a TOML file.
 
     Args:
-        path: the file. Its tables [problem] and [optimise] belong to others and are ignored.
+        path: the file. Its tables [problem], [optimise] and [fit] belong to others and are ignored.
         overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
 
     Raises:

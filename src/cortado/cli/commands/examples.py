@@ -32,7 +32,9 @@ def _chosen(names: list[str], known: list[str]) -> list[str]:
 
 
 def _copied(sources: list[Path], folder: Path) -> str:
-    """Nothing is copied unless all of it can be: a file that is there is kept."""
+    """Nothing is copied unless all of it can be: a file that is there is kept. What an example reads goes with it."""
+    examples = [folder / source.name for source in sources]
+    sources = [*sources, *(data for source in sources for data in sorted(source.parent.glob(f"{source.stem}_*.csv")))]
     targets = [folder / source.name for source in sources]
     for target in targets:
         if is_taken(target):
@@ -41,7 +43,7 @@ def _copied(sources: list[Path], folder: Path) -> str:
         folder.mkdir(parents=True, exist_ok=True)
     for source, target in zip(sources, targets, strict=True):
         write_atomically(target, source.read_bytes())
-    return "" if is_quiet() else "\n".join(f"{target}: {_command(target)}" for target in targets)
+    return "" if is_quiet() else "\n".join(f"{example}: {_command(example)}" for example in examples)
 
 
 def _command(path: Path) -> str:
@@ -49,7 +51,7 @@ def _command(path: Path) -> str:
     if path.suffix == ".py":
         return f"python {path}"
     tables = tomllib.loads(path.read_text("utf-8"))
-    command = next((name for name in ("optimise", "dataset") if name in tables), "run")
+    command = next((name for name in ("optimise", "fit", "dataset") if name in tables), "run")
     return f"cortado {command} {path}"
 
 

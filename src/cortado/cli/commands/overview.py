@@ -16,6 +16,7 @@ _GROUPS = {
         ("cortado run dam.toml --out runs/fine --set discretisation.spacing=0.02", "replace a value"),
         ("cortado compare runs/dam runs/fine", "two runs: the same scene? how far apart?"),
         ("cortado optimise task.toml --out runs/found", "find what a task file asks for; --resume goes on"),
+        ("cortado fit task.toml --out runs/fit", "a viscosity with an error bar, from a video or a force"),
         ("cortado sweep dam.toml --set phase.0.viscosity=0.05,0.1", "every combination of some values"),
         ("cortado dataset dam.toml --runs 100 --out data", "varied runs to train on, as LagrangeBench's"),
         ("cortado gradients check dam.toml --steps 20", "are gradients right, and for how long?"),

@@ -5,21 +5,23 @@ import json
 from typing import Any
 
 from cortado.optimisation.datasets.table import DatasetTables
+from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.scene.scene import Scene
 
 
 def file_schema() -> dict[str, Any]:
     """Of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what must fit together."""
-    scene, task, data_set = (model.model_json_schema() for model in (Scene, TaskTables, DatasetTables))
-    tables = {**scene["$defs"], **task["$defs"], **data_set["$defs"]}
+    models = (Scene, TaskTables, FitTables, DatasetTables)
+    scene, task, fit, data_set = (model.model_json_schema() for model in models)
+    tables = {**scene["$defs"], **task["$defs"], **fit["$defs"], **data_set["$defs"]}
     for table in tables.values():
         _require_shape(table)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **{key: value for key, value in scene.items() if key != "$defs"},
         "title": "A scene of Cortado, a task, or a data set",
-        "properties": {**scene["properties"], **task["properties"], **data_set["properties"]},
+        "properties": {**scene["properties"], **task["properties"], **fit["properties"], **data_set["properties"]},
         "$defs": tables,
     }
 

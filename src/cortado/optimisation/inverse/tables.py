@@ -30,6 +30,7 @@ from cortado.gradients import (
     ImplicitPressure,
 )
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
+from cortado.optimisation.inverse.measured_tables import AnyMeasured
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
 from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
@@ -164,9 +165,31 @@ class ProblemTable(Table):
     """The true parameters by name: the target is what a run with them makes. Either this or a picture is needed."""
     picture: Text | None = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
+    measured: tuple[AnyMeasured, ...] = ()
+    """What was measured of an experiment, in the place of a target or a picture; for `cortado fit`."""
+    also: tuple[Text, ...] = ()
+    """Files of other experiments with the same fluid, beside the task's own: scenes with a table [problem] of measured
+    data; for `cortado fit`."""
+
+    @model_validator(mode="after")
+    def _check_measured(self) -> Self:
+        if not self.measured:
+            if self.also:
+                raise field_error(("also",), list(self.also), "left out, as nothing is measured")
+            return self
+        others = {"loss", "distance", "frames", "target", "picture"} & self.model_fields_set
+        for name in sorted(others):
+            raise field_error((name,), Words("given"), "left out, as there is measured data")
+        names = [one.name for one in self.measured]
+        for k, name in enumerate(names):
+            if name in names[:k] or "." in name:
+                raise field_error(("measured", k, "name"), name, "a name of its own, without a dot")
+        return self
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
+        if self.measured:
+            return self
         if self.picture is None and self.target is None:
             raise field_error(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
         if self.picture is not None and self.target is not None:

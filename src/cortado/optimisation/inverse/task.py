@@ -47,6 +47,8 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     scene = scene_from_dict(data, file)
     if not any(key in data for key in TaskTables.model_fields):
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
+    if "fit" in data and "optimise" not in data:
+        raise SceneError(file, "fit", Words("given"), "solved by cortado fit, as its target was measured")
     if scene.solver.chooses:
         wanted = "a number of seconds in a task, whose runs are compared step by step"
         raise SceneError(file, "solver.time_step", "auto", wanted)
@@ -57,6 +59,10 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
             given = {key: data[key] for key in TaskTables.model_fields if key in data}
             tables = TaskTables.model_validate(given, context={"names": names})
         problem, optimise = tables.problem, tables.optimise
+        if problem.measured:
+            raise SceneError(
+                None, "problem.measured", Words("given"), "left out: measured data is fitted by cortado fit"
+            )
         true, steps = problem.target or {}, problem.steps
         for name in optimise.start:
             if problem.picture is None and name not in true:

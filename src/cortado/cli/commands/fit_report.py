@@ -1,0 +1,123 @@
+"""What ``cortado fit`` writes: the report for people, and the results for programs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
+from cortado.optimisation.fitting.fitted import Fit, Profile, unit_of
+from cortado.optimisation.inverse.fit_task import FitTask
+from cortado.runs.report import Section
+from cortado.scene.in_words import scene_in_words
+from cortado.words import counted
+
+
+def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
+    """The report, in the order in which one would tell it."""
+    head = ("", "unit", "start", "found", "standard error", "95 %, from", "to", "degrees of freedom", "counted error")
+    noise = ("", "unit", "frames", "numbers", "residuals", "noise", "correlation time [s]", "independent frames")
+    return [
+        Section("What was asked", _asked(task, fitted)),
+        Section("What was found", fitted.lines(), [*_apart(fitted), *fitted.doubts]),
+        Section("In numbers", [COUNTED], head=head, rows=_rows(fitted)),
+        Section("Measured and found", figures=video_figures(fitted, folder)),
+        Section(
+            "Residuals", figures=residual_figure(fitted, folder / "residuals.png"), head=noise, rows=_parts(fitted)
+        ),
+        Section("Profiles", figures=profile_figure(profiles, folder / "profiles.png")),
+        Section("Correlations", head=("", *fitted.labels), rows=_correlations(fitted)),
+        Section("The fit", [_effort(fitted)]),
+    ]
+
+
+COUNTED = (
+    "The last column is what the error would be if every number that was measured were independent of all others: it "
+    "shows how much correlation matters."
+)
+
+
+def _asked(task: FitTask, fitted: Fit) -> list[str]:
+    particles = [one.simulation.particles for one in fitted.problem.experiments] if fitted.problem else []
+    found = []
+    for one, count in zip(task.experiments, particles, strict=True):
+        what = ", ".join(f"{table.name} ({table.file})" for table in one.problem.measured)
+        found.append(f"What was measured: {what}. The scene: {scene_in_words(one.scene, count)}")
+    names = [name.replace("_", " ") for name in fitted.coordinates.names]
+    return [f"Which {', '.join(names)} makes the simulation do what was measured?", *found]
+
+
+def _apart(fitted: Fit) -> list[str]:
+    return [
+        f"{a} and {b} are hardly told apart: a change of both together changes little of what was measured (their "
+        f"estimates have a correlation of {c:.3f})."
+        for a, b, c in fitted.not_told_apart
+    ]
+
+
+def _rows(fitted: Fit) -> list[tuple[object, ...]]:
+    coordinates, free = fitted.coordinates, fitted.coordinates.free
+    ends = fitted.intervals()
+    lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
+    slopes = coordinates.slopes(fitted.u)
+    columns = (
+        coordinates.at_start[free],
+        coordinates.numbers(fitted.u),
+        np.sqrt(np.diag(fitted.covariance)),
+        lower,
+        upper,
+        np.round(fitted.degrees_of_freedom, 1),
+        np.sqrt(np.diag(fitted.naive_covariance)) * slopes,
+    )
+    return [
+        (label.replace("_", " "), unit_of(label), *(float(column[k]) for column in columns))
+        for k, label in enumerate(fitted.labels)
+    ]
+
+
+def _parts(fitted: Fit) -> list[tuple[object, ...]]:
+    return [
+        (
+            one.label,
+            one.part.observation.unit,
+            *one.residuals.shape,
+            one.spread,
+            "" if one.part.observation.noise is None else one.part.observation.noise,
+            one.correlation_time,
+            round(one.frames, 1),
+        )
+        for one in fitted.parts
+    ]
+
+
+def _correlations(fitted: Fit) -> list[tuple[object, ...]]:
+    if len(fitted.labels) < 2:
+        return []
+    return [(a, *(round(float(c), 3) for c in row)) for a, row in zip(fitted.labels, fitted.correlation, strict=True)]
+
+
+def _effort(fitted: Fit) -> str:
+    ended = "converged" if fitted.converged else "ended after its last trial point"
+    runs, tangents = counted(fitted.runs, "forward run"), counted(fitted.tangents, "run")
+    return f"The fit {ended} after {runs} and {tangents} along a tangent."
+
+
+def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
+    """What came out, by names."""
+    lower, upper = ({n: np.asarray(pair[k]) for n, pair in fitted.intervals().items()} for k in range(2))
+    return {
+        "parameters": {name: np.asarray(value) for name, value in fitted.values.items()},
+        "standard_errors": {name: np.asarray(value) for name, value in fitted.standard_errors.items()},
+        "lower_95": lower,
+        "upper_95": upper,
+        "labels": fitted.labels,
+        "covariance": fitted.covariance,
+        "not_told_apart": [list(one) for one in fitted.not_told_apart],
+        "doubts": list(fitted.doubts),
+        "converged": fitted.converged,
+        "runs": fitted.runs,
+        "tangents": fitted.tangents,
+        "residuals": {one.label: one.spread for one in fitted.parts},
+        "profiles": {one.label: {"values": one.values, "deviance": one.deviance} for one in profiles},
+    }

@@ -1,0 +1,1 @@
+"""Fits of measured experiments: parameters with error bars, from videos, sensors and tracks."""

@@ -1,0 +1,75 @@
+"""What residuals say against the model: sentences about where it is wrong, by more than the noise."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.noise import ScoreCovariance
+
+TOO_LARGE = 1.3
+"""Residuals over the noise that was given."""
+TOO_SLOW = 0.35
+"""Correlation time of residuals, over the length of the record."""
+TOO_FAR = 3.0
+"""Distance between what two halves of a record say, over its error."""
+
+
+def doubts(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    scores: Sequence[ScoreCovariance],
+    labels: Sequence[str],
+) -> tuple[str, ...]:
+    """None where the residuals look like noise."""
+    found = []
+    for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
+        times, noise = part.observation.times, part.observation.noise
+        size = float(np.sqrt((r**2).sum() / max(np.count_nonzero(r), 1)))
+        if noise is not None and size > TOO_LARGE * noise:
+            found.append(
+                f"The residuals of {part.label} are {size / noise:.2g} times the noise that was given "
+                f"({size:.2g} against {noise:.2g} {part.observation.unit}): the model is wrong by that much."
+            )
+        length = times[-1] - times[0]
+        if weight.correlation_time > TOO_SLOW * length:
+            found.append(
+                f"The residuals of {part.label} hardly change from frame to frame: they are correlated over "
+                f"{weight.correlation_time:.2g} s of a record of {length:.2g} s, which noise seldom is. The model is "
+                f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
+            )
+    return (*found, *_halves(problem, at, weights, scores, labels))
+
+
+def _halves(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    scores: Sequence[ScoreCovariance],
+    labels: Sequence[str],
+) -> list[str]:
+    """Where the first and the second half of the frames say different things: one step of Gauss and Newton for each."""
+    size = len(at.u)
+    steps, variances = [], []
+    for half in (0, 1):
+        N, s, B = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
+        for part, r, J, weight, score in zip(problem.parts, at.residuals, at.jacobians, weights, scores, strict=True):
+            times = part.observation.times
+            chosen = np.array_split(np.arange(len(times)), 2)[half]
+            slopes, white = weight.of(J, times)[chosen], weight.of(r, times)[chosen]
+            N += np.einsum("fmp,fmq->pq", slopes, slopes, optimize=True)
+            s += np.einsum("fmp,fm->p", slopes, white, optimize=True)
+            B += score.products.S[chosen, chosen].sum(axis=0) / (1.0 - score.lost)
+        if np.linalg.cond(N) > 1e10:
+            return []
+        inverse = np.linalg.inv(N)
+        steps.append(-inverse @ s)
+        variances.append(np.diag(inverse @ B @ inverse))
+    away = np.abs(steps[0] - steps[1]) / np.sqrt(variances[0] + variances[1] + 1e-300)
+    return [
+        f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the "
+        "error of the difference. The model is wrong, in a way that changes over time."
+        for label, off in zip(labels, away, strict=True)
+        if off > TOO_FAR
+    ]

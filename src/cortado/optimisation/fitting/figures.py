@@ -1,0 +1,78 @@
+"""Pictures of a fit: residuals frame by frame, what was measured beside what was found, and profiles."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cortado.optimisation.fitting.fitted import Fit, FittedPart, Profile, unit_of
+from cortado.optimisation.fitting.video import Video
+from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE, drawing
+from cortado.pictures.figures import images
+from cortado.runs.report import Figures
+
+GREATEST_SERIES = 4
+"""Numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
+
+
+def residual_figure(fitted: Fit, path: Path) -> Figures:
+    """Residuals over time, one panel for each observation."""
+    with drawing(path, height=1.4 + 2.3 * len(fitted.parts)) as figure:
+        rows = figure.subplots(len(fitted.parts), 1, squeeze=False)[:, 0]
+        for axes, part in zip(rows, fitted.parts, strict=True):
+            _residuals(axes, part)
+        rows[-1].set_xlabel("time [s]")
+    words = "Residuals, predicted less measured: noise scatters around 0; what stays on one side is the model's error."
+    return [(words, path)]
+
+
+def _residuals(axes: object, part: FittedPart) -> None:
+    times, r = part.part.observation.times, part.residuals
+    plot = axes.plot  # type: ignore[attr-defined]
+    if r.shape[1] <= GREATEST_SERIES:
+        for k, series in enumerate(r.T):
+            plot(times, series, marker="o", markersize=3, color=PALETTE[k % len(PALETTE)])
+    else:
+        plot(times, np.sqrt((r**2).mean(axis=1)), marker="o", color=PALETTE[0], label="root mean square")
+        plot(times, r.mean(axis=1), marker="o", color=PALETTE[1], label="mean")
+        axes.legend(loc="upper left")  # type: ignore[attr-defined]
+    axes.axhline(0.0, color=FAINT, linewidth=1.0)  # type: ignore[attr-defined]
+    axes.set(title=part.label, ylabel=f"residual [{part.part.observation.unit}]")  # type: ignore[attr-defined]
+
+
+def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
+    """The profile of each number, beside the parabola that its interval stands for."""
+    if not profiles:
+        return []
+    columns = min(len(profiles), 3)
+    rows = -(-len(profiles) // columns)
+    with drawing(path, width=3.6 * columns + 1.0, height=0.6 + 3.0 * rows) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes, one in zip(panels, profiles, strict=False):
+            axes.plot(one.values, one.expected, **DASHED, color=INK, label="of a linear model")
+            axes.plot(one.values, one.deviance, marker="o", color=PALETTE[0], label="found")
+            axes.axhline(4.0, color=FAINT, linewidth=1.0)
+            unit = unit_of(one.label)
+            axes.set(xlabel=f"{one.label.replace('_', ' ')}{f' [{unit}]' if unit else ''}", ylim=(-0.3, 8.0))
+        for axes in panels[len(profiles) :]:
+            axes.set_visible(False)
+        panels[0].set_ylabel("squared standard errors")
+        panels[0].legend(loc="upper center")
+    words = "By how much the sum of squares grows beside its least; below the faint line lie two standard errors."
+    return [(words, path)]
+
+
+def video_figures(fitted: Fit, folder: Path) -> Figures:
+    """Of each video its last frame: measured, found, and how far apart they are."""
+    found: Figures = []
+    for number, part in enumerate(fitted.parts):
+        video = part.part.observation
+        if isinstance(video, Video):
+            rows, columns, _ = video.renderer.shape
+            pictures = np.ones((3, rows, columns, 3))
+            last, off = video.measured[-1].reshape(-1, 3), part.residuals[-1].reshape(-1, 3)
+            for picture, values in zip(pictures, (last, last + off, np.abs(off)), strict=True):
+                picture[video.mask] = np.clip(np.nan_to_num(values), 0.0, 1.0)
+            path = images(list(pictures), ("measured", "found", "apart"), folder / f"measured_{number}.png")
+            found.append((f"The last frame of {part.label}: measured, found, and how far apart they are.", path))
+    return found

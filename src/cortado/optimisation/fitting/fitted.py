@@ -1,0 +1,208 @@
+"""What a fit found: values, error bars, and what the residuals say."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from cortado.arrays import as_one_number
+from cortado.errors import InputError, shown
+from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.optimisation.fitting.least_squares import LeastSquares, Part, Weighting
+from cortado.scene.parameters.values import UNITS
+
+ALIKE = 0.9
+"""Two numbers whose estimates are correlated by more are not told apart."""
+OF_VIEWS = {
+    "translation": "m",
+    "rotation": "rad",
+    "field_of_view": "degrees",
+    "width": "m",
+    "extinction": "1/m",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPart:
+    """An observation, beside what the fitted model says of it."""
+
+    part: Part
+    weighting: Weighting
+    residuals: np.ndarray
+    """(frames, m) predicted less measured, in the unit of the observation; 0 for what does not count."""
+    spread: float
+    """Root mean square of the residuals."""
+    inflation: float
+    """By how much correlation within frames makes variances larger than a count of numbers has it."""
+    samples: float
+    """Independent numbers in a frame."""
+    frames: float
+    """Independent frames."""
+
+    @property
+    def label(self) -> str:
+        """Its name, with the experiment's number where there are several."""
+        return self.part.label
+
+    @property
+    def correlation_time(self) -> float:
+        """Of the residuals [s]."""
+        return self.weighting.correlation_time
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The best sum of squares with one number held, over its values."""
+
+    label: str
+    values: np.ndarray
+    """(points,) of the number, in its unit."""
+    deviance: np.ndarray
+    """(points,) by how much the sum of squares is larger than the least one, in squared standard errors."""
+    expected: np.ndarray
+    """(points,) the same of a model that is linear, from which the intervals come."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters that were fitted to experiments, with their error bars."""
+
+    coordinates: Coordinates = field(repr=False)
+    u: np.ndarray = field(repr=False)
+    """(free,) coordinates: numbers, or their logarithms."""
+    coordinate_covariance: np.ndarray = field(repr=False)
+    """(free, free) of the coordinates."""
+    naive_covariance: np.ndarray = field(repr=False)
+    """(free, free) what a count of numbers would make of it: far too small, kept for comparison."""
+    degrees_of_freedom: np.ndarray = field(repr=False)
+    """(free,) of Student's distribution."""
+    parts: tuple[FittedPart, ...] = field(repr=False)
+    """One for each observation."""
+    doubts: tuple[str, ...] = field(repr=False)
+    """Sentences about where the residuals do not look like noise, so that the model is wrong by more than the bars."""
+    converged: bool = True
+    """Whether it ended where the sum of squares is least, and not after the last iteration."""
+    runs: int = 0
+    """Forward runs, each of one experiment."""
+    tangents: int = 0
+    """Runs along a tangent, each of one experiment."""
+    sum_of_squares: float = field(default=0.0, repr=False)
+    hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    problem: LeastSquares | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "problem": None}
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Parameters by name: arrays, or numbers."""
+        return {n: float(v) if not v.shape else v for n, v in self.coordinates.values(self.u).items()}
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the numbers that were searched, in the order of the covariance."""
+        return self.coordinates.labels
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(free, free) in the units of the parameters, of small errors."""
+        slopes = self.coordinates.slopes(self.u)
+        return self.coordinate_covariance * np.outer(slopes, slopes)
+
+    @property
+    def standard_errors(self) -> dict[str, Any]:
+        """By name, in the shape and the unit of the parameter; 0 for a number that was not searched."""
+        spread = self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0)
+        return {n: float(v) if not v.shape else v for n, v in spread.items()}
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """(free, free)"""
+        size = np.sqrt(np.diag(self.coordinate_covariance))
+        return self.coordinate_covariance / np.maximum(np.outer(size, size), 1e-300)
+
+    @property
+    def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
+        found, labels = self.correlation, self.labels
+        return tuple(
+            (labels[i], labels[j], float(found[i, j]))
+            for i in range(len(labels))
+            for j in range(i + 1, len(labels))
+            if abs(found[i, j]) > ALIKE
+        )
+
+    def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
+        """By name, the lower and the upper end of an interval that contains the true value with this probability, if
+        the model is right; positive numbers have an interval of their logarithm. Raises `InputError`."""
+        if not 0.0 < as_one_number("confidence", confidence) < 1.0:
+            raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
+        from scipy.stats import t as student
+
+        reach = student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom)
+        reach = reach * np.sqrt(np.diag(self.coordinate_covariance))
+        ends = [self.coordinates.values(self.u + way * reach) for way in (-1.0, 1.0)]
+        return {
+            n: (float(a), float(b)) if not a.shape else (a, b)
+            for (n, a), b in zip(ends[0].items(), ends[1].values(), strict=True)
+        }
+
+    def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
+        """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
+        parabola of a linear model, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
+        `InputError`."""
+        if label not in self.labels or self.problem is None:
+            raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
+        k, weights = self.labels.index(label), [part.weighting for part in self.parts]
+        V = self.coordinate_covariance
+        counted = np.linalg.inv(self.hessian)[k, k]
+        deviance, shifts = [], np.linspace(-reach, reach, points) * np.sqrt(V[k, k])
+        lower, upper = self.coordinates.bounds
+        for shift in shifts:
+            begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
+            begun[k] = self.u[k] + shift
+            ended, _ = self.problem.solve(begun, weights, 2, fixed=[k])
+            squares = self.problem.sum_of_squares(self.problem.residuals(ended), weights)
+            deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
+        values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
+        return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
+
+    def lines(self, confidence: float = 0.95) -> list[str]:
+        """One for each number: its value, its standard error, and its interval."""
+        ends = self.intervals(confidence)
+        free = self.coordinates.free
+        lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
+        numbers, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        return [
+            f"{label.replace('_', ' ')} {with_error(value, error)}{_unit(label)} "
+            f"({100 * confidence:g} % between {a:.4g} and {b:.4g})"
+            for label, value, error, a, b in zip(self.labels, numbers, errors, lower, upper, strict=True)
+        ]
+
+    def __str__(self) -> str:
+        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})" for a, b, c in self.not_told_apart]
+        ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
+        return "\n".join([*self.lines(), *apart, *ended, *self.doubts])
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
+    if not np.isfinite(error) or error <= 0.0:
+        return f"{value:.6g} ± {error:.2g}"
+    power = int(np.floor(np.log10(error)))
+    digits = -power + (1 if error / 10.0**power < 3.55 else 0)
+    if digits >= 0 and abs(value) < 1e6 and digits <= 8:
+        return f"{value:.{digits}f} ± {error:.{digits}f}"
+    return f"{value:.{max(int(np.floor(np.log10(abs(value) or error))) + digits, 0)}e} ± {error:.1e}"
+
+
+def unit_of(label: str) -> str:
+    """Of a number, by its label; empty where it has none."""
+    name = label.partition("[")[0]
+    return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
+
+
+def _unit(label: str) -> str:
+    found = unit_of(label)
+    return f" {found}" if found and found != "-" else ""

@@ -1,0 +1,92 @@
+"""The data that tables [[problem.measured]] name, as observations."""
+
+from functools import singledispatch
+from pathlib import Path
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.files.csv_columns import read_columns
+from cortado.optimisation.fitting.observation import Observation
+from cortado.optimisation.fitting.sensor_series import SensorSeries
+from cortado.optimisation.fitting.tracks import Tracks
+from cortado.optimisation.fitting.video import Video
+from cortado.optimisation.inverse.measured_tables import MeasuredTable, SensorSeriesTable, TracksTable, VideoTable
+from cortado.pictures.image_files import open_picture, resized
+from cortado.pictures.video_frames import read_frames
+from cortado.runs.sensors.of_scene import sensors_of
+from cortado.simulation import Simulation
+
+LIGHT = 0.5
+"""Pixels of a mask that are brighter count."""
+
+
+@singledispatch
+def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    """What a table describes, up to the ``last`` time of the run [s]; its files are in a folder. Raises
+    `InputError`."""
+    raise NotImplementedError(type(table))
+
+
+@observation.register
+def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    renderer = simulation.renderer()
+    rows, columns, _ = renderer.shape
+    times, frames = read_frames(folder / table.file, (columns, rows), table.crop, table.frame_rate, table.every)
+    chosen = _within(times + table.start, last)
+    mask = None
+    if table.mask is not None:
+        picture = open_picture(folder / table.mask)
+        cropped = picture if table.crop is None else picture.crop(table.crop)
+        mask = resized(cropped, (columns, rows)).mean(axis=2) > LIGHT
+    moments = (times + table.start)[chosen]
+    return Video(renderer, moments, frames[chosen], mask, table.noise, table.calibrate)
+
+
+@observation.register
+def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    sensors = sensors_of(simulation.scene)
+    if table.sensor not in sensors:
+        raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
+    sensor, path = sensors[table.sensor], folder / table.file
+    data = _with(read_columns(path), ("time",), path)
+    known = sensor.columns(simulation.dimension)
+    names = [name for name in data if name != "time"]
+    for name in names:
+        if name not in known:
+            raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
+    times = data["time"] + table.start
+    chosen = _within(times, last)
+    values = np.stack([data[name] for name in names], axis=1) if names else np.zeros((len(times), 0))
+    return SensorSeries(sensor, times[chosen], values[chosen], simulation.dimension, names, table.noise)
+
+
+@observation.register
+def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    path, axes = folder / table.file, ["x", "y", "z"][: simulation.dimension]
+    data = _with(read_columns(path), ("time", "tracer", *axes), path)
+    times, when = np.unique(data["time"] + table.start, return_inverse=True)
+    tracers, who = np.unique(data["tracer"], return_inverse=True)
+    places = np.full((len(times), len(tracers), len(axes)), np.nan)
+    places[when, who] = np.stack([data[axis] for axis in axes], axis=1)
+    begin = int(np.argmin(np.abs(times)))
+    missing = tracers[np.isnan(places[begin]).any(axis=1)]
+    if abs(times[begin]) > 1e-9 * max(last, 1e-300) or len(missing):
+        lacking = f" of tracer {missing[0]:g}" if len(missing) else ""
+        raise InputError(f"{path} lacks the place{lacking} at the start of the run, time {-table.start:g} s.")
+    chosen = _within(times, last) & (times > 0.0)
+    return Tracks(simulation, places[begin], times[chosen], places[chosen], table.noise)
+
+
+def _within(times: np.ndarray, last: float) -> np.ndarray:
+    """Which of some times are within the run; the others are left out."""
+    return (times >= -1e-12) & (times <= last * (1.0 + 1e-9))
+
+
+def _with(data: dict[str, np.ndarray], wanted: tuple[str, ...], path: Path) -> dict[str, np.ndarray]:
+    for name in wanted:
+        if name not in data:
+            raise InputError(f"{path} has the columns {', '.join(data)}, but must have {name}.")
+        if name == "time" and np.isnan(data[name]).any():
+            raise InputError(f"{path} has lines without a time.")
+    return data

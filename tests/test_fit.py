@@ -1,0 +1,317 @@
+"""Fits of measured experiments: error bars that hold the truth, tangents that are right, and mistakes in sentences."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import cortado
+from bad_scenes import assert_one_sentence
+from cortado import measured
+from cortado.errors import ComputationError, InputError
+from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.optimisation.fitting.fitted import with_error
+from cortado.optimisation.fitting.noise import (
+    Products,
+    correlation_time,
+    independent_frames,
+    score_covariance,
+    whitened,
+)
+from cortado.optimisation.fitting.observation import Frames
+from cortado.sensors import PressureProbe, WallForce, WaveGauge
+
+STEPS, TIME_STEP = 12, 0.005
+TRUE = 2.0
+SCENE = cortado.Scene(
+    dimension=2,
+    discretisation={"spacing": 0.03},
+    phase=[{"name": "syrup", "rest_density": 1300.0, "viscosity": TRUE, "colour": [0.45, 0.12, 0.03]}],
+    fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.18, 0.24], "phase": "syrup"}],
+    container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.48, 0.36], "slip": "no"},
+    forces={"gravity": [0.0, -9.81], "viscosity": "stress"},
+    solver={"time_step": TIME_STEP, "minimum_iterations": 3, "maximum_iterations": 3},
+)
+
+
+# ---- error bars --------------------------------------------------------------------------------------------------
+
+
+def design(frames, rows, columns):
+    """(frames, m, 2): a front that moves, seen by two parameters."""
+    t = np.linspace(0.1, 1.0, frames)[:, None, None]
+    y, x = np.mgrid[:rows, :columns]
+    front = np.exp(-(((x - columns * (0.2 + 0.5 * t)) / 2.0) ** 2))
+    return np.stack([t * front, t**2 * front * (1.0 - y / rows)], axis=-1).reshape(frames, -1, 2)
+
+
+def noise_of(random, frames, rows, columns, kept):
+    fresh = random.standard_normal((frames, rows, columns))
+    fresh = np.stack([gaussian_filter(one, 2, mode="wrap") for one in fresh])
+    fresh += 0.2 * random.standard_normal((frames, 1, 1))
+    for f in range(1, frames):
+        fresh[f] = kept * fresh[f - 1] + np.sqrt(1.0 - kept**2) * fresh[f]
+    return fresh.reshape(frames, -1)
+
+
+def linear_fit(J, y):
+    flat = J.reshape(-1, J.shape[-1])
+    inverse = np.linalg.inv(flat.T @ flat)
+    estimate = inverse @ flat.T @ y.ravel()
+    return estimate, y - J @ estimate, inverse
+
+
+def test_bars_hold_the_truth_where_a_count_of_pixels_does_not():
+    """Of 60 linear fits with noise that is correlated in frames and over time."""
+    from scipy.stats import t as student
+
+    random, times = np.random.default_rng(0), np.arange(8.0)
+    J = design(8, 12, 16)
+    held, counted = [], []
+    for _ in range(60):
+        y = noise_of(random, 8, 12, 16, 0.5)
+        estimate, r, inverse = linear_fit(J, y)
+        counted.append(np.abs(estimate) < 1.96 * np.sqrt(np.diag(inverse) * np.mean(r**2)))
+        time = correlation_time(J, r, inverse, times)
+        white = whitened(J, times, time)
+        estimate, r, inverse = linear_fit(white, whitened(y, times, time))
+        score = score_covariance(white, r, inverse, independent_frames(times, time))
+        size = np.sqrt(np.diag(inverse @ score.B @ inverse))
+        freedom = [score.degrees_of_freedom(inverse, unit) for unit in np.eye(2)]
+        held.append(np.abs(estimate) < student.ppf(0.975, freedom) * size)
+    assert 0.91 < np.mean(held) < 0.99
+    assert np.mean(counted) < 0.5
+
+
+def test_of_one_number_per_frame_it_is_the_textbook_formula():
+    """But for the factor 1 + 2 / n of a correlation time that is estimated."""
+    random = np.random.default_rng(1)
+    J, y = random.standard_normal((30, 1, 3)), random.standard_normal((30, 1))
+    _, r, inverse = linear_fit(J, y)
+    score = score_covariance(J, r, inverse, 30.0)
+    assert inverse @ score.B @ inverse == pytest.approx(
+        inverse * (r**2).sum() / 27.0 * (1.0 + 2.0 / 30.0), rel=0.03, abs=2e-4
+    )
+    assert score.degrees_of_freedom(inverse, np.eye(3)[0]) == pytest.approx(27.0, rel=0.02)
+
+
+@pytest.mark.parametrize("true", [0.0, 3.0])
+def test_a_correlation_time_is_found(true):
+    random, times, found = np.random.default_rng(2), np.arange(40.0), []
+    J = np.stack([np.ones(40), times / 40.0], axis=-1)[:, None, :].repeat(5, axis=1)
+    kept = np.exp(-1.0 / true) if true else 0.0
+    for _ in range(20):
+        y = random.standard_normal((40, 5))
+        for f in range(1, 40):
+            y[f] = kept * y[f - 1] + np.sqrt(1.0 - kept**2) * y[f]
+        _, r, inverse = linear_fit(J, y)
+        found.append(correlation_time(J, r, inverse, times))
+        assert np.corrcoef(whitened(y, times, true)[1:].ravel(), whitened(y, times, true)[:-1].ravel())[0, 1] < 0.3
+    assert np.median(found) == pytest.approx(true, rel=0.25, abs=0.4)
+
+
+def test_products_are_what_they_say():
+    random = np.random.default_rng(3)
+    J, r = random.standard_normal((4, 5, 2)), random.standard_normal((4, 5))
+    C, found = r.T @ r / 4, Products.of(J, r)
+    assert found.S[1, 3] == pytest.approx(J[1].T @ C @ J[3]) and found.K[2, 0] == pytest.approx(J[2].T @ J[0])
+
+
+# ---- numbers -----------------------------------------------------------------------------------------------------
+
+
+def test_coordinates_leave_fixed_numbers_alone():
+    own = Coordinates.of(
+        {"viscosity": [1.0, 2.0], "gravity": [0.5, -9.0]}, ["viscosity"], {"viscosity": (1.0, [1.0, 9.0])}
+    )
+    assert own.labels == ["viscosity[1]", "gravity[0]", "gravity[1]"]
+    u = own.start + [0.1, 0.0, 1.0]
+    assert own.values(u)["viscosity"] == pytest.approx([1.0, 2.0 * np.exp(0.1)])
+    assert own.directions(u)[0]["viscosity"] == pytest.approx([0.0, 2.0 * np.exp(0.1)])
+    assert set(own.directions(u)[2]) == {"gravity"}
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [(0.8312, 0.0402, "0.83 ± 0.04"), (1.0, 0.15, "1.00 ± 0.15"), (1302.0, 26.0, "1302 ± 26"), (0.0, 3e-5, "0.000000")],
+)
+def test_a_value_has_the_digits_that_its_error_leaves(value, error, text):
+    assert with_error(value, error).startswith(text)
+
+
+def test_frames_between_steps_are_interpolated():
+    frames = Frames.of(np.array([0.0, 0.25, 1.0]), 0.1, 10)
+    assert frames.needed == {0, 2, 3, 10}
+    assert frames.between({k: np.array([float(k)]) for k in frames.needed}).ravel() == pytest.approx([0.0, 2.5, 10.0])
+
+
+# ---- experiments -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return cortado.Simulation(SCENE, precision="float64")
+
+
+@pytest.fixture(scope="module")
+def experiment(simulation):
+    """All that can be measured, without noise."""
+    times = TIME_STEP * np.linspace(2.0, STEPS, 6)
+    renderer = simulation.renderer(resolution=(16, 12))
+    first = simulation.positions[::5] + 0.004
+    empty = np.zeros((6, 1))
+    found = measured.Experiment(
+        simulation,
+        {
+            "camera": measured.Video(renderer, times, np.zeros((6, 12, 16, 3)), calibrate=("translation", "width")),
+            "tracers": measured.Tracks(simulation, first, times - 0.3 * TIME_STEP, np.zeros((6, *first.shape))),
+            "gauge": measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, empty, 2),
+            "scales": measured.SensorSeries(WallForce(), times[-4:], empty[-4:], 2, columns=["force_y"]),
+        },
+    )
+    return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
+
+
+def test_the_jacobian_is_the_limit_of_differences(experiment):
+    at = {"viscosity": np.array(TRUE), "gravity": np.array([0.3, -9.0]), **experiment.start}
+    at["camera.translation"] = np.array([1e-3, 2e-3, 0.0])  # else pixels look exactly along the faces between cells
+    directions = [
+        {"viscosity": np.array(1.0)},
+        {"gravity": np.array([1.0, 0.5])},
+        {"camera.width": np.array(0.1)},
+        {"camera.translation": np.array([0.01, 0.02, 0.0])},
+    ]
+    predicted, slopes = experiment.linearised(at, directions)
+    for k, direction in enumerate(directions):
+        ends = [
+            experiment.predicted({n: v + way * 1e-4 * direction.get(n, 0.0) for n, v in at.items()})
+            for way in (1.0, -1.0)
+        ]
+        for name, slope in slopes.items():
+            difference = (ends[0][name] - ends[1][name]) / 2e-4
+            assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
+    assert all(np.array_equal(predicted[name], one) for name, one in experiment.predicted(at).items())
+
+
+def test_the_tangent_of_a_picture_is_the_transpose_of_its_adjoint(experiment):
+    video = experiment.observations["camera"]
+    end, random = experiment.problem.end({"viscosity": TRUE}), np.random.default_rng(0)
+    dot, bar = random.standard_normal(end.positions.shape), random.standard_normal(video.renderer.shape)
+    video.renderer.render(end)
+    along = (bar * video.renderer.tangent(dot)).sum()
+    back = (video.renderer.adjoint(bar).positions.numpy()[:, :2] * dot).sum()
+    assert along == pytest.approx(back, rel=1e-10)
+
+
+def test_a_fit_finds_what_was_measured_without_noise(experiment):
+    found = cortado.fit(experiment, {"viscosity": 1.0}, {"camera.translation": ([-0.1, -0.1, 0.0], [0.1, 0.1, 0.0])})
+    assert found.converged and found.values["viscosity"] == pytest.approx(TRUE, rel=1e-4)
+    assert found.values["camera.width"] == pytest.approx(0.48, rel=1e-4)
+    assert found.labels == ["viscosity", "camera.translation[0]", "camera.translation[1]", "camera.width"]
+    assert "viscosity 2.0" in str(found) and "Pa s" in str(found)
+
+
+@pytest.fixture(scope="module")
+def shaken(simulation):
+    """Tracers that a shaking camera sees."""
+    times, first = TIME_STEP * np.linspace(2.0, STEPS, 10), simulation.positions[::3]
+    own = measured.Tracks(simulation, first, times, np.zeros((10, *first.shape)))
+    found = measured.Experiment(simulation, {"tracers": own})
+    return found.measured_again(found.predicted({"viscosity": TRUE}))
+
+
+def with_shake(shaken, seed, size=2e-4):
+    """All tracers of a frame are off by the same."""
+    random, clean = np.random.default_rng(seed), shaken.observations["tracers"].measured
+    shake = np.tile(random.standard_normal((len(clean), 2)), clean.shape[1] // 2)
+    return shaken.measured_again({"tracers": clean + size * (shake + 0.1 * random.standard_normal(clean.shape))})
+
+
+def test_bars_of_fits_hold_the_truth_where_counted_ones_do_not(shaken):
+    """A handful; `python -m benchmarks.fits` counts 200."""
+    fits = [cortado.fit(with_shake(shaken, seed), {"viscosity": 1.5}) for seed in range(6)]
+    off = np.array([float(np.log(one.values["viscosity"] / TRUE)) for one in fits])
+    bars = np.array([np.sqrt(one.coordinate_covariance[0, 0]) for one in fits])
+    counted = np.array([np.sqrt(one.naive_covariance[0, 0]) for one in fits])
+    assert 0.2 < np.mean((off / bars) ** 2) < 3.0
+    assert np.mean((off / counted) ** 2) > 4.0
+    assert all(one.intervals()["viscosity"][0] < TRUE < one.intervals()["viscosity"][1] for one in fits)
+
+
+def test_two_experiments_tell_more_than_one(shaken):
+    pair = [with_shake(shaken, seed) for seed in (0, 1)]
+    both = cortado.fit(pair, {"viscosity": 1.5})
+    alone = cortado.fit(pair[0], {"viscosity": 1.5})
+    assert both.standard_errors["viscosity"] < 0.95 * alone.standard_errors["viscosity"]
+    assert [part.label for part in both.parts] == ["tracers of experiment 1", "tracers of experiment 2"]
+
+
+def test_a_profile_of_small_noise_is_a_parabola(shaken):
+    found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).profile("viscosity", points=3)
+    assert found.deviance == pytest.approx(found.expected, rel=0.1, abs=0.05)
+
+
+def test_a_wrong_model_is_doubted(shaken):
+    """Its gravity is too small."""
+    found = cortado.fit(
+        with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
+    )
+    assert found.doubts and "model is" in found.doubts[0]
+    assert not cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).doubts
+
+
+def test_what_cannot_be_told_is_said(simulation, shaken):
+    with pytest.raises(ComputationError, match=r"does not tell .* apart at all"):
+        times = TIME_STEP * np.arange(1.0, 3.0, 0.4)
+        height = measured.SensorSeries(PressureProbe([0.09, 0.05]), times, np.ones((len(times), 1)), 2, noise=1.0)
+        still = measured.Experiment(simulation, {"probe": height})
+        cortado.fit(still, {"viscosity": 2.0, "gravity": [0.0, -9.0], "rest_density": 1300.0}, iterations=1)
+
+
+# ---- mistakes ----------------------------------------------------------------------------------------------------
+
+TIMES = [0.0, 0.01, 0.02, 0.03]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (
+            lambda s: measured.SensorSeries(WallForce(), TIMES[:3], np.zeros((3, 1)), 2, ["force_y"]),
+            "at least 4 rising",
+        ),
+        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 1)), 2, ["up"]), "one of force_x"),
+        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 2)), 2, ["force_x", "torque"]), "one unit"),
+        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.full((4, 1), np.nan), 2, ["force_y"]), "not for all"),
+        (lambda s: measured.SensorSeries(WallForce(), TIMES, np.zeros((4, 1)), 2, ["force_y"], 0.0), "greater than 0"),
+        (lambda s: measured.Tracks(s, [[9.0, 9.0]], TIMES, np.zeros((4, 1, 2))), "must be within"),
+        (lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES, np.zeros((4, 2, 2))), "positions has shape"),
+        (lambda s: measured.Video(s.renderer(resolution=(8, 8)), TIMES, np.zeros((4, 8, 9, 3))), "frames has shape"),
+        (
+            lambda s: measured.Video(s.renderer(resolution=(8, 8)), TIMES, np.zeros((4, 8, 8, 3)), calibrate=["up"]),
+            "calib",
+        ),
+        (lambda s: measured.Experiment(s, {}), "observations is empty"),
+        (lambda s: cortado.fit([], {"viscosity": 1.0}), "experiments is empty"),
+        (lambda s: cortado.fit("experiment", {"viscosity": 1.0}), "must be made of"),
+    ],
+)
+def test_a_mistake_is_a_sentence(make, words, simulation):
+    with pytest.raises(InputError, match=words) as error:
+        make(simulation)
+    assert_one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize(
+    ("start", "bounds", "words"),
+    [
+        ({"viscosity": 1.0}, {"mobility": (0.0, 1.0)}, "that start has"),
+        ({"viscosity": 1.0}, {"viscosity": (2.0, 3.0)}, "within its bounds"),
+        ({"viscosity": 1.0}, {"viscosity": (1.0, 1.0)}, "0 free numbers"),
+        ({"honey": 1.0}, None, "honey"),
+        ({"viscosity": np.nan}, None, "viscosity"),
+    ],
+)
+def test_a_wrong_start_is_a_sentence(start, bounds, words, shaken):
+    with pytest.raises(InputError, match=words) as error:
+        cortado.fit(shaken, start, bounds)
+    assert_one_sentence(str(error.value))

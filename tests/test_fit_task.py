@@ -1,0 +1,94 @@
+"""Tasks with measured data: their files, their command, and mistakes in them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bad_scenes import assert_one_sentence
+from cortado.errors import CortadoError, InputError
+from cortado.files.csv_columns import read_columns
+from cortado.optimisation.inverse.fit_task import load_fit
+from cortado.optimisation.inverse.task import load_task
+from cortado.pictures.image_files import write_picture
+from cortado.pictures.video_frames import read_frames
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def task(tmp_path):
+    """The example, with fewer particles."""
+    for path in EXAMPLES.glob("fit_heights_*.csv"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    file = tmp_path / "task.toml"
+    file.write_text((EXAMPLES / "fit_heights.toml").read_text("utf-8").replace("spacing = 0.02 ", "spacing = 0.04 "))
+    return file
+
+
+def test_a_fit_writes_its_numbers_and_its_report(task, tmp_path, cortado_command, unrendered):
+    code, out, err = cortado_command("fit", task, "--out", tmp_path / "run", "--set", "fit.profiles=0")
+    assert (code, err) == (0, "") and "viscosity " in out and "± " in out and "Pa s" in out
+    found = json.loads((tmp_path / "run/result.json").read_text())
+    assert found["lower_95"]["viscosity"] < found["parameters"]["viscosity"] < found["upper_95"]["viscosity"]
+    report = (tmp_path / "run/report.html").read_text()
+    assert "Residuals" in report and "standard error" in report and "left gauge" in report
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[fit]", "[optimise]", "fit is missing"),
+        ('sensor = "left"', 'sensor = "middle"', "sensor is 'middle'"),
+        ('file = "fit_heights_left.csv"', 'file = "none.csv"', "none.csv cannot be read"),
+        ('name = "right gauge"', 'name = "left gauge"', "measured[1].name"),
+        ("[problem]\n", '[problem]\nloss = "image"\n', "problem.loss is given"),
+        ("start.viscosity = 1.0", "start.honey = 1.0", "fit.start.honey"),
+        ('kind = "sensor"', 'kind = "scent"', "problem.measured[0].kind"),
+    ],
+)
+def test_a_mistake_in_a_task_is_a_sentence(task, old, new, words):
+    task.write_text(task.read_text().replace(old, new, 1))
+    with pytest.raises(CortadoError) as error:
+        for one in load_fit(task).experiments:
+            one.experiment("cpu", "float32")
+    assert_one_sentence(str(error.value))
+    assert words in str(error.value)
+
+
+def test_each_command_names_the_other(task):
+    with pytest.raises(CortadoError, match="cortado fit"):
+        load_task(task)
+    with pytest.raises(CortadoError, match="cortado optimise"):
+        load_fit(EXAMPLES / "identify.toml")
+
+
+def test_frames_of_a_folder_are_read(tmp_path):
+    for k in range(4):
+        write_picture(tmp_path / f"{k:02}.png", np.full((32, 48, 3), 0.2 + 0.1 * k))
+    times, frames = read_frames(tmp_path, (24, 16), frame_rate=50.0)
+    assert times == pytest.approx([0.0, 0.02, 0.04, 0.06]) and frames.shape == (4, 16, 24, 3)
+    assert frames[:, 0, -1, 0] == pytest.approx([0.2, 0.3, 0.4, 0.5], abs=0.01)
+    cropped = read_frames(tmp_path, (8, 8), crop=(24, 0, 48, 24), frame_rate=50.0, every=2)[1]
+    assert len(cropped) == 2 and cropped[1] == pytest.approx(np.full((8, 8, 3), 0.4), abs=0.01)
+    with pytest.raises(InputError, match="frame_rate is missing"):
+        read_frames(tmp_path, (24, 16))
+    with pytest.raises(InputError, match="must lie within the frames"):
+        read_frames(tmp_path, (24, 16), crop=(0, 0, 49, 10), frame_rate=50.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("", "must have a line"), ("time,x\n0,1,2\n", "3 entries"), ("time,x\n0,one\n", "line 2, x is 'one'")],
+)
+def test_a_table_that_is_none_is_a_sentence(tmp_path, text, words):
+    (tmp_path / "table.csv").write_text(text)
+    with pytest.raises(InputError, match=words) as error:
+        read_columns(tmp_path / "table.csv")
+    assert_one_sentence(str(error.value))
+
+
+def test_an_entry_may_be_left_out(tmp_path):
+    (tmp_path / "table.csv").write_text("time, x\n0, 1\n1,\n")
+    assert np.array_equal(read_columns(tmp_path / "table.csv")["x"], [1.0, np.nan], equal_nan=True)
