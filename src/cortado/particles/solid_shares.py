@@ -29,6 +29,8 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.state import Layout
 from cortado.particles.terms import Term
 
+ALL_WALLS = -(2**31)
+"""In the place of the number of a solid: those of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before")
 """f, t, f_0 and t_0."""
 SUM = """\
@@ -87,16 +89,19 @@ class SolidShares:
         kernel: Callable[[], Any],
         *groups: Named,
         constants: tuple[float, float] = (0.0, 0.0),
+        over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move."""
+        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move; of a
+        sum ``over`` the walls of one solid, to that alone."""
         if self._walls is None:
             return
         before, after = self._walls.before, self._walls.after
         poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
-            launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
+            if over in (ALL_WALLS, solid):
+                launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
         """(n,) vectors that the particles have given to one solid so far, as kernels call them."""

@@ -4,7 +4,7 @@ A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solv
 for its tangent and its adjoint.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn, Self
 
@@ -22,6 +22,7 @@ from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fi
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.wall_terms import WallTerm
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
@@ -32,6 +33,17 @@ from cortado.sph.density import density_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, StepContext
+from cortado.sph.wall_slope import wall_slope_term
+
+
+@dataclass(frozen=True)
+class NamedSolid:
+    """A solid of a scene."""
+
+    number: int
+    """Of its wall particles (`cortado.scene.motions.wall_numbers`)."""
+    middle: NDArray
+    """(3,) where its middle is at the start [m]"""
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,8 @@ class ParticleSystem:
     waiting: int
     """Number of the first particle of a scene that may wait in a nozzle."""
     walled: Walled
+    solids: Mapping[str, NamedSolid]
+    """By their names."""
     of_one_lane: Callable[[], "ParticleSystem"]
     """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
 
@@ -69,6 +83,8 @@ class ParticleSolver:
     """Of the Warp modules that have the kernels of the density."""
     density_power = 2
     """The pressure force of a pair has p_i over this power of its number density n_i."""
+    wall_push: Callable[[Discretisation], WallTerm] = staticmethod(wall_slope_term)
+    """What makes the term of walls which a particle's pressure pushes along: with V^2 p_i over that power."""
     shares: tuple[str, ...] = ()
     """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 

@@ -10,6 +10,7 @@ import warp as wp
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.wall_terms import WallTerm
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,20 @@ def beside_solid_kernel(discretisation: Discretisation) -> Any:
     """The kernel of what they give to solids (`cortado.particles.solid_shares.SolidShares.add`), for the adjoints
     ``gamma_bar``, ``nu_bar`` and ``drift_bar``."""
     return solid_kernel(discretisation, "projection", _work)
+
+
+def push_term(discretisation: Discretisation) -> WallTerm:
+    """gamma / V of the walls of a solid, with the adjoint ``bar``."""
+    return WallTerm(discretisation, "projection", _push_work, "bar")
+
+
+def _push_work(d: Discretisation) -> Any:
+    real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
+
+    def push_work(x_ij: vector, bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
+        return wp.dot(normal(gradient(x_ij, s), foot), bar_i)
+
+    return push_work
 
 
 def _work(d: Discretisation) -> Any:

@@ -16,6 +16,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
+from cortado.solvers.projection.beside import push_term
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.moving import moving_kernels
@@ -63,6 +64,7 @@ class ProjectionSteps(ParticleSolver):
 
     topic = "projection"
     density_power = 0
+    wall_push = staticmethod(push_term)
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER),)
 
     def __init__(self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int):
