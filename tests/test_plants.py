@@ -38,7 +38,7 @@ UNNAMED = {
     "particles.solid_shares": {"solid_kernel.share"},
     "sph.rotations": {"rotations.back", "rotations.back_about_z"},
     "sph.density": {"_density_work.density_work"},
-    "sph.viscosity": {"viscosity_solid_kernel.made.viscosity_work"},
+    "sph.viscosity": {"viscosity_term.made.viscosity_work"},
     "sph.wall_slope": {"_work.wall_slope_work"},
     "sph.packed": {"packing_kernels.add_number"},
     "sph.stress_functions": {"stress_functions.back"},

@@ -291,9 +291,8 @@ class Viscosity:
         discretisation = setting.discretisation
         self._kernels, self.friction = viscosity_kernels(discretisation, form, friction > 0.0), friction
         self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
-        self.walls: WallSums | None = None
-        if friction > 0.0:
-            self.walls = WallSums(viscosity_term(discretisation, form), setting.layout, (kappa * friction, 0.0))
+        term, constants = viscosity_term(discretisation, form), (kappa * friction, 0.0)
+        self.wall_action = WallSums(term, setting.layout, constants) if friction > 0.0 else None
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, **self._constants, acceleration_in=before, acceleration=after)
@@ -304,8 +303,8 @@ class Viscosity:
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
-        if self.walls is not None:
-            self.walls.give(step, bar, ALL_WALLS, acceleration_bar)
+        if self.wall_action is not None:
+            self.wall_action.give(step, bar, ALL_WALLS, acceleration_bar)
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:

@@ -45,7 +45,7 @@ class ViscousStress:
         self._change = {name: wp.zeros(dtype=kind, **sizes) for name, kind in kinds.items()}
         """Tangents of T and eta, or adjoints of M, A and R."""
         own = setting, self._made_for, self._constants, self._of, self._packed, self
-        self.walls = StressWalls(*own) if scene.sticks else None
+        self.wall_action = StressWalls(*own) if scene.sticks else None
 
     def compile(self, what: str) -> None:
         """Compile the law in it; raises `InputError` where Warp cannot."""

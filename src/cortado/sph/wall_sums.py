@@ -22,8 +22,8 @@ class WallAction(Protocol):
         """(n,) their tangents, after forward mode of the step."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """From the adjoints of the vectors to those of sorted particles, parameters and solids, in ``bar``, and to those
-        (n,) of v* = v + dt a, of velocities after all explicit forces."""
+        """From the adjoints of the vectors to those of sorted particles, parameters and solids, in ``bar``, and to
+        those (n,) of v* = v + dt a, of velocities after all explicit forces."""
 
 
 class WallSums:

@@ -2,10 +2,11 @@
 
 Particle i pushes them with
 
-    f_i = V^2 p_i / n_i^power A_i - V m_i sum a_i,
+    f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i),
 
-where A_i is the sum over wall particles along which its pressure acts (`cortado.solvers.particles.ParticleSolver.wall_push`)
-and a_i the acceleration that they give it by a force such as viscosity: momentum that the fluid loses, the walls get.
+where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
+`cortado.solvers.particles.ParticleSolver`) and a_i the acceleration that they give it by a force such as viscosity. The
+walls so get what momentum the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
 from dataclasses import dataclass
@@ -26,51 +27,53 @@ class WallLoads:
     `cortado.particles.solid_shares.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
-        self._volume, self._power = solver.lattice.volume, solver.density_power
+        self._cell, self._power = solver.lattice.cell, solver.density_power
+        self._scale = self._cell * solver.lattice.volume
         self._push = WallSums(solver.wall_push(solver.discretisation), solver.layout)
-        walls = (getattr(force, "walls", None) for force in solver.forces)
+        walls = (getattr(force, "wall_action", None) for force in solver.forces)
         self._rubs: list[WallAction] = [action for action in walls if action is not None]
 
     def forces(self, at: Particles, sums: Sums, solid: int) -> NDArray:
         """f [N]"""
         found = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
         for action in self._rubs:
-            found -= self._volume * at["m"][:, None] * vectors(action.total(sums.context, solid))
+            found -= self._cell * at["m"][:, None] * vectors(action.total(sums.context, solid))
         return found
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
         """That of f."""
-        strength_dot = self._volume**2 / at["n"] ** self._power * (dot.p - self._power * at.p * dot["n"] / at["n"])
+        strength_dot = self._scale / at["n"] ** self._power * (dot.p - self._power * at.p * dot["n"] / at["n"])
         pushed = vectors(self._push.total(sums.context, solid))
         pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
         found = strength_dot[:, None] * pushed + self._strength(at)[:, None] * pushed_dot
         for action in self._rubs:
             a = vectors(action.total(sums.context, solid))
             a_dot = vectors(action.tangent(sums.context, along, solid))
-            found -= self._volume * (dot["m"][:, None] * a + at["m"][:, None] * a_dot)
+            found -= self._cell * (dot["m"][:, None] * a + at["m"][:, None] * a_dot)
         return found
 
     def adjoint(self, at: Particles, sums: Sums, forces_bar: NDArray, bar: Particles, solid: int) -> None:
         """From that of f, add to those of the particles."""
         step, strength = sums.context, self._strength(at)
         strength_bar = (forces_bar * vectors(self._push.total(step, solid))).sum(axis=1)
-        bar.p[:] += strength_bar * self._volume**2 / at["n"] ** self._power
+        bar.p[:] += strength_bar * self._scale / at["n"] ** self._power
         bar["n"][:] -= self._power * strength_bar * strength / at["n"]
         within = bar.within
         self._push.adjoint(step, within.bar, solid, sums.on_device(strength[:, None] * forces_bar), within.v_star)
         for action in self._rubs:
-            bar["m"][:] -= self._volume * (forces_bar * vectors(action.total(step, solid))).sum(axis=1)
-            total_bar = sums.on_device(-self._volume * at["m"][:, None] * forces_bar)
+            bar["m"][:] -= self._cell * (forces_bar * vectors(action.total(step, solid))).sum(axis=1)
+            total_bar = sums.on_device(-self._cell * at["m"][:, None] * forces_bar)
             action.adjoint(step, within.bar, solid, total_bar, within.v_star)
 
     def _strength(self, at: Particles) -> NDArray:
-        return np.asarray(self._volume**2 * at.p / at["n"] ** self._power)
+        return np.asarray(self._scale * at.p / at["n"] ** self._power)
 
 
 @dataclass(frozen=True)
 class SolidLoad:
-    """Force and torque on a solid, F = sum_i f_i and sum_i r_i x f_i, with r_i from its middle, where its walls are in the
-    step, to particle i; of each scene one behind the other, in the plane the torque that stands on it."""
+    """Force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at the end of the
+    step, where its walls are, to particle i. Each scene has F and T one behind the other, in the plane the component of
+    T that stands on it."""
 
     loads: WallLoads
     solver: ParticleSolver

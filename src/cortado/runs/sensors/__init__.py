@@ -1,4 +1,4 @@
-"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, loads on solids and walls."""
+"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid."""
 
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.log import Readings

@@ -16,8 +16,9 @@ class WallForce:
 
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
 
-    over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F. The border of a region is a jump: let it run where particles do not push in the direction that is looked
-    at, as half-way between two walls.
+    over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F. The border of
+    a region is a jump: let it run where particles do not push in the direction that is looked at, as half-way between
+    two walls.
     """
 
     def __init__(self, lower: Any = None, upper: Any = None, about: Any = None):
