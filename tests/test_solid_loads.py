@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import Problem, Scene, SceneError, Simulation
+from cortado.discretise.solids.mass import Mass
 from cortado.errors import InputError
 from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
@@ -54,8 +55,7 @@ def test_what_fluid_does_to_a_free_body_is_what_moves_it():
     scene = plane(RAFT, container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]})
     run = Simulation(scene, precision="float64").run(STEPS, sensors=loads_of(scene))
     load, motion = run.sensors["raft"].values[:-1, :2], run.solids["raft"]
-    lower, upper = np.array(RAFT["lower"]), np.array(RAFT["upper"])
-    mass = RAFT["density"] * np.prod(upper - lower)
+    mass = RAFT["density"] * Mass.of(scene.solid[0].own_solid()).volume
     gained = mass * (np.diff(motion.velocities, axis=0) / scene.solver.time_step - scene.forces.gravity)
     np.testing.assert_allclose(load, gained, atol=1e-10 * np.abs(load).max())
 

@@ -85,7 +85,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         wall_grips: wp.array(dtype=real)
         """w_b of walls without slip, 0 of those that slip freely [-]."""
         wall_velocities: wp.array(dtype=vector)
-        """How fast a wall particle moves [m/s]; read where the `Discretisation` is moving."""
+        """How fast the point of the surface above a wall particle moves [m/s]; read where the `Discretisation` is
+        moving."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
