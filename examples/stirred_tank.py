@@ -9,20 +9,20 @@ import numpy as np
 
 import cortado
 
-STEPS, ITERATIONS, TIME_STEP = 60, 7, 0.004
+STEPS, ITERATIONS, TIME_STEP = 25, 6, 0.004
 TRUE, GUESS = 9.0, 2.0  # Pa s
 
-shape = {"shape": "box", "lower": [0.1, 0.04, 0.16], "upper": [0.3, 0.2, 0.24]}
+shape = {"shape": "box", "lower": [0.2, 0.05, 0.2], "upper": [0.4, 0.2, 0.4]}
 if len(sys.argv) > 1:
     shape = {"shape": "mesh", "file": sys.argv[1]}
-turns = {"position": [0.2, 0.12, 0.2], "motion": "path", "angular_velocity": [0.0, 5.0, 0.0], "slip": "no"}
+turns = {"position": [0.3, 0.125, 0.3], "motion": "path", "angular_velocity": [0.0, 3.0, 0.0], "slip": "no"}
 scene = cortado.Scene(
     name="stirred tank",
     dimension=3,
-    discretisation={"spacing": 0.04},
+    discretisation={"spacing": 0.05},
     phase=[{"name": "honey", "rest_density": 1400.0, "viscosity": GUESS, "colour": [0.9, 0.55, 0.1]}],
-    fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.24, 0.4], "phase": "honey"}],
-    container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.4, 0.4], "slip": "no"},
+    fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.25, 0.6], "phase": "honey"}],
+    container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.4, 0.6], "slip": "no"},
     solid=[{**shape, **turns, "name": "stirrer"}],
     solver={"kind": "projection", "time_step": TIME_STEP},
 )

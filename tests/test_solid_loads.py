@@ -132,6 +132,13 @@ def test_a_load_is_a_quantity_and_a_sensor_of_the_scene():
     assert not np.any(Simulation(far).quantity("post.load"))
 
 
+def test_after_the_last_step_a_solid_goes_on():
+    """What is read of the last state is what a longer run reads there."""
+    simulation, sensors = Simulation(plane(ROTOR), precision="float64"), {"rotor": SolidLoad("rotor")}
+    short, long = (simulation.run(steps, sensors=sensors).sensors["rotor"].values for steps in (4, 6))
+    np.testing.assert_allclose(short, long[:5], rtol=1e-9)
+
+
 MISTAKES = [
     (lambda: SolidLoad(3), "solid is 3, but must be the name of a solid"),
     (lambda: Simulation(plane(ROTOR)).run(1, sensors={"a": SolidLoad("cup")}), "solid 'cup', but the scene has rotor"),

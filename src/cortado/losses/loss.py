@@ -108,7 +108,8 @@ class StepBar:
     """Derivatives of a loss with respect to the parameters of one step."""
 
     row: int
-    """Which of a run's steps it is."""
+    """Which of a run's steps it is, or how many there are: one after the last (`row_of` of
+    `cortado.runs.quantities.moment`)."""
     parameters: Mapping[str, np.ndarray]
     """By name, with a first axis for the scenes of a batch, and one row of those over time."""
 
