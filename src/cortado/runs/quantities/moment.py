@@ -46,8 +46,8 @@ class Moment:
 
     @classmethod
     def of(cls, rollout: Rollout, step: int, state: State, evaluator: Callable[[], Evaluates]) -> "Moment":
-        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are those of
-        `row_of`."""
+        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are as
+        `row_of` says."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -77,8 +77,9 @@ class Moment:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own. After
-    the last step they are those of it, but paths of solids go on as far as they went in it: else solids would stop."""
+    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own.
+    After the last step they are those of it, but paths of solids go on as far as they went in it: else solids would
+    stop."""
     found: Arrays = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value)
