@@ -37,9 +37,9 @@ def plunged_box(across: int, solver: str) -> dict[str, float]:
 def taylor_couette(across: int) -> dict[str, float]:
     """Torques on two cylinders, the inner of which turns in a very viscous fluid, over that of the closed form: the
     mean over the second half of a run that begins at rest. So many particles are between the cylinders."""
-    r_1, r_2, omega, viscosity = 0.25, 0.5, 1.0, 100.0
+    r_1, r_2, omega, viscosity = 0.25, 0.5, 1.0, 300.0
     spacing = (r_2 - r_1) / across
-    step, duration = 0.04 * spacing / (omega * r_1), 0.4
+    step, duration = 0.02 * spacing / (omega * r_1), 0.12
     middle = {"shape": "sphere", "centre": [0.0, 0.0], "slip": "no"}
     scene = Scene(
         dimension=2,
