@@ -148,10 +148,32 @@ class NozzlePath:
         return np.asarray(emitter.outlet) + SCATTER * self.spread(simulation) * noise
 
 
+@dataclass(frozen=True)
+class PaddlePath:
+    """How a paddle has moved, its velocity constant in equal blocks of time: u (blocks, d) [m/s]."""
+
+    blocks: int
+    parameter: str = "paddle.displacement"
+
+    def fits(self, simulation: Simulation) -> bool:
+        return any(solid.name == "paddle" for solid in simulation.scene.solid)
+
+    def spread(self, simulation: Simulation) -> float:
+        return 0.05
+
+    def bijector(self, simulation: Simulation, steps: int) -> Bijector:
+        block = np.arange(steps) * self.blocks // steps
+        return Linear(simulation.scene.solver.time_step * np.cumsum(np.eye(self.blocks)[block], axis=0))
+
+    def drawn(self, simulation: Simulation, steps: int, random: np.random.Generator) -> np.ndarray:
+        return SCATTER * self.spread(simulation) * random.standard_normal((self.blocks, simulation.dimension))
+
+
 CONTROLS: Mapping[str, Control] = {
     "gravity-4": GravityBlocks(4),
     "gravity-16": GravityBlocks(16),
     "gravity-each-step": GravityEachStep(),
     "velocity-modes": VelocityModes(),
     "nozzle-path": NozzlePath(),
+    "paddle-4": PaddlePath(4),
 }

@@ -59,12 +59,23 @@ def jet() -> dict[str, Any]:
     }
 
 
+def paddled() -> dict[str, Any]:
+    """A pool in the plane of 24 by 12 spacings, in whose middle a paddle is moved, a third of it deep."""
+    spacing = 0.025
+    paddle = {"name": "paddle", "shape": "box", "lower": [0.25, 0.1], "upper": [0.35, 0.5], "motion": "path"}
+    paddle["velocity"] = [0.0, 0.0]
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [24 * spacing, 12 * spacing], "phase": "water"}
+    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [24 * spacing, 40 * spacing]}
+    return dam(spacing, (24, 12), fluid=[pool], container=container, solid=[paddle])
+
+
 SCENES: dict[str, dict[str, Any]] = {
     "plane-144": dam(0.025, (12, 12)),
     "plane-144-wendland-c2": with_kernel("wendland_c2", 2.0),
     "plane-144-wendland-c4": with_kernel("wendland_c4", 2.4),
     "plane-144-two-fluids": two_fluids(0.025, (12, 12)),
     "plane-jet": jet(),
+    "plane-paddle": paddled(),
     "plane-576": dam(0.0125, (24, 24)),
     "plane-2304": dam(0.00625, (48, 48)),
     "plane-9216": dam(0.003125, (96, 96)),
@@ -74,6 +85,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "plane-144-projection": projected(dam(0.025, (12, 12))),
     "plane-144-wendland-c2-2.6": with_kernel("wendland_c2", 2.6),
     "plane-144-projection-cubic-spline": projected(with_kernel("cubic_spline", 2.0)),
+    "plane-paddle-projection": projected(paddled()),
     "plane-576-projection": projected(dam(0.0125, (24, 24))),
     "space-1000-projection": projected(dam(0.05, (10, 10, 10))),
     "space-8000-projection": projected(dam(0.025, (20, 20, 20))),
