@@ -80,11 +80,12 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
     """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own.
     After the last step they are those of it, but paths of solids go on as far as they went in it: else solids would
     stop."""
-    found: Arrays = {}
+    found = {}
     for name, value in values.items():
-        shares = _shares_of_rows(rollout, name, row, value)
-        found[name] = value if shares is None else sum(share * value[:, k : k + 1] for k, share in shares.items())
-    return {name: np.asarray(value) for name, value in found.items()}
+        shares = _shares_of_rows(rollout, name, row, value) or {}
+        rows = [share * value[:, k : k + 1] for k, share in shares.items()]
+        found[name] = np.sum(rows, axis=0) if rows else np.asarray(value)
+    return found
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
