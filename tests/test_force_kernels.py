@@ -150,7 +150,7 @@ class WallSlope(Operation):
         return {"total": found["total_dot"]}
 
     def adjoint(self, values, bars):
-        found = launch(self.kernels.adjoint, **self.given, **values, bar=bars["total"], **zeros("x_bar"))
+        found = launch(self.kernels.adjoint, **self.given, **values, slope_bar=bars["total"], **zeros("x_bar"))
         return {"x": found["x_bar"]}
 
 

@@ -53,14 +53,14 @@ def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
 
 
 def wall_slope_term(discretisation: Discretisation) -> WallTerm:
-    """g as the sum over the walls of a solid, with the adjoint ``bar``."""
-    return WallTerm(discretisation, "wall_slope", _work, "bar")
+    """g as the sum over the walls of a solid, with the adjoint ``slope_bar``."""
+    return WallTerm(discretisation, "wall_slope", _work, "slope_bar")
 
 
 def _work(d: Discretisation) -> Any:
     real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
 
-    def wall_slope_work(x_ij: vector, bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
-        return wp.dot(gradient(x_ij, s), bar_i)
+    def wall_slope_work(x_ij: vector, slope_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
+        return wp.dot(gradient(x_ij, s), slope_bar_i)
 
     return wall_slope_work

@@ -105,7 +105,7 @@ class PcisphAdjoint(ParticleAdjoint):
         solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
         context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
         slopes = wall_slope_term(solver.discretisation).solid_kernel
-        self.bar.solids.add(context.launch, slopes, *self.bar.named, bar=self._slope_bar)
+        self.bar.solids.add(context.launch, slopes, *self.bar.named, slope_bar=self._slope_bar)
 
 
 class FrozenPcisphAdjoint(PcisphAdjoint):

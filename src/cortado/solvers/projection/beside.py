@@ -88,15 +88,15 @@ def beside_solid_kernel(discretisation: Discretisation) -> Any:
 
 
 def push_term(discretisation: Discretisation) -> WallTerm:
-    """gamma / V of the walls of a solid, with the adjoint ``bar``."""
-    return WallTerm(discretisation, "projection", _push_work, "bar")
+    """gamma / V of the walls of a solid, with the adjoint ``push_bar``."""
+    return WallTerm(discretisation, "projection", _push_work, "push_bar")
 
 
 def _push_work(d: Discretisation) -> Any:
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
-    def push_work(x_ij: vector, bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
-        return wp.dot(normal(gradient(x_ij, s), foot), bar_i)
+    def push_work(x_ij: vector, push_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
+        return wp.dot(normal(gradient(x_ij, s), foot), push_bar_i)
 
     return push_work
 
