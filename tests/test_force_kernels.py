@@ -11,15 +11,16 @@ import warp as wp
 import cortado
 import test_kernels
 from cortado.forces import Body, Pair
+from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Layout
-from cortado.runs.quantities.formulas import circulation_kernels
 from cortado.sph.curvature_derivatives import curvature_adjoints, curvature_tangents
 from cortado.sph.curvature_kernels import curvature_kernels, entries
 from cortado.sph.emitter import Nozzle
 from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
-from cortado.sph.wall_slope import wall_slope_kernels
+from cortado.sph.vorticity import circulation_kernels
+from cortado.sph.wall_slope import wall_slope_term
 from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros
 
 VECTORS = np.zeros((N, 3))
@@ -134,22 +135,23 @@ class Circulation(Operation):
 
 
 class WallSlope(Operation):
-    inputs, outputs = ("x",), ("wall_slope",)
+    inputs, outputs = ("x",), ("total",)
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.kernels = wall_slope_kernels(DISCRETISATION)
+        self.kernels = wall_slope_term(DISCRETISATION).kernels
+        self.given = {"s": self.s, "solid": ALL_WALLS, "constants": DISCRETISATION.precision.pair(0.0, 0.0)}
 
     def forward(self, values):
-        return launch(self.kernels.slope, s=self.s, **values, wall_slope=VECTORS)
+        return launch(self.kernels.forward, **self.given, **values, total=VECTORS)
 
     def tangent(self, values, dots):
-        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), wall_slope_dot=VECTORS)
-        return {"wall_slope": found["wall_slope_dot"]}
+        found = launch(self.kernels.tangent, **self.given, **values, **dotted(dots), total_dot=VECTORS)
+        return {"total": found["total_dot"]}
 
     def adjoint(self, values, bars):
-        found = launch(self.kernels.change, s=self.s, **values, along=bars["wall_slope"], wall_slope_change=VECTORS)
-        return {"x": found["wall_slope_change"]}
+        found = launch(self.kernels.adjoint, **self.given, **values, slope_bar=bars["total"], **zeros("x_bar"))
+        return {"x": found["x_bar"]}
 
 
 def swirl(x, v, t, rate, centre):

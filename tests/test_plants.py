@@ -38,7 +38,7 @@ UNNAMED = {
     "particles.solid_shares": {"solid_kernel.share"},
     "sph.rotations": {"rotations.back", "rotations.back_about_z"},
     "sph.density": {"_density_work.density_work"},
-    "sph.viscosity": {"viscosity_solid_kernel.made.viscosity_work"},
+    "sph.viscosity": {"viscosity_term.made.viscosity_work"},
     "sph.wall_slope": {"_work.wall_slope_work"},
     "sph.packed": {"packing_kernels.add_number"},
     "sph.stress_functions": {"stress_functions.back"},
@@ -80,6 +80,8 @@ ELSEWHERE = {
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
     "solvers.projection.pressed": "of a quantity too: tests/test_quantities.py",
+    "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
+    "sph.stress_wall_kernels": "of loads too",
     "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""

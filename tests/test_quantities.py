@@ -156,7 +156,7 @@ def test_values_are_those_of_sums_over_all_pairs(make):
     np.testing.assert_allclose(simulation.quantity("speed", state), np.linalg.norm(v, axis=1), rtol=1e-14)
 
     pressure = simulation.quantity("pressure", state)
-    push = volume**2 * (pressure / n**2)[:, None] * np.einsum("b,nbd->nd", weights, wall_slope)
+    push = simulation.lattice.cell * volume * (pressure / n**2)[:, None] * np.einsum("b,nbd->nd", weights, wall_slope)
     np.testing.assert_allclose(simulation.quantity("wall_force", state), push, atol=1e-12 * np.abs(push).max())
 
     in_space = ((0, 0), (0, 0), (0, 3 - v.shape[1]))

@@ -129,7 +129,7 @@ def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
     simulation = still_water(forces=FRICTIONLESS)
     gravity, dt = np.array([1.0, -9.81]), simulation.scene.solver.time_step
     trajectory = simulation.run(30, sensors={"walls": WallForce()})
-    masses = trajectory.constants["reference_density"] * simulation.lattice.volume
+    masses = trajectory.constants["reference_density"] * simulation.lattice.cell
     momentum = np.einsum("n,fnd->fd", masses, trajectory.velocities)
     force = trajectory.sensors["walls"].values[:-1, :2]
     lack = masses.sum() * gravity - np.diff(momentum, axis=0) / dt
@@ -145,7 +145,7 @@ def test_the_torque_on_walls_is_what_the_fluid_lacks_of_its_angular_momentum(in_
     d, dt, about = simulation.dimension, simulation.scene.solver.time_step, np.array([0.1, 0.05, -0.2])
     about = about[:d]
     trajectory = simulation.run(30, sensors={"walls": WallForce(about=about)})
-    masses = trajectory.constants["reference_density"] * simulation.lattice.volume
+    masses = trajectory.constants["reference_density"] * simulation.lattice.cell
     arms = np.zeros((30, simulation.particles, 3))
     pushes = np.zeros_like(arms)
     arms[..., :d] = trajectory.positions[:-1] - about

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from loads import LOADS
+
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
 from floating_bodies import added_mass, floating_box
@@ -87,6 +89,7 @@ CASES = {
     "added-mass, a sphere 8 across, 20 deep, 4 iterations, 10 steps": lambda: added_mass(8, 20, 100, 4, steps=10),
     "added-mass, a sphere 8 across, 20 deep, 16 iterations": lambda: added_mass(8, 20, 100, 16),
     "added-mass, a sphere 8 across, 20 deep, 32 iterations": lambda: added_mass(8, 20, 200, 32),
+    **LOADS,
 }
 
 

@@ -353,6 +353,12 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "### The force on walls",
                 '[[sensor]]\nkind = "wall_force"\nname = "left wall"\nupper = [0.5, 1.0, 0.5]',
             ),
+            (
+                "SolidLoadTable",
+                "### The load on a solid",
+                '[[solid]]\nname = "post"\nshape = "box"\nlower = [0.9, 0.0, 0.2]\nupper = [1.0, 0.6, 0.3]\n\n'
+                '[[sensor]]\nkind = "solid_load"\nname = "load"\nsolid = "post"',
+            ),
         ),
     ),
     (

@@ -16,6 +16,7 @@ from cortado.particles.state import Parameters, State
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import Residual, without_lost
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
+from cortado.runs.quantities.moment import add_to_row
 from cortado.scene.parameters.values import Arrays
 
 
@@ -90,10 +91,9 @@ class ProblemForwardPass:
 
     def _add(self, own: StepBar, total: Parameters) -> None:
         """Add adjoints of the parameters of one step to those of all steps."""
-        over_time = self.rollout.solver.layout.known.over_time
         for name, bar in own.parameters.items():
             whole = total[name].numpy()
-            (whole[:, own.row : own.row + 1] if name in over_time else whole)[...] += bar
+            add_to_row(self.rollout, name, bar, own.row, whole)
             total[name].assign(whole)
 
     def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:

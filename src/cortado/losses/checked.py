@@ -13,7 +13,7 @@ from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBa
 from cortado.losses.batch import BatchedLoss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.particles.state import State
-from cortado.scene.quantities import check_quantity
+from cortado.scene.quantities import check_readable
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
 """What the arrays of an adjoint are derivatives with respect to, in words."""
@@ -111,7 +111,7 @@ def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
 def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
     """Adjoints by the names of fields of a state and of quantities."""
     for name in bar:
-        check_quantity(name, "a name in the loss's adjoint", end.state.names)
+        check_readable(name, "a name in the loss's adjoint", end.state.names)
     return {name: _checked_array(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
 
 

@@ -15,7 +15,7 @@ from cortado.fixed import FixedDict, fixed
 from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.quantities import check_quantity
+from cortado.scene.quantities import check_readable
 from cortado.words import counted
 
 
@@ -63,12 +63,13 @@ class Snapshot:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """A field of the state by its name, such as "velocities", or a quantity of its particles, such as "density" or
-        "pressure" (see `docs/sensors.md`); float64, read-only. Raises `InputError` for any other name."""
+        "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`); float64, read-only. Raises
+        `InputError` for any other name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
         if isinstance(name, str) and name in self.state.names:
             return _read_only(self.state.numpy(self.dimension, only=[name])[name])
-        check_quantity(name, "a field of a state", self.state.names)
+        check_readable(name, "a field of a state", self.state.names)
         return self._quantity(name)
 
     @property
@@ -107,7 +108,8 @@ class StepBar:
     """Derivatives of a loss with respect to the parameters of one step."""
 
     row: int
-    """Which of a run's steps it is."""
+    """Which of a run's steps it is, or how many there are: one after the last (`row_of` of
+    `cortado.runs.quantities.moment`)."""
     parameters: Mapping[str, np.ndarray]
     """By name, with a first axis for the scenes of a batch, and one row of those over time."""
 

@@ -1,5 +1,5 @@
-"""The wall particles of solids that move: where they are at the end of a step, sorted by cell, and how fast they get
-there."""
+"""The wall particles of solids that move: where they are at the end of a step, sorted by cell, and how fast the point
+of the surface above each gets there. Of a solid that turns that is not as fast as the particle."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -103,9 +103,11 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         member = j // count
         b = j - member * count
         k = solid[b]
-        moved = x[j] - before[member, k] - turns_before[member, k] * of.own[b]
+        foot = turns[member, k] * of.own_feet[b]
+        surface_before = before[member, k] + turns_before[member, k] * (of.own[b] + of.own_feet[b])
+        moved = x[j] + foot - surface_before
         walls.wall_positions[first + p] = x[j]
-        walls.wall_feet[first + p] = turns[member, k] * of.own_feet[b]
+        walls.wall_feet[first + p] = foot
         walls.wall_velocities[first + p] = moved / time_step[member] + turns[member, k] * of.own_slides[b]
         walls.wall_weights[first + p] = of.own_weights[b]
         walls.wall_grips[first + p] = of.own_grips[b]
@@ -146,10 +148,12 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         k = solid[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
         x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
-        arm_before = turns_before[member, k] * of.own[b]
-        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], arm_before)
+        surface_dot = x_dot + wp.cross(turned, turns[member, k] * of.own_feet[b])
+        arm_before = turns_before[member, k] * (of.own[b] + of.own_feet[b])
+        surface_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], arm_before)
         dt = length.time_step[member]
-        moved_dot = x_dot - x_before_dot - length.time_step_dot[member] * (wall_velocities[first + p] - slide)
+        moved_dot = surface_dot - surface_before_dot
+        moved_dot -= length.time_step_dot[member] * (wall_velocities[first + p] - slide)
         walls.wall_positions_dot[first + p] = x_dot
         walls.wall_velocities_dot[first + p] = moved_dot / dt + wp.cross(turned, slide)
         walls.wall_turns_dot[first + p] = turned

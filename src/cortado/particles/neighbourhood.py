@@ -85,11 +85,13 @@ def neighbourhood_type(precision: Precision) -> Any:
         wall_grips: wp.array(dtype=real)
         """w_b of walls without slip, 0 of those that slip freely [-]."""
         wall_velocities: wp.array(dtype=vector)
-        """How fast a wall particle moves [m/s]; read where the `Discretisation` is moving."""
+        """How fast the point of the surface above a wall particle moves [m/s]; read where the `Discretisation` is
+        moving."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
-        """The number of the solid that moves whose a wall particle is, -1 of those at rest; where walls move."""
+        """The number of the solid whose a wall particle is: of those that move from 0 on, of those at rest from -2 on
+        downwards; -1 of the container's."""
         wall_positions_dot: wp.array(dtype=vector)
         """Tangents of their positions, which like the next two are there where walls move."""
         wall_velocities_dot: wp.array(dtype=vector)

@@ -126,16 +126,14 @@ class NeighbourSearch:
         still, moving = walls.some(walls.solid < 0), walls.some(walls.solid >= 0)
         count = len(still) + layout.members * len(moving)
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
-        kinds |= {"weights": precision.real, "grips": precision.real}
-        own = {"solids": wp.int32, **dict.fromkeys(("positions_dot", "velocities_dot", "turns_dot"), precision.vector)}
+        kinds |= {"weights": precision.real, "grips": precision.real, "solids": wp.int32}
+        own = dict.fromkeys(("positions_dot", "velocities_dot", "turns_dot"), precision.vector)
         sizes = {**dict.fromkeys(kinds, count), **dict.fromkeys(own, count if solids else 0)}
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
-        """What kernels know of wall particles, those at rest first; of solids that move nothing without any."""
+        """What kernels know of wall particles, those at rest first; no tangents where no solid moves."""
         self._write_walls(still)
-        if solids and len(still):
-            self.walls["wall_solids"][: len(still)].fill_(-1)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
         self.moving = MovingWalls(moving, len(still), solids, grid, layout) if solids else None
@@ -162,8 +160,9 @@ class NeighbourSearch:
 
     def _write_walls(self, walls: WallArrays) -> None:
         """Those at rest, in this order."""
-        for name in ("positions", "weights", "grips", "feet"):
-            array, values = self.walls[f"wall_{name}"], getattr(walls, name)
+        known = {name: getattr(walls, name) for name in ("positions", "weights", "grips", "feet")}
+        for name, values in {**known, "solids": walls.solid}.items():
+            array = self.walls[f"wall_{name}"]
             if len(values):
                 wp.copy(array, wp.array(values, dtype=array.dtype, device=self.device), count=len(values))
 

@@ -5,13 +5,13 @@ with W = T . S_i^, to wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
 
-made by Warp from W. The particle is at x_b = c + R r_b with the velocity (x_b - x_b^0) / dt + R u, from x_b^0 = c_0 +
-R_0 r_b at the start of the step, and R has turned its foot, too. So a solid that moves by c' and turns further by w',
-and whose pose at the start of the step changed by c_0' and w_0', has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0'
-with
+made by Warp from W. The particle is at x_b = c + R r_b. Its velocity is that of the point of the surface above it,
+s_b = c + R q_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the start of the step, and R has turned
+its foot R (q_b - r_b), too. So a solid that moves by c' and turns further by w', and whose pose at the start of the
+step changed by c_0' and w_0', has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' with
 
-    f = sum x_b^ + v_b^ / dt,        t = sum R r_b x (x_b^ + v_b^ / dt) + foot_b x foot_b^ + R u x v_b^,
-    f_0 = -sum v_b^ / dt,            t_0 = -sum R_0 r_b x v_b^ / dt.
+    f = sum x_b^ + v_b^ / dt,    t = sum R r_b x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
+    f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt.
 """
 
 from collections.abc import Callable
@@ -29,6 +29,8 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.state import Layout
 from cortado.particles.terms import Term
 
+ALL_WALLS = -(2**31)
+"""In the place of the number of a solid: those of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before")
 """f, t, f_0 and t_0."""
 SUM = """\
@@ -59,8 +61,9 @@ def {name}(
             _force += _x_bar
             _torque += _wp.cross(_arm, _x_bar){by_foot}
             _pulled += _v_bar
-            _twisted += _wp.cross(_arm, _v_bar)
-            _twisted_before += _wp.cross(back * _arm, _v_bar)
+            _surface = _arm + _foot
+            _twisted += _wp.cross(_surface, _v_bar)
+            _twisted_before += _wp.cross(back * _surface, _v_bar)
             _rate += _wp.dot(_v_bar, _v_b - slide)
     return _force, _torque, _pulled, _twisted, _twisted_before, _rate
 """
@@ -87,16 +90,19 @@ class SolidShares:
         kernel: Callable[[], Any],
         *groups: Named,
         constants: tuple[float, float] = (0.0, 0.0),
+        over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move."""
+        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move; of a
+        sum ``over`` the walls of one solid, to that alone."""
         if self._walls is None:
             return
         before, after = self._walls.before, self._walls.after
         poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
-            launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
+            if over in (ALL_WALLS, solid):
+                launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
         """(n,) vectors that the particles have given to one solid so far, as kernels call them."""

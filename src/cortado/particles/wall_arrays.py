@@ -20,7 +20,8 @@ class WallArrays:
     slides: np.ndarray
     """(b, 3) how fast their surface slides along the solid [m/s]"""
     solid: np.ndarray
-    """(b,) the number of the solid that moves whose each is; -1 of those at rest"""
+    """(b,) the number of the solid whose each is: of those that move from 0 on, of those at rest from -2 on
+    downwards; -1 of the container's"""
 
     def some(self, which: np.ndarray) -> "WallArrays":
         """Those that are chosen."""

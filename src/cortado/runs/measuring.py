@@ -16,7 +16,7 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import OVER_TIME
-from cortado.scene.quantities import check_quantity
+from cortado.scene.quantities import check_readable
 from cortado.scene.restart import RestartState
 
 FIRST = names(Role.STATE)
@@ -63,7 +63,8 @@ class Measuring:
         controls: Mapping[str, Any] | None = None,
     ) -> NDArray:
         """A quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 / s],
-        "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own keeps.
+        "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own keeps, or
+        the load on a solid, such as "rotor.load".
 
         Args:
             name: of the quantity.
@@ -73,12 +74,13 @@ class Measuring:
                 trajectory they are those of its run.
 
         Returns:
-            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order, of a field its shape.
+            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order, of a field its shape, of a
+            load (k,).
 
         Raises:
             InputError: another name, or a state that is none of this simulation's.
         """
-        check_quantity(name, others=cast(Measured, self).initial.names)
+        check_readable(name, "quantity", cast(Measured, self).initial.names)
         if not isinstance(of, Trajectory):
             return self._quantity(name, of, controls)
         frames = [self._quantity(name, of[: k + 1].last_state, _at(controls, of, k)) for k in range(len(of))]

@@ -35,7 +35,6 @@ def recorded(
             substeps=rollout.substeps,
             origin=rollout.origins[number],
             quantities={name: array[kept][at] for name, array in quantities.items()},
-            scene=scene,
         )
 
     batch = rollout.solver.layout.batch

@@ -74,8 +74,6 @@ class Trajectory(Showing):
     """what sensors have read in every step, by their names; it is not in files"""
     solids: Mapping[str, SolidMotion] = field(default_factory=dict)
     """where solids that move are, by their names"""
-    scene: Scene | None = None
-    """what it is a run of; None of a file"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
     scene: Scene | None = field(default=None, repr=False)

@@ -19,6 +19,7 @@ from cortado.scene.outlines import MeshShape
 from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.room import room_of
+from cortado.scene.sensors import SolidLoadTable
 from cortado.scene.sentences import point_in_words
 from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
@@ -48,6 +49,7 @@ def check_scene(scene: SceneTables) -> None:
     for index, solid in enumerate(scene.solid):
         check_solid(("solid", index), solid, spacing)
     check_free(scene)
+    _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
         if isinstance(fluid, PointsFluid):
@@ -89,6 +91,14 @@ def _check_phases(scene: SceneTables) -> None:
         raise field_error(("forces", "viscosity"), found, '"stress", as the phase has a rheology')
     if len(names) == 1 and scene.mixture != MixtureTable():
         raise field_error(("mixture",), Words("given"), "left out, as the scene has only one phase")
+
+
+def _check_sensors(scene: SceneTables) -> None:
+    names = [solid.name for solid in scene.solid]
+    for index, sensor in enumerate(scene.sensor):
+        if isinstance(sensor, SolidLoadTable) and sensor.solid not in names:
+            wanted = f"the name of a solid, of {shown(names)}" if names else "of a scene with solids"
+            raise field_error(("sensor", index, "solid"), sensor.solid, wanted)
 
 
 def _check_files(scene: SceneTables) -> None:

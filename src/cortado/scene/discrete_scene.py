@@ -41,7 +41,9 @@ class Lattice:
     self_weight: float
     """W(0) [1 / m^d]."""
     volume: float
-    """Rest volume V_0 of a particle [m^d]."""
+    """Rest volume V_0 of a particle [m^d], with which the sums of the lattice give the rest density."""
+    cell: float
+    """Volume of a cell of the lattice [m^d]: the mass of a particle is the rest density times it."""
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
@@ -57,6 +59,7 @@ class Lattice:
             normalisation=kernel.normalisation(dimension, support),
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=rest_volume(kernel, spacing, support, dimension),
+            cell=spacing**dimension,
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
             response=wall_response(kernel, spacing, support, dimension),
             laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),

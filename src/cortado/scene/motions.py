@@ -76,6 +76,14 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
     return [solid for solid in solids if solid.moves]
 
 
+def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
+    """What their wall particles are numbered with, by their names: those that move from 0 on, and those at rest from
+    -2 on downwards, as -1 is the container."""
+    resting = [solid for solid in solids if not solid.moves]
+    numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
+    return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
+
+
 def told(solids: Sequence[SolidTable]) -> list[SolidTable]:
     """Those that move as they are told."""
     return [solid for solid in moving(solids) if solid.motion != "free"]

@@ -41,7 +41,7 @@ QUANTITIES = {
         Quantity("pressure", "Pa", "What the solver finds in the step that begins at the state."),
         Quantity("speed", "m/s", "The length of the velocity."),
         Quantity("vorticity", "1/s", "The curl of the velocity, from the fluid around a particle.", Kind.TURNING),
-        Quantity("wall_force", "N", "What a particle's pressure pushes the walls with; in the plane N/m.", Kind.VECTOR),
+        Quantity("wall_force", "N", "What a particle pushes the walls with; in the plane N/m.", Kind.VECTOR),
     )
 }
 """Every quantity by its name."""
@@ -54,6 +54,25 @@ def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
+
+
+LOAD = ".load"
+"""What names of the loads on solids end with."""
+
+
+def load_name(solid: str) -> str:
+    """Of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the other."""
+    return f"{solid}{LOAD}"
+
+
+def is_load(name: object) -> bool:
+    """Whether it is the name of a load; whether there is such a solid, those say who compute it."""
+    return isinstance(name, str) and name.endswith(LOAD)
+
+
+def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
+    """As `check_quantity`, with the ``fields`` of a state and the loads on solids as further names."""
+    return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:

@@ -60,7 +60,7 @@ class FlowRateTable(SensorTable):
 
 
 class WallForceTable(SensorTable):
-    """The force, and its torque, with which the pressure of the fluid in a region pushes the walls."""
+    """The force, and its torque, with which the fluid in a region pushes the walls."""
 
     kind: Literal["wall_force"]
     """Which sensor it is."""
@@ -72,4 +72,15 @@ class WallForceTable(SensorTable):
     """(d,) the point of the torque [m]; the origin if left out."""
 
 
-AnySensor = Annotated[PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable, Field(discriminator="kind")]
+class SolidLoadTable(SensorTable):
+    """The force of the fluid on a solid, and its torque about the solid's position."""
+
+    kind: Literal["solid_load"]
+    """Which sensor it is."""
+    solid: Text
+    """The name of the solid."""
+
+
+AnySensor = Annotated[
+    PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable, Field(discriminator="kind")
+]

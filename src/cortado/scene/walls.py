@@ -16,7 +16,7 @@ from cortado.discretise.walls.places import Places
 from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
 from cortado.errors import InputError
 from cortado.scene.containers import Container
-from cortado.scene.motions import moving
+from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.room import resting_room
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
@@ -42,11 +42,11 @@ class Walls:
     slides: Points
     """(b, d) how fast their surface slides along the solid, in its own frame [m/s]"""
     solid: NDArray[np.int64]
-    """(b,) whose they are: the number of a solid among those that move; -1 of those at rest."""
+    """(b,) whose they are: `wall_numbers` of solids; -1 of those of the container."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_]) -> "Walls":
-        """Those at rest, with the weights that were found."""
+        """Those of the container, with the weights that were found."""
         return cls(points.positions, weights, points.feet, sticks, 0.0 * points.feet, np.full(len(points), -1))
 
     @classmethod
@@ -90,7 +90,10 @@ def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
             raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
     beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     points, weights = _weighed(surface, beside, room.solids, layers, lattice)
-    return Walls.of(points, weights, np.array([table.sticks for table in tables])[surface.owners(points)])
+    owners, numbers = surface.owners(points), wall_numbers(scene.solid)
+    found = Walls.of(points, weights, np.array([table.sticks for table in tables])[owners])
+    of_tables = [-1 if isinstance(table, Container) else numbers[table.name] for table in tables]
+    return replace(found, solid=np.array(of_tables)[owners])
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:

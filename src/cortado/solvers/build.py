@@ -19,7 +19,7 @@ from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
 from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene
-from cortado.scene.motions import moving, solid_frames
+from cortado.scene.motions import moving, solid_frames, wall_numbers
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
@@ -27,7 +27,7 @@ from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.obstacles import FINE, Obstacle
-from cortado.solvers.particles import ParticleSystem
+from cortado.solvers.particles import NamedSolid, ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
@@ -70,6 +70,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
+            _named_solids(scene),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
 
@@ -221,6 +222,12 @@ def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     moved = [_obstacle(table, table.own_solid()) for table in moving(scene.solid)]
     solids = (tuple(still), tuple(moved)) if scene.forces.pressure else ((), ())
     return Walled(region, discrete.near, scene.discretisation.spacing, *solids, discrete.periods)
+
+
+def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
+    """All of its solids."""
+    numbers = wall_numbers(scene.solid)
+    return {table.name: NamedSolid(numbers[table.name], padded(table.middle()[None])[0]) for table in scene.solid}
 
 
 def _obstacle(table: SolidTable, solid: Solid) -> Obstacle:

@@ -10,6 +10,7 @@ from cortado.particles.arrays import Fields
 from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
+from cortado.solvers.solver import WithinBar
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried
 from cortado.sph.density import density_solid_kernel
@@ -121,17 +122,18 @@ class ParticleAdjoint:
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
         context.launch(begin_adjoint_kernel(self._solver.layout.precision), *self.bar.named, v_star=v_star, **scene)
 
-    def predict(self, context: StepContext) -> None:
-        """Of a prediction v* = v + dt a, and of `accelerate`."""
+    def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
+        """Of a prediction v* = v + dt a, of which the adjoint is what that of velocities is by then, and of
+        `accelerate`; with adjoints ``within`` the step."""
+        fields = self.bar.fields
+        if within is not None:
+            add(within.v_star, fields["v"])
         own = {"acceleration_bar": self._acceleration_bar}
         context.launch(self._solver.integration.acceleration_adjoint, *self.bar.named, **own)
         self.accelerate(context, self._acceleration_bar)
-
-    def add(self, fields_bar: Fields) -> None:
-        """Adjoints of the sorted fields at the start of the step: after `predict`, which takes what the adjoint of
-        velocities is by then for that of v*."""
-        for own, total in zip(fields_bar.arrays(), self.bar.fields.arrays(), strict=True):
-            add(own, total)
+        if within is not None:
+            for given, total in zip(within.fields.arrays(), fields.arrays(), strict=True):
+                add(given, total)
 
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
         """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""

@@ -4,7 +4,7 @@ A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solv
 for its tangent and its adjoint.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn, Self
 
@@ -32,6 +32,18 @@ from cortado.sph.density import density_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, StepContext
+from cortado.sph.wall_slope import wall_slope_term
+from cortado.sph.wall_sums import WallAction, WallSums
+
+
+@dataclass(frozen=True)
+class NamedSolid:
+    """A solid of a scene."""
+
+    number: int
+    """Of its wall particles (`cortado.scene.motions.wall_numbers`)."""
+    middle: NDArray
+    """(3,) where its middle is at the start [m]"""
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,8 @@ class ParticleSystem:
     waiting: int
     """Number of the first particle of a scene that may wait in a nozzle."""
     walled: Walled
+    solids: Mapping[str, NamedSolid]
+    """By their names."""
     of_one_lane: Callable[[], "ParticleSystem"]
     """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
 
@@ -111,6 +125,10 @@ class ParticleSolver:
         self.generation = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
         self.resize(search.capacity)
+
+    def wall_push(self) -> WallAction:
+        """What a particle's pressure pushes walls along: with V^2 p_i / n_i^2, or what `density_power` says."""
+        return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def vectors(self) -> wp.array:
         """(n,) vectors for a step or its derivative to work in, all 0."""

@@ -5,6 +5,7 @@ Rollouts, gradients and the certificate know a solver by this protocol, and so d
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import warp as wp
@@ -83,14 +84,25 @@ class PressureTangent(StepTangent, Protocol):
         so often."""
 
 
+@dataclass(frozen=True)
+class WithinBar:
+    """Adjoints of what a step computes, of sorted particles."""
+
+    fields: Fields
+    """Of the fields at its start."""
+    p: wp.array
+    """(n,) of the pressures."""
+    v_star: wp.array
+    """(n,) of the velocities v* = v + dt a that the explicit forces lead to; what they depend on dt is counted
+    elsewhere."""
+
+
 class PressureAdjoint(StepAdjoint, Protocol):
     """The same in reverse mode."""
 
-    def from_within(
-        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
-    ) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints of its sorted fields and of its
-        pressures, (n,), with none of its result."""
+    def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
+        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints ``within`` the step, with none
+        of its result."""
 
 
 class Solver(Protocol):

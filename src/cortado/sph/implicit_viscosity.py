@@ -76,6 +76,8 @@ class ImplicitViscousStress(ViscousStress):
         self._no_bars = {"M_bar": no_matrix, "R_bar": wp.zeros(dtype=layout.precision.real, **sizes)}
         self._after: Any = None
         """a' of the last step."""
+        self._after_dot: Any = None
+        """Its tangent, after forward mode of the step."""
 
     @property
     def iterations(self) -> NDArray:
@@ -104,15 +106,36 @@ class ImplicitViscousStress(ViscousStress):
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         self._at_the_end(step)
-        u_dot, change = self._y, {f"{name}_dot": self._change[name] for name in ("T", "eta")}
-        along = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
+        u_dot, along = self._y, {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
         step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
-        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
-        both = {"u": self._u, "u_dot": u_dot, "A_u": self._A_u}
-        step.launch(self._implicit.stress_tangent, *dot.named, self._constants, self._of, both, **theta, **change)
+        change = self._stress_along(step, dot, u_dot)
         now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
         step.launch(self._force.tangent, now, change, *self._known(*dot.named))
         self.solve(step, self._known(), self._r, after)
+        self._after_dot = after
+
+    def _stress_along(self, step: StepContext, dot: Tangents, u_dot: wp.array) -> dict[str, wp.array]:
+        """Write the tangents of T and mu for one of u."""
+        change = {f"{name}_dot": self._change[name] for name in ("T", "eta")}
+        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
+        both = {"u": self._u, "u_dot": u_dot, "A_u": self._A_u}
+        step.launch(self._implicit.stress_tangent, *dot.named, self._constants, self._of, both, **theta, **change)
+        return change
+
+    def resisted(self, step: StepContext) -> dict[str, wp.array]:
+        self._at_the_end(step)
+        return {"T": self._T_u, "eta": self._of["eta"], "A_u": self._A_u, "v": self._u}
+
+    def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
+        self._at_the_end(step)
+        by_time, u_dot = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}, self._y
+        step.launch(self._implicit.predict, by_time, acceleration=self._after, u=self._r)
+        step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
+        return {**self._stress_along(step, dot, u_dot), "v_dot": u_dot}
+
+    def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
+        own = {"v_bar": v_star_bar, "u_bar": v_bar, "acceleration": self._after}
+        step.launch(self._implicit.end_adjoint, own, *bar.named)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
         """Returns the adjoint of the acceleration by all other forces."""

@@ -149,4 +149,6 @@ class Force(Protocol):
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
         """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for. A force whose own acceleration
         depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes after all others.
-        One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.solve_record`."""
+        One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.solve_record`. One
+        with which walls act on fluid has what they do, a `cortado.sph.wall_sums.WallAction`, as ``wall_action``, or
+        loads on solids lack it."""

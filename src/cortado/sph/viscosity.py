@@ -11,7 +11,7 @@ mean keeps the shear stress continuous between fluids); friction is 0 for a wall
 angular momentum too, but carries no shear to a wall, which the laminar form does.
 """
 
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -23,11 +23,13 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import rubbing_sum
-from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.solid_shares import ALL_WALLS
+from cortado.particles.wall_terms import WallTerm
 from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.viscous_stress import ViscousStress
+from cortado.sph.wall_sums import WallSums
 
 
 @cache
@@ -254,9 +256,8 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
 
 
 @cache
-def viscosity_solid_kernel(discretisation: Discretisation, form: PairForm) -> Any:
-    """The kernel of what the force gives to solids that move, for the adjoint ``acceleration_bar``, with kappa times
-    the friction as the first of the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+def viscosity_term(discretisation: Discretisation, form: PairForm) -> WallTerm:
+    """The acceleration by the walls of a solid, with kappa times the friction as the first of the ``constants``."""
 
     def made(d: Discretisation) -> Any:
         real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, form(d).force
@@ -276,7 +277,7 @@ def viscosity_solid_kernel(discretisation: Discretisation, form: PairForm) -> An
 
         return viscosity_work
 
-    return solid_kernel(discretisation, form.__name__, made, rubs=True)
+    return WallTerm(discretisation, form.__name__, made, "acceleration_bar", rubs=True)
 
 
 class Viscosity:
@@ -285,11 +286,13 @@ class Viscosity:
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
-    def __init__(self, discretisation: Discretisation, form: PairForm, kappa: float, friction: float):
+    def __init__(self, setting: Setting, form: PairForm, kappa: float, friction: float):
         """``friction`` 0 lets walls slip freely."""
+        discretisation = setting.discretisation
         self._kernels, self.friction = viscosity_kernels(discretisation, form, friction > 0.0), friction
-        self._of_solids = partial(viscosity_solid_kernel, discretisation, form)
         self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
+        term, constants = viscosity_term(discretisation, form), (kappa * friction, 0.0)
+        self.wall_action = WallSums(term, setting.layout, constants) if friction > 0.0 else None
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, **self._constants, acceleration_in=before, acceleration=after)
@@ -300,9 +303,8 @@ class Viscosity:
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
-        if self.friction > 0.0:
-            factors, given = (self._constants["kappa"] * self.friction, 0.0), {"acceleration_bar": acceleration_bar}
-            bar.solids.add(step.launch, self._of_solids, given, *bar.named, constants=factors)
+        if self.wall_action is not None:
+            self.wall_action.give(step, bar, ALL_WALLS, acceleration_bar)
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
@@ -313,7 +315,7 @@ def force(setting: Setting) -> Viscosity | ViscousStress | None:
     if scene.forces.viscosity == "stress":
         return stress_of(scene)(setting)
     if scene.forces.viscosity == "pairwise":
-        return Viscosity(setting.discretisation, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
+        return Viscosity(setting, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
     if scene.forces.viscosity == "laminar":
-        return Viscosity(setting.discretisation, laminar, 2.0, friction=walls.friction if sticks else 0.0)
+        return Viscosity(setting, laminar, 2.0, friction=walls.friction if sticks else 0.0)
     return None

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.binding import Named
+from cortado.device.launching import add
 from cortado.discretise.calibration import stress_control
 from cortado.scene.parameters.parameter import Parameter
 from cortado.sph.formula import compiled
@@ -13,6 +14,7 @@ from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_kernels import stress_kernels, stress_solid_kernels
+from cortado.sph.stress_walls import StressWalls
 from cortado.sph.viscosity_law import Law, newtonian_law
 
 CLOSEST = 0.25
@@ -42,6 +44,8 @@ class ViscousStress:
         self._of = {name: wp.zeros(dtype=kind, **sizes, requires_grad=taped) for name, kind in kinds.items()}
         self._change = {name: wp.zeros(dtype=kind, **sizes) for name, kind in kinds.items()}
         """Tangents of T and eta, or adjoints of M, A and R."""
+        own = setting, self._made_for, self._constants, self._of, self._packed, self
+        self.wall_action = StressWalls(*own) if scene.sticks else None
 
     def compile(self, what: str) -> None:
         """Compile the law in it; raises `InputError` where Warp cannot."""
@@ -57,6 +61,16 @@ class ViscousStress:
         change = {f"{name}_dot": self._change[name] for name in ("T", "eta")}
         step.launch(self._stress.tangent, *known, **theta, **change)
         step.launch(self._force.tangent, *known, change, acceleration_in_dot=before, acceleration_dot=after)
+
+    def resisted(self, step: StepContext) -> dict[str, wp.array]:
+        """As that of `cortado.sph.stress_walls.Resisting`, and the next two."""
+        return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
+
+    def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
+        return {**{f"{name}_dot": self._change[name] for name in ("T", "eta")}, "v_dot": dot.fields["v"]}
+
+    def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
+        add(v_bar, bar.fields["v"])
 
     def give(self, step: StepContext, bar: Adjoints, *bars: Named, by_force: bool = True) -> None:
         """What solids that move are given, by the adjoints M_bar, A_bar and R_bar of the sums, and by that of the

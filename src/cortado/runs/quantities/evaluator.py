@@ -1,8 +1,9 @@
 """Quantities of a state of a solver's particles, with the derivatives of each."""
 
 from collections.abc import Iterable, Mapping
-from functools import cached_property, partial
-from typing import cast
+from dataclasses import replace
+from functools import cached_property
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,29 @@ from cortado.errors import InputError
 from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import Rollout
-from cortado.runs.quantities.formulas import Particles, Sums, formulas
+from cortado.runs.quantities.formulas import formulas
 from cortado.runs.quantities.moment import Moment
+from cortado.runs.quantities.particles import OnDevice, Particles, Sums
 from cortado.scene.parameters.values import Arrays
-from cortado.scene.quantities import check_quantity
+from cortado.scene.quantities import LOAD, check_quantity, is_load
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver
-from cortado.sph.parts import StepContext
-from cortado.sph.wall_slope import wall_slope_solid_kernel
+from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
+from cortado.sph.parts import Adjoints, StepContext
 
 OF_PRESSURE = {"pressure", "wall_force"}
-"""Quantities that need the step after the state to be solved; others need its neighbours alone."""
+"""Quantities of particles that need the step after the state to be solved; others need its neighbours alone."""
+
+
+class StepWithin(PressureAdjoint, Protocol):
+    """That of a solver of particles."""
+
+    bar: Adjoints
+
+
+def _need_the_step(names: Iterable[str]) -> bool:
+    """Whether quantities need the step after the state to be solved, and not its neighbours alone."""
+    return any(name in OF_PRESSURE or is_load(name) for name in names)
 
 
 class QuantityEvaluator:
@@ -52,9 +64,9 @@ class QuantityEvaluator:
     @in_turn
     def values(self, names: Iterable[str], moment: Moment) -> Arrays:
         """Quantities by name, float64."""
-        wanted = [check_quantity(name) for name in names]
+        wanted = self._checked(names)
         at, sums = self._begin(wanted, moment, replay=False)
-        return {name: self._in_scene_order(self._formulas[name].value(at, sums)) for name in wanted}
+        return {name: self._shown(name, self._formulas[name].value(at, sums)) for name in wanted}
 
     @in_turn
     def tangents(
@@ -62,34 +74,55 @@ class QuantityEvaluator:
     ) -> Arrays:
         """Their tangents along that of the state, by fields, and of the parameters of the step, as `Moment` has
         them."""
-        wanted, solver = [check_quantity(name) for name in names], self._solver
+        wanted, solver = self._checked(names), self._solver
         at, sums = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
         state_dot.set(dot)
         along.set(parameters_dot)
         tangent, pressure_dot = self._tangent(wanted, state_dot, along)
         own = Particles.of(tangent.dot.fields, pressure_dot)
-        each = {name: self._formulas[name].tangent(at, sums, own, tangent.dot.named) for name in wanted}
-        return {name: self._in_scene_order(value) for name, value in each.items()}
+        each = {name: self._formulas[name].tangent(at, sums, own, tangent.dot) for name in wanted}
+        return {name: self._shown(name, value) for name, value in each.items()}
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
         """From adjoints of quantities, by name, to those of the state, by fields, and of the parameters of the step, as
         `Moment` has them but with an axis for the scenes."""
-        wanted, solver = [check_quantity(name) for name in bars], self._solver
+        wanted, solver = self._checked(bars), self._solver
         at, sums = self._begin(wanted, moment, replay=True)
-        own = Particles.zeros(solver.layout.all_particles)
-        for name in wanted:
-            self._formulas[name].adjoint(at, sums, self._sorted(bars[name]), own)
+        solved = _need_the_step(wanted)
+        adjoint = self._pressure_adjoint if solved else self._field_adjoint
+        adjoint.begin()
         fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
+        on_device = OnDevice(replace(adjoint.bar, fields=fields), solver.vectors())
+        own = Particles.zeros(solver.layout.all_particles, on_device)
+        for name in wanted:
+            self._formulas[name].adjoint(at, sums, self._sorted(name, bars[name]), own)
         for name, array in own.fields.items():
-            fields[name].assign(array)
+            fields[name].assign(fields[name].numpy() + array)
         state_bar = solver.new_state()
-        through = self._from_fields if OF_PRESSURE.isdisjoint(wanted) else self._from_pressure
-        parameters = through(fields, own, state_bar).collect()
+        if solved:
+            p_bar = solver.numbers()
+            p_bar.assign(own.p)
+            within = WithinBar(fields, p_bar, on_device.v_star)
+            self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
+        else:
+            self._from_fields(fields, state_bar)
+        parameters = adjoint.collect()
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
         state = state_bar.numpy(self._dimension)
         return {name: array.astype(np.float64) for name, array in state.items()}, found
+
+    def _checked(self, names: Iterable[str]) -> list[str]:
+        """Names of quantities and of loads; raises `InputError` for any other."""
+        wanted = list(names)
+        for name in wanted:
+            if not is_load(name):
+                check_quantity(name)
+            elif name not in self._formulas:
+                solids = ", ".join(self._solver.system.solids) or "none"
+                raise InputError(f"{name!r} is of the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}.")
+        return wanted
 
     # ---- the step ------------------------------------------------------------------------------------------------
 
@@ -100,10 +133,10 @@ class QuantityEvaluator:
         rollout.initial.assign(moment.state)
         rollout.parameters.set(moment.parameters)
         rollout.substeps = moment.substeps
-        if OF_PRESSURE.isdisjoint(names):
-            context, pressures = self._look_around(moment.substeps), None
-        else:
+        if _need_the_step(names):
             context, pressures = self._solve(replay)
+        else:
+            context, pressures = self._look_around(moment.substeps), None
         return Particles.of(self._solver.fields, pressures), Sums(self._solver, context)
 
     def _look_around(self, substeps: int) -> StepContext:
@@ -138,7 +171,7 @@ class QuantityEvaluator:
     ) -> tuple[ParticleTangent | PressureTangent, NDArray | None]:
         """That of the sorted particles, and of their pressures."""
         solver, parameters = self._solver, self._rollout.parameters
-        if OF_PRESSURE.isdisjoint(names):
+        if not _need_the_step(names):
             own = ParticleTangent(solver, along)
             own.sort(solver.context(parameters), state_dot)
             return own, None
@@ -146,26 +179,11 @@ class QuantityEvaluator:
         whole.step(self._counts, state_dot, parameters)
         return whole, np.concatenate(whole.pressures(self._rounds)).astype(np.float64)
 
-    def _from_fields(self, fields: Fields, own: Particles, state_bar: State) -> ParticleAdjoint:
+    def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)
-        adjoint.begin()
         adjoint.bar.fields.assign(fields)
         adjoint.mix(context, state_bar)
         adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self._solver.carried_fields})
-        return adjoint
-
-    def _from_pressure(self, fields: Fields, own: Particles, state_bar: State) -> PressureAdjoint:
-        solver, adjoint = self._solver, self._pressure_adjoint
-        p_bar, slope_bar = solver.numbers(), solver.vectors()
-        p_bar.assign(own.p)
-        adjoint.begin()
-        if isinstance(adjoint, ParticleAdjoint) and solver.search.moving is not None:
-            slope_bar.assign(own.slope)
-            slopes = partial(wall_slope_solid_kernel, solver.discretisation)
-            context = solver.context(self._rollout.parameters)
-            adjoint.bar.solids.add(context.launch, slopes, *adjoint.bar.named, bar=slope_bar)
-        adjoint.from_within(self._counts, fields, p_bar, state_bar, self._rollout.parameters)
-        return adjoint
 
     @cached_property
     def _rollout(self) -> Rollout:
@@ -177,8 +195,8 @@ class QuantityEvaluator:
         return ParticleAdjoint(self._solver, 1)
 
     @cached_property
-    def _pressure_adjoint(self) -> PressureAdjoint:
-        return cast(PressureAdjoint, self._solver.adjoint(1))
+    def _pressure_adjoint(self) -> "StepWithin":
+        return cast(StepWithin, self._solver.adjoint(1))
 
     # ---- orders --------------------------------------------------------------------------------------------------
 
@@ -186,12 +204,17 @@ class QuantityEvaluator:
     def _order(self) -> NDArray:
         return self._solver.search.order.numpy()[: self._solver.layout.all_particles]
 
-    def _in_scene_order(self, values: NDArray) -> NDArray:
+    def _shown(self, name: str, values: NDArray) -> NDArray:
+        """In the scene's order; those of a solid have none."""
+        if is_load(name):
+            return values[0] if self._solver.layout.batch is None else values
         found = np.empty(values.shape)
         found[self._order] = values
         batch = self._solver.layout.batch
         return found if batch is None else found.reshape(batch, -1, *found.shape[1:])
 
-    def _sorted(self, values: NDArray) -> NDArray:
+    def _sorted(self, name: str, values: NDArray) -> NDArray:
+        if is_load(name):
+            return np.asarray(values, dtype=np.float64).reshape(self._solver.layout.members, -1)
         flat = values if self._solver.layout.batch is None else values.reshape(-1, *values.shape[2:])
         return np.asarray(flat, dtype=np.float64)[self._order]

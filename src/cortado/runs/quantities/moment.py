@@ -39,20 +39,20 @@ class Moment:
     substeps: int
     """Explicit steps of diffusion within the step."""
     row: int
-    """Which of the steps of a run the parameters are those of."""
+    """Which of the steps of a run the parameters are those of, or how many there are: after the last one."""
     evaluator: Callable[[], Evaluates]
     """Makes what computes quantities."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
     def of(cls, rollout: Rollout, step: int, state: State, evaluator: Callable[[], Evaluates]) -> "Moment":
-        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are still
-        those of the last step."""
-        row = min(step, max(rollout.steps - 1, 0))
-        parameters, size = row_of(rollout, rollout.parameters.written, row), rollout.step_sizes.of_step(row)
+        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are as
+        `row_of` says."""
+        parameters = row_of(rollout, rollout.parameters.written, step)
+        size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
             parameters["time_step"] = size
-        return cls(state, parameters, rollout.substeps, row, evaluator)
+        return cls(state, parameters, rollout.substeps, step, evaluator)
 
     @property
     def lattice(self) -> Lattice:
@@ -77,9 +77,33 @@ class Moment:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own."""
-    over_time = rollout.solver.layout.known.over_time
-    return {
-        name: value[:, row : row + 1].copy() if name in over_time else np.asarray(value)
-        for name, value in values.items()
-    }
+    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own.
+    After the last step they are those of it, but paths of solids go on as far as they went in it: else solids would
+    stop."""
+    found = {}
+    for name, value in values.items():
+        shares = _shares_of_rows(rollout, name, row, value) or {}
+        rows = [share * value[:, k : k + 1] for k, share in shares.items()]
+        found[name] = np.sum(rows, axis=0) if rows else np.asarray(value)
+    return found
+
+
+def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
+    """The transpose of `row_of`: add the adjoint of a parameter of one row to that of all rows, ``total``."""
+    shares = _shares_of_rows(rollout, name, row, total)
+    if shares is None:
+        total += bar
+        return
+    for k, share in shares.items():
+        total[:, k : k + 1] += share * bar
+
+
+def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
+    """Of which rows a row is the sum, with their factors; None of parameters that are not over time."""
+    known = rollout.solver.layout.known
+    if name not in known.over_time:
+        return None
+    rows = values.shape[1]
+    if row < rows:
+        return {row: 1.0}
+    return {rows - 1: 2.0, rows - 2: -1.0} if known[name].grows and rows > 1 else {rows - 1: 1.0}

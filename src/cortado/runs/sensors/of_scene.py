@@ -8,6 +8,7 @@ import numpy as np
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.pressure_probe import PressureProbe
 from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensors.solid_load import SolidLoad
 from cortado.runs.sensors.wall_force import WallForce
 from cortado.runs.sensors.wave_gauge import WaveGauge
 from cortado.scene.scene import Scene
@@ -17,6 +18,7 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "wave_gauge": WaveGauge,
     "flow_rate": FlowRate,
     "wall_force": WallForce,
+    "solid_load": SolidLoad,
 }
 """By their kinds."""
 

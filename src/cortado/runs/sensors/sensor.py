@@ -59,6 +59,13 @@ ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 """What w is multiplied with, over the reach to the number of dimensions, so that it has the integral 1."""
 
 
+def load_columns(dimension: int) -> dict[str, str]:
+    """The names of a force and its torque, with their units: in the plane those of a metre across it."""
+    force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
+    turning = ["torque_x", "torque_y", "torque_z"] if dimension == 3 else ["torque"]
+    return dict.fromkeys(["force_x", "force_y", "force_z"][:dimension], force) | dict.fromkeys(turning, torque)
+
+
 def point(what: str, values: Any) -> NDArray[Any]:
     """A place or a direction, (d,), finite; raises `InputError`."""
     array = corner(what, values)

@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import Reading, corner, in_dimension, point
+from cortado.runs.sensors.sensor import Reading, corner, in_dimension, load_columns, point
 
 
 @fixed
 class WallForce:
-    """The force with which the pressure of the fluid pushes the walls, and its torque:
+    """The force with which the fluid pushes the walls, and its torque:
 
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
 
-    over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F; friction is
-    not in it. The border of a region is a jump: let it run where particles do not push in the direction that is looked
-    at, as half-way between two walls.
+    over the particles of a region, where f_i is the quantity "wall_force". Walls push the fluid with -F. The border of
+    a region is a jump: let it run where particles do not push in the direction that is looked at, as half-way between
+    two walls.
     """
 
     def __init__(self, lower: Any = None, upper: Any = None, about: Any = None):
@@ -39,9 +39,7 @@ class WallForce:
         return f"WallForce({', '.join(map(str, shown))})"
 
     def columns(self, dimension: int) -> dict[str, str]:
-        force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
-        turning = ["torque_x", "torque_y", "torque_z"] if dimension == 3 else ["torque"]
-        return dict.fromkeys(["force_x", "force_y", "force_z"][:dimension], force) | dict.fromkeys(turning, torque)
+        return load_columns(dimension)
 
     def value(self, at: Reading) -> NDArray[Any]:
         arms, force = self._chosen(at)

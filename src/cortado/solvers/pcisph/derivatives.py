@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
-from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
-from cortado.solvers.solver import Counts
+from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import StepContext
-from cortado.sph.wall_slope import wall_slope_solid_kernel
+from cortado.sph.wall_slope import wall_slope_term
 
 
 class PcisphAdjoint(ParticleAdjoint):
@@ -35,14 +34,12 @@ class PcisphAdjoint(ParticleAdjoint):
         self._begin(counts, state_bar, parameters)
         self._finish(counts, state_bar, parameters)
 
-    def from_within(
-        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
-    ) -> None:
+    def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         """As that of `PressureAdjoint`."""
         state_bar.clear()
         self._begin(counts, state_bar, parameters)
-        add(p_bar, self._p_bar)
-        self._finish(counts, state_bar, parameters, fields_bar)
+        add(within.p, self._p_bar)
+        self._finish(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """From the adjoint of the result to that of the last prediction."""
@@ -62,10 +59,9 @@ class PcisphAdjoint(ParticleAdjoint):
         )
 
     def _finish(
-        self, counts: Counts, state_bar: State, parameters: Parameters, fields_bar: Fields | None = None
+        self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """From the adjoint of the last prediction to that of the state, with ``fields_bar`` of the sorted fields at its
-        start."""
+        """From the adjoint of the last prediction to that of the state."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
@@ -90,9 +86,7 @@ class PcisphAdjoint(ParticleAdjoint):
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
             densities = partial(density_solid_kernel, solver.discretisation, solver.topic, looped=True)
             self.bar.solids.add(context.launch, densities, going, *known, x=it.x_star[k], bar=self._r)
-        self.predict(context)
-        if fields_bar is not None:
-            self.add(fields_bar)
+        self.predict(context, within)
         if kernels.density_ratio:
             factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
@@ -110,8 +104,8 @@ class PcisphAdjoint(ParticleAdjoint):
         """Of the relaxation beside walls, which depends on positions alone."""
         solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
         context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
-        slopes = partial(wall_slope_solid_kernel, solver.discretisation)
-        self.bar.solids.add(context.launch, slopes, *self.bar.named, bar=self._slope_bar)
+        slopes = wall_slope_term(solver.discretisation).solid_kernel
+        self.bar.solids.add(context.launch, slopes, *self.bar.named, slope_bar=self._slope_bar)
 
 
 class FrozenPcisphAdjoint(PcisphAdjoint):

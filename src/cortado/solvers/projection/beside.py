@@ -22,6 +22,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.wall_terms import WallTerm
 from cortado.sph.moment_functions import moment_functions
 
 EDGED = (0.1, 0.4)
@@ -137,6 +138,20 @@ def beside_solid_kernel(discretisation: Discretisation) -> Any:
     """The kernel of what they give to solids (`cortado.particles.solid_shares.SolidShares.add`), for the adjoints of
     the sums."""
     return solid_kernel(discretisation, "projection", _work)
+
+
+def normal_term(discretisation: Discretisation) -> WallTerm:
+    """normal / V of the walls of a solid, with the adjoint ``push_bar``."""
+    return WallTerm(discretisation, "projection", _normal_work, "push_bar")
+
+
+def _normal_work(d: Discretisation) -> Any:
+    real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
+
+    def normal_work(x_ij: vector, push_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)) -> real:
+        return wp.dot(normal(gradient(x_ij, s), foot), push_bar_i)
+
+    return normal_work
 
 
 def _work(d: Discretisation) -> Any:

@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
-from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
-from cortado.solvers.solver import Counts
+from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
@@ -126,16 +125,14 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._begin(state_bar, parameters)
         self._finish(counts, state_bar, parameters)
 
-    def from_within(
-        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
-    ) -> None:
+    def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         """As that of `PressureAdjoint`."""
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
-        own = {"k": solver.iterates[counts[0]]["k"], "p_bar": p_bar, "k_bar": self._k_bar}
+        own = {"k": solver.iterates[counts[0]]["k"], "p_bar": within.p, "k_bar": self._k_bar}
         solver.context(parameters).launch(pressed_adjoint_kernel(solver.layout.precision), *self.bar.named, own)
-        self._finish(counts, state_bar, parameters, fields_bar)
+        self._finish(counts, state_bar, parameters, within)
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
         """From the adjoint of the result to those of the last positions, velocities and k."""
@@ -155,9 +152,9 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.begin()
 
     def _finish(
-        self, counts: Counts, state_bar: State, parameters: Parameters, fields_bar: Fields | None = None
+        self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """From there to the adjoint of the state, with ``fields_bar`` of the sorted fields at its start."""
+        """From there to the adjoint of the state."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
         self._mend(context, known, counts[1])
@@ -176,9 +173,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(kernel, *known, solver.relaxed)
         self.bar.solids.add(context.launch, partial(beside_solid_kernel, solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
-        self.predict(context)
-        if fields_bar is not None:
-            self.add(fields_bar)
+        self.predict(context, within)
         self.mix(context, state_bar)
         self.sort(context, state_bar, **{IMPULSE: self._k_before_bar})
 

@@ -24,6 +24,7 @@ from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
+from cortado.solvers.projection.wall_push import ProjectionPush
 from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.moment_functions import matrix_type, symmetric
@@ -94,6 +95,9 @@ class ProjectionSteps(ParticleSolver):
         self.loops = tuple(
             Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, names, strict=True)
         )
+
+    def wall_push(self) -> ProjectionPush:
+        return ProjectionPush(self.discretisation, self.layout, self.constants, self.lattice.volume)
 
     def new_arrays(self, **kinds: Any) -> dict[str, wp.array]:
         """Arrays (n,) of zeros by name, of Warp types."""

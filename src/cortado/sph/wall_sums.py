@@ -1,0 +1,66 @@
+"""What walls do to particles by one term of a step: the protocol, and that of a sum over neighbours."""
+
+from functools import cached_property
+from typing import Protocol
+
+import warp as wp
+
+from cortado.device.binding import Named
+from cortado.particles.state import Layout
+from cortado.particles.wall_terms import WallTerm
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+
+class WallAction(Protocol):
+    """What walls do to the particles around them by one term of a step, after the step. ``solid`` is the number of wall
+    particles of a solid, or `cortado.particles.solid_shares.ALL_WALLS`."""
+
+    def total(self, step: StepContext, solid: int) -> wp.array:
+        """(n,) vectors of the sorted particles: of a force its accelerations by walls [m / s2]."""
+
+    def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
+        """(n,) their tangents, after forward mode of the step."""
+
+    def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
+        """From the adjoints of the vectors to those of sorted particles, parameters and solids, in ``bar``, and to
+        those (n,) of v* = v + dt a, of velocities after all explicit forces."""
+
+
+class WallSums:
+    """The `WallAction` of a sum that is told by its work; its arrays are those of the last step."""
+
+    def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
+        """``constants`` of the work."""
+        self.term, self._layout, self._constants = term, layout, constants
+
+    @cached_property
+    def _arrays(self) -> dict[str, wp.array]:
+        """Made when they are asked for, as runs do without."""
+        own = {"shape": self._layout.all_particles, "device": self._layout.device}
+        return {name: wp.zeros(dtype=self._layout.precision.vector, **own) for name in ("total", "total_dot")}
+
+    def _known(self, solid: int) -> Named:
+        return {"solid": solid, "constants": self._layout.precision.pair(*self._constants)}
+
+    def total(self, step: StepContext, solid: int, *groups: Named) -> wp.array:
+        found = self._arrays["total"]
+        step.launch(self.term.kernels.forward, *groups, self._known(solid), total=found)
+        return found
+
+    def tangent(self, step: StepContext, dot: Tangents, solid: int, *groups: Named) -> wp.array:
+        found = self._arrays["total_dot"]
+        step.launch(self.term.kernels.tangent, *groups, *dot.named, self._known(solid), total_dot=found)
+        return found
+
+    def adjoint(
+        self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array, *groups: Named
+    ) -> None:
+        """As that of `WallAction`; v* gets nothing."""
+        step.launch(self.term.kernels.adjoint, {self.term.bar: total_bar}, *groups, *bar.named, self._known(solid))
+        self.give(step, bar, solid, total_bar, *groups)
+
+    def give(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, *groups: Named) -> None:
+        """What the adjoint gives to solids that move."""
+        given = {self.term.bar: total_bar}
+        kernel, factors = self.term.solid_kernel, self._constants
+        bar.solids.add(step.launch, kernel, given, *groups, *bar.named, constants=factors, over=solid)
