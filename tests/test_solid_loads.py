@@ -92,7 +92,7 @@ def test_loads_have_derivatives(name):
     scene = SEEN[name]()
     problem = Problem(Simulation(scene, precision="float64"), STEPS, Loads(scene))
     point, along = ({}, {}) if name == "raft" else point_of(scene)
-    point |= {"gravity": np.array(scene.forces.gravity) + 0.3, "viscosity": np.array(scene.phase[0].viscosity)}
+    point |= {"gravity": np.array(scene.forces.gravity) + 0.5, "viscosity": np.array(scene.phase[0].viscosity)}
     along |= {"gravity": np.ones(scene.dimension), "viscosity": 0.3 * point["viscosity"]}
     if name == "raft":
         point |= {"raft.density": np.array(500.0), "raft.velocity": np.array([0.1, -0.2])}
@@ -118,7 +118,7 @@ def test_loads_of_a_batch_are_those_of_single_scenes_and_twice_the_same():
     assert single[0] == single[2] and [value for value, _ in single[:2]] == values.tolist()
     assert [gradient["viscosity"] for _, gradient in single[:2]] == gradients["viscosity"].tolist()
     exact = Problem(Simulation(scene, precision="float64"), STEPS, loss).value_and_gradient({"viscosity": 1.0})
-    assert single[0][0] == pytest.approx(exact[0], rel=1e-3)
+    assert single[0][0] == pytest.approx(exact[0], rel=2e-3)  # pressures in float32 are off by 5e-4 of the greatest
     assert single[0][1]["viscosity"] == pytest.approx(exact[1]["viscosity"], rel=1e-2)
 
 

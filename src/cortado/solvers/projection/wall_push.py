@@ -65,7 +65,7 @@ class ProjectionPush:
 
         def found(sums: WallSums, over: int) -> NDArray:
             array = sums.total(step, over) if dot is None else sums.tangent(step, dot, over)
-            return np.asarray(array.numpy(), dtype=np.float64)
+            return np.array(array.numpy(), dtype=np.float64)  # a copy: the next sum overwrites the array
 
         return _Sums(*(found(sums, over) for over in (solid, ALL_WALLS) for sums in (self._normal, self._whole)))
 
