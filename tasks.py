@@ -6,6 +6,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).parent
@@ -13,10 +14,11 @@ VENV = ROOT / ".venv"
 STAMPS = {"test": VENV / ".ready", "pictures,view": VENV / ".demo", "docs": VENV / ".docs"}
 """What says that extras are installed."""
 BIN = VENV / ("Scripts" if sys.platform == "win32" else "bin")
-INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable")
+INSTALL = ("python", "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check", "--editable")
+"""Modules are compiled when they are first imported; to compile all takes as long as to install them."""
 DOCS = "--fresh-env --write-all --fail-on-warning --keep-going"
-ENGINE = (*INSTALL, "./reference")
-"""Needs a C++ compiler."""
+ENGINE = (*INSTALL, "./reference", "--no-deps")
+"""Needs a C++ compiler. What it depends on, Cortado, is installed at the same time."""
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("cortado", "optimise", "examples/latte_art_small.toml", "--out", "runs/demo", "--overwrite"),
     "lint": ("ruff", "check", "."),
@@ -75,9 +77,11 @@ def set_up(extra: str) -> None:
     print(f"Installing Cortado in {VENV.name}, once: some minutes.")
     if not BIN.exists():
         subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
-    if run((*INSTALL, f".[{extra}]")):
-        sys.exit(1)
-    if extra == "test" and not engine_built():
+    with ThreadPoolExecutor() as beside:
+        engine = beside.submit(engine_built) if extra == "test" else None
+        if run((*INSTALL, f".[{extra}]")):
+            sys.exit(1)
+    if engine and not engine.result():
         print("Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.", file=sys.stderr)
     stamp.touch()
 

@@ -95,7 +95,7 @@ def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
     monkeypatch.setattr(tasks, "run", lambda command, quiet=False: ran.append(command) or 0)
     tasks.set_up("test")
     tasks.set_up("test")
-    assert ran == [(*tasks.INSTALL, ".[test]"), tasks.ENGINE] and ready.exists()
+    assert set(ran) == {(*tasks.INSTALL, ".[test]"), tasks.ENGINE} and len(ran) == 2 and ready.exists()
     later = ready.stat().st_mtime + 10
     os.utime(tmp_path / newer, (later, later))
     tasks.set_up("test")
