@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from cortado.scene.model import OTHER_TABLES
+
 Tables = dict[str, Any]
 
 ROOT = Path(__file__).parent.parent
@@ -48,13 +50,13 @@ def _bases() -> Mapping[str, Tables]:
 
 def scenes() -> dict[str, Tables]:
     """Scenes by name, without the tables of tasks."""
-    kept = ((name, {k: v for k, v in t.items() if k not in ("problem", "optimise")}) for name, t in _bases().items())
+    kept = ((name, {k: v for k, v in t.items() if k not in OTHER_TABLES}) for name, t in _bases().items())
     return {name: copy.deepcopy(tables) for name, tables in kept}
 
 
 def tasks() -> dict[str, Tables]:
     """Tasks by name."""
-    return {name: copy.deepcopy(tables) for name, tables in _bases().items() if "problem" in tables}
+    return {name: copy.deepcopy(tables) for name, tables in _bases().items() if "optimise" in tables}
 
 
 def _small(tables: Tables, spacing: float | None) -> Tables:
@@ -62,7 +64,7 @@ def _small(tables: Tables, spacing: float | None) -> Tables:
         tables["discretisation"]["spacing"] = spacing
     if "render" in tables:
         tables["render"]["resolution"] = [24, 16]
-    if "problem" in tables:
+    if "optimise" in tables:
         problem, optimise = tables["problem"], tables["optimise"]
         problem["steps"] = min(problem["steps"], STEPS)
         problem["frames"] = min(problem.get("frames", 1), 2)

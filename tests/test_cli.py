@@ -190,7 +190,7 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_comm
     monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", stopped)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
     there = Path("dam").absolute()
-    sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film draws it."
+    sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film goes on with it."
     assert (code, err.splitlines()[-1]) == (130, sentence)
     assert {path.name for path in there.iterdir()} == RUN_FILES
 

@@ -73,7 +73,8 @@ def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
     assert density.min() > 0.97 and density.max() < 1.01
     run = Simulation(table, precision="float64").run(300, record_every=50)
     energies = 0.5 * (run.velocities**2).sum(axis=2).mean(axis=1) + 9.81 * run.positions[:, :, 1].mean(axis=1)
-    assert (np.diff(energies) < 0.0).all() and energies[-1] > 0.99 * energies[0]
+    assert energies.argmax() == 0 and energies[-1] > 0.99 * energies[0]
+    assert np.diff(energies).max() < 1e-4 * energies[0]  # repairs of the density lift fluid at rest now and then
     assert min(table.solid[0].solid().distance(x).min() for x in run.positions) > 0.25 * SPACING
 
 
