@@ -191,7 +191,7 @@ def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_pat
     """Killed at every file that is written, made or removed."""
     events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.runs.run_folder, "write_atomically")]
     finished = False
-    for moment in range(100):
+    for moment in range(200):
         path = tmp_path / str(moment)
         if overwrite:
             old = new_run(path)
@@ -213,7 +213,7 @@ def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_pat
         assert new_run(path, overwrite=True).read_metrics() == []
         if finished:
             return
-    raise AssertionError("A hundred kills were not enough.")
+    raise AssertionError("Two hundred kills were not enough.")
 
 
 def killing(function, left):
