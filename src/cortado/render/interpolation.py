@@ -42,12 +42,18 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         return wp.where(side == 0, real(1.0) - f, f)
 
     @wp.func
-    def value(x: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+    def cell(x: vector, nodes: nodes_struct):
+        """The node at which the cell of a point begins, and how far the point is from it, in node distances."""
         s = nodes.frequency * (x - nodes.origin)
         i = int(wp.floor(s[0]))
         j = int(wp.floor(s[1]))
         k = int(wp.floor(s[2]))
         f = s - vector(real(i), real(j), real(k))
+        return i, j, k, f
+
+    @wp.func
+    def value(x: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+        i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):
             for b in range(2):
@@ -68,11 +74,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
     @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
         """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
-        s = nodes.frequency * (x - nodes.origin)
-        i = int(wp.floor(s[0]))
-        j = int(wp.floor(s[1]))
-        k = int(wp.floor(s[2]))
-        f = s - vector(real(i), real(j), real(k))
+        i, j, k, f = cell(x, nodes)
         total = vector()
         for a in range(2):
             for b in range(2):
@@ -83,11 +85,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
         """Of the value at a point that moves; on the face of a cell as `gradient`."""
-        s = nodes.frequency * (x - nodes.origin)
-        i = int(wp.floor(s[0]))
-        j = int(wp.floor(s[1]))
-        k = int(wp.floor(s[2]))
-        f = s - vector(real(i), real(j), real(k))
+        i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):
             for b in range(2):
