@@ -42,6 +42,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         self.observation_space, actions = spaces(self.scenes)
         self.action_space, self._shape = actions, actions.shape
         self._over = "before the first one"
+        self._closed = False
 
     @property
     def layout(self) -> dict[str, slice]:
@@ -50,6 +51,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Begin an episode; the same seed has the same bits."""
+        if self._closed:
+            raise InputError("reset is called after close(), but must come before it.")
         super().reset(seed=seed)
         self.scenes.begin({0: self.scenes.drawn(self.np_random)})
         self._over = ""
@@ -71,6 +74,10 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         self._over = "after the end of an episode" if lost or truncated else ""
         info = {"diverged": lost[0]} if lost else {}
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
+
+    def close(self) -> None:
+        """No episode goes on, or begins, from now on."""
+        self._closed, self._over = True, "after close()"
 
     def render(self) -> NDArray[np.uint8] | None:
         """A picture (rows, columns, 3) of the scene."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import whole_number
+from cortado.arrays import require_table, whole_number
 from cortado.environments.catalogue import task_of
 from cortado.environments.fluid_env import Info, Observation
 from cortado.environments.gym import AutoresetMode, VectorEnv, batch_space, np_random
@@ -67,14 +67,19 @@ class FluidVectorEnv(VectorEnv):
     ) -> tuple[Observation, Info]:
         """Begin episodes: all of them, or those of ``options={"reset_mask": (num_envs,) bool}``. A number as ``seed``
         gives environment b the seed + b."""
+        require_table("options", options or {}, "{'reset_mask': array of bool}")
+        if self.closed:
+            raise InputError("reset is called after close(), but must come before it.")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             wanted = f"an array ({self.num_envs},) of bool that is not False throughout"
             raise InputError(f"reset_mask is {shown(mask)}, but must be {wanted}.")
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds = [None if seed is None else int(seed) + b for b in range(self.num_envs)]
-        else:
+        elif isinstance(seed, (list, tuple, np.ndarray)):
             seeds = list(seed)
+        else:
+            raise InputError(f"seed is {shown(seed)}, but must be a whole number, or a list of them.")
         if len(seeds) != self.num_envs:
             raise InputError(f"seed has {len(seeds)} numbers, but must have {self.num_envs}, one for each environment.")
         for b, own in enumerate(seeds):
@@ -88,6 +93,8 @@ class FluidVectorEnv(VectorEnv):
         """As that of `FluidEnv`, for all. An episode that is over begins anew as the autoreset mode says: in the next
         step, in the place of its action; in the same step, with what it ended with in ``infos["final_obs"]`` and
         ``infos["final_info"]``; or only by `reset`."""
+        if self.closed:
+            raise InputError("step is called after close(), but must come before it.")
         actions = checked_actions("actions", actions, self._shape)
         if self._over.any() and self._mode is not AutoresetMode.NEXT_STEP:
             found = f"step is called after the end of the episode of environment {self._over.argmax()}"

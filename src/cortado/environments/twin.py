@@ -10,6 +10,7 @@ from cortado.environments.actuators import split
 from cortado.environments.reward import MinusReward
 from cortado.environments.scenes import Scenes
 from cortado.environments.spaces import checked_actions
+from cortado.errors import InputError, shown
 from cortado.gradients import GradientEstimator
 from cortado.losses import Frames
 from cortado.optimisation.fixed_parameters import FixedParameters
@@ -71,7 +72,7 @@ class Twin:
             return jnp.asarray(one.base, u.dtype) + jnp.tensordot(jnp.asarray(one.matrix, u.dtype), u, 2)
 
         loss = value(self.problem, gradient)
-        return lambda actions: loss(self._parameters(jnp.asarray(actions).clip(-1.0, 1.0), contracted))
+        return lambda actions: loss(self._parameters(self._shaped(jnp.asarray(actions)).clip(-1.0, 1.0), contracted))
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
         """The loss as a function of a tensor (actions, a) of PyTorch: see `cortado.torch.value`."""
@@ -82,7 +83,15 @@ class Twin:
             return u.new_tensor(one.base) + torch.tensordot(u.new_tensor(one.matrix), u, 2)
 
         loss = value(self.problem, gradient)
-        return lambda actions: loss(self._parameters(actions.clamp(-1.0, 1.0), contracted))
+        return lambda actions: loss(self._parameters(self._shaped(actions).clamp(-1.0, 1.0), contracted))
+
+    def _shaped(self, actions: Any) -> Any:
+        """Actions of another library; raises `InputError` for another shape."""
+        shape = getattr(actions, "shape", None)
+        if shape is None or tuple(shape) != self.shape:
+            found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
+            raise InputError(f"actions {found}, but must be an array {self.shape}.")
+        return actions
 
     def _parameters(self, u: Any, contracted: Any) -> dict[str, Any]:
         """Of the scene, given actions of another library, and how it multiplies."""

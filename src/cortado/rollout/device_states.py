@@ -54,8 +54,8 @@ class DeviceStates(HostStates):
         self._require_own(state)
         self._require_judged(state)
         space.check_restarts(state.scenes, values)
-        space.begin(rollout, values, varied, state.scenes)
         rollout.initial.assign(state.arrays)
+        space.begin(rollout, values, varied, state.scenes)
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:

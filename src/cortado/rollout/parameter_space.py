@@ -123,7 +123,7 @@ class ParameterSpace:
             self._one.run({**self._one.scheduled(own, clock), **own})
             for own, clock in zip(members, clocks, strict=True)
         ]
-        self._warn(jump_sentence(simulation.scene, firsts[0], chosen[0]))
+        self._warn(jump_sentence(simulation.scene, rollout.initial, chosen[0]))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [self._origin(one["rest_density"]) for one in chosen]
         rollout.origins = origins * (len(rollout.clocks) // len(origins))

@@ -1,9 +1,8 @@
 """What to say of solids that are told to go too far in a step."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
+from cortado.particles.state import State
 from cortado.scene.motions import displacement_name, position_name, told
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
@@ -12,15 +11,15 @@ FURTHEST = 1.0
 """In spacings: solids that go further in a step pass over fluid, which is in them then."""
 
 
-def jump_sentence(scene: Scene, first: Mapping[str, np.ndarray], run: Arrays) -> str | None:
-    """Of the first solid that goes further than a spacing in a step, from where the fields of a first state have it,
-    with the parameters of a run; None if there is none, or where steps are still to be chosen."""
+def jump_sentence(scene: Scene, first: State, run: Arrays) -> str | None:
+    """Of the first solid that goes further than a spacing in a step, from where a first state has it, of a batch in its
+    first scene, with the parameters of a run; None if there is none, or where steps are still to be chosen."""
     if scene.solver.chooses:
         return None
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         position = position_name(table.name)
-        begun = np.reshape(first.get(position, run[position]), (1, -1))
+        begun = first.numpy(scene.dimension, only=[position])[position].reshape(-1, scene.dimension)[:1]
         places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
         if len(steps) and steps.max() > FURTHEST * spacing * (1.0 + 1e-6):

@@ -35,6 +35,13 @@ class Experiment:
             raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
         if not observations:
             raise InputError("observations is empty, but must have what was measured.")
+        for name, one in observations.items():
+            if not hasattr(one, "measured"):
+                raise InputError(f"observations {name} is {shown(one)}, but must be one such as a measured.Video.")
+            seen = getattr(getattr(one, "renderer", None), "inputs", {}).get("positions", simulation.positions.shape)
+            if seen != simulation.positions.shape:
+                found = f"sees positions {seen}, but must see {simulation.positions.shape}, those of the simulation"
+                raise InputError(f"observations {name} {found}.")
         if simulation.scene.solver.chooses:
             raise InputError('solver.time_step is "auto", but must be a number of seconds, as frames are at times.')
         step = float(simulation.scene.solver.time_step)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import require_function, whole_number
+from cortado.arrays import require_function, require_table, whole_number
 from cortado.errors import ComputationError, InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import doubts
@@ -47,17 +47,19 @@ def fit(
         DivergedError: the run at the start diverges.
         ComputationError: what was measured does not tell some of the parameters.
     """
-    each = [experiments] if isinstance(experiments, Experiment) else list(experiments)
-    for one in each:
-        if not isinstance(one, Experiment):
-            raise InputError(f"experiments has {shown(one)}, but must be made of cortado.measured.Experiment.")
+    each = [experiments] if isinstance(experiments, Experiment) else experiments
+    if not isinstance(each, list | tuple) or not all(isinstance(one, Experiment) for one in each):
+        raise InputError(f"experiments is {shown(experiments)}, but must be a cortado.measured.Experiment, or a list.")
     if not each:
         raise InputError("experiments is empty, but must have one experiment at least.")
+    require_table("start", start, "{'viscosity': 1.0}")
     require_function("on_trial", on_trial)
     iterations = whole_number("iterations", iterations, 1)
     known = each[0].simulation.known
     own = {name: value for one in each for name, value in one.start.items()}
     given = {**start, **{name: value for name, value in own.items() if name not in start}}
+    if not given:
+        raise InputError("start is empty, but must have a parameter to fit.")
     positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
     coordinates = Coordinates.of(given, positive, bounds)
     problem = LeastSquares(each, coordinates, on_trial)

@@ -162,4 +162,7 @@ def _table(what: str, given: Table | None) -> Table:
     """What was given, nothing if it was left out; raises `InputError` for anything but a table by names."""
     found = {} if given is None else given
     require_table(what, found, "{'gravity': array}" if what == "parameters" else "{'positions': array, ...}")
+    for name in found:
+        if not isinstance(name, str):
+            raise InputError(f"{what} has the name {shown(name)}, but must have texts as names.")
     return found

@@ -27,6 +27,8 @@ class Picture(Layer):
 
     def check(self, given: Shapes) -> None:
         wanted = self._renderer.inputs
+        if "positions" not in given:
+            raise InputError(f"positions is left out, but must be an array {wanted['positions']}.")
         for name, shape in given.items():
             if shape != wanted[name]:
                 raise InputError(f"{name} has shape {shape}, but must have {wanted[name]}.")
