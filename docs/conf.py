@@ -38,7 +38,8 @@ nb_execution_mode = "cache"  # what was executed stays until a cell, or the pack
 sources = sorted(Path(cortado.__file__).parent.rglob("*.py"))
 digest = sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
 nb_execution_cache_path = str(HERE.parent / "build" / "executed" / digest)
-nb_execution_timeout = 120
+nb_execution_timeout = 300
+nb_execution_excludepatterns = ["*train_a_policy.ipynb"]  # ten minutes
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 # Kernels of notebooks warn of how they are reached, on this machine alone, and their client tells of each.

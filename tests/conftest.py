@@ -53,6 +53,7 @@ SLOW = {
     "test_held_water",
     "test_kernel_cache",
     "test_memory",
+    "test_notebooks",
     "test_readme",
     "test_silence",
     "test_terminal",

@@ -54,8 +54,7 @@ class DeviceStates(HostStates):
         self._require_own(state)
         self._require_judged(state)
         space.check_restarts(state.scenes, values)
-        rollout.initial.assign(state.arrays)
-        space.begin(rollout, values, varied, state.scenes)
+        space.begin(rollout, values, varied, state.scenes, state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:

@@ -96,13 +96,19 @@ class ParameterSpace:
 
     @WARP
     def begin(
-        self, rollout: Rollout, values: Arrays, varied: Iterable[str] = (), states: Sequence[RestartState] = ()
+        self,
+        rollout: Rollout,
+        values: Arrays,
+        varied: Iterable[str] = (),
+        states: Sequence[RestartState] = (),
+        arrays: State | None = None,
     ) -> None:
         """Give a rollout its first state and its parameters: ``values``, and for what is not among them the scene's, as
         its schedule changes it.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
+        diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state; ``arrays`` has
+        their fields where they have none.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
@@ -110,7 +116,9 @@ class ParameterSpace:
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
-        if not states:
+        if arrays is not None:
+            rollout.initial.assign(arrays)
+        elif not states:
             rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
