@@ -4,6 +4,7 @@ Of a test with several parameters it runs so many cases that every value of each
 combinations; and in the place of a test that takes more than 20 s it runs one that is shorter (`LONG`).
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 LONG = {
@@ -43,13 +44,16 @@ def _names(mark) -> list[str]:
 
 
 def chosen(cases: Sequence[set[Value]]) -> list[int]:
-    """Indices of cases: of those that are left, the first with the most values that no chosen one has comes next."""
+    """Indices of cases: of those that are left, one with the most values that no chosen one has comes next, and of
+    these the first whose values were chosen least often, so that all values are about as often with each other."""
     missing: set[Value] = set().union(*cases)
+    uses: Counter[Value] = Counter()
     found: list[int] = []
     while missing:
-        best = max(range(len(cases)), key=lambda k: len(cases[k] & missing))
+        best = max(range(len(cases)), key=lambda k: (len(cases[k] & missing), -sum(uses[value] for value in cases[k])))
         found.append(best)
         missing -= cases[best]
+        uses.update(cases[best])
     return sorted(found)
 
 
