@@ -15,7 +15,7 @@ def test_a_file_is_in_one_tier():
     assert not VALIDATION & SLOW and not (VALIDATION | SLOW) & SLOW_TESTS.keys()
 
 
-def tests_of(file):
+def names_in(file):
     tree = ast.parse((TESTS / f"{file}.py").read_text())
     return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
@@ -23,12 +23,12 @@ def tests_of(file):
 @pytest.mark.parametrize("file", LONG)
 def test_in_the_place_of_what_is_long_something_is_left(file):
     listed = {name.partition("[")[0] for name in LONG[file]}
-    assert listed < tests_of(file)
+    assert listed < names_in(file)
 
 
 @pytest.mark.parametrize("file", sorted({*VALIDATION, *SLOW, *SLOW_TESTS}))
 def test_what_is_listed_is_there(file):
-    listed, there = SLOW_TESTS.get(file, set()), tests_of(file)
+    listed, there = SLOW_TESTS.get(file, set()), names_in(file)
     assert listed <= there, listed - there
     assert all(tier(file, test) == "slow" for test in listed)
 
