@@ -502,11 +502,11 @@ def test_paths_of_solids_pass_the_check_of_gradients(at):
         for k in range(2):
             path = {"paddle.displacement": places[k], "paddle.turn": turns[k]}
             state = at.layer.step(at.simulation, state, path, steps=3)
-        return state["positions"]
+        return 10.0 * state["velocities"]
 
     random = np.random.default_rng(1)
     places = at.jnp.asarray(np.cumsum(random.uniform(-0.01, 0.0, (6, 2)), axis=0).reshape(2, 3, 2))
     turns = at.jnp.asarray(np.cumsum(random.uniform(0.0, 0.02, 6)).reshape(2, 3))
     check_grads(end, (places, turns), order=1, modes=["fwd", "rev"], eps=1e-7)
     gradient = at.jax.grad(lambda *own: (end(*own) ** 2).sum(), argnums=(0, 1))(places, turns)
-    assert all(np.abs(one).max() > 1e-4 for one in gradient)
+    assert all(np.abs(one).max() > 1e-3 for one in gradient)

@@ -451,3 +451,20 @@ def test_where_it_is_not_installed_there_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ImportError, match=r"PyTorch is not installed, which cortado.torch needs: pip install torch$"):
         cortado.lazy.getter("cortado")("torch")
+
+
+def test_the_path_of_a_solid_passes_the_check_of_gradients(layer):
+    paddle = {"name": "paddle", "shape": "box", "lower": [0.42, 0.1], "upper": [0.55, 0.4], "motion": "path"}
+    scene_with = plane(solid=[{**paddle, "velocity": [0.0, 0.0]}])
+    simulation = Simulation(scene_with, precision="float64")
+    state = layer.state(simulation)
+
+    def end(places, turns):
+        path = {"paddle.displacement": places, "paddle.turn": turns}
+        return 10.0 * layer.step(simulation, state, path, steps=3)["velocities"]
+
+    places = torch.tensor([[-0.004, 0.0], [-0.01, 0.001], [-0.015, 0.003]], dtype=torch.float64, requires_grad=True)
+    turns = torch.tensor([0.01, 0.03, 0.04], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(end, (places, turns), eps=1e-7, atol=1e-4, fast_mode=True)
+    end(places, turns).square().sum().backward()
+    assert places.grad.abs().max() > 1e-3 and turns.grad.abs().max() > 1e-4
