@@ -73,7 +73,7 @@ def cup_turned(across: int, steps: int) -> dict[str, float]:
     """A cup, so many particles wide, is turned upside down above a floor and back: how many particles went through its
     wall, how many were poured over its rim, and the greatest depth of one in it, in spacings."""
     spacing, radius, height, thickness = 1.0 / across, 0.5, 1.2, 5.0 / across
-    step = 0.045 * spacing
+    step = 0.03 * spacing
     time = step * steps
     base = np.array([0.0, 1.0])
     cup = {
