@@ -64,15 +64,27 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of the container, in layers of even particles."""
-    container, dimension, spacing = scene.container, scene.dimension, lattice.spacing
-    room, lower = resting_room(scene), container.periods(dimension)[0]
+    from scipy.spatial import cKDTree
+
+    (short, folded), dimension = scene.container.shortened(lattice.spacing, lattice.support), scene.dimension
+    points, sought = (
+        _even_points(container, dimension, layers, lattice.spacing) for container in (scene.container, short)
+    )
+    lower, lengths = short.periods(dimension)
+    room = Room(short.region(dimension).opened(lengths), (), lengths)
+    surface = WallSurface(sought.positions, sought.flat, lattice, room, lower, lengths, even_changes)
+    weights = surface.weights(short.places(dimension, lattice.spacing, lattice.support))
+    same = cKDTree(sought.positions).query(folded(points.positions))[1] if len(sought) else slice(0)
+    return Walls.of(points, weights[same], np.full(len(points), scene.container.sticks))
+
+
+def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
+    """The wall particles of a container."""
     particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
     positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
-    points = WallPoints(positions, flat, room.region.nearest(positions) - positions)
-    surface = WallSurface(positions, flat, lattice, room, lower, room.periods, even_changes)
-    weights = surface.weights(container.places(dimension, spacing, lattice.support))
-    return Walls.of(points, weights, np.full(len(points), container.sticks))
+    region = container.region(dimension).opened(container.periods(dimension)[1])
+    return WallPoints(positions, flat, region.nearest(positions) - positions)
 
 
 def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
+
 import numpy as np
 from numpy.typing import NDArray
 
