@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, corners
 from cortado.discretise.solids.solid import Placed, Solid
 from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
 from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
 from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
 from cortado.errors import InputError
-from cortado.scene.containers import Container
+from cortado.scene.containers import Container, NoContainer
 from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.room import resting_room
 from cortado.scene.scene import Scene
@@ -57,9 +57,24 @@ class Walls:
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
-    still = _around(scene, layers, lattice) if resting_room(scene).solids else _container_walls(scene, layers, lattice)
+    if not resting_room(scene).solids:
+        still = [_container_walls(scene, layers, lattice)]
+    elif _stand_clear(scene, lattice):
+        inner = scene.model_copy(update={"container": NoContainer()})
+        still = [_container_walls(scene, layers, lattice), _around(inner, layers, lattice)]
+    else:
+        still = [_around(scene, layers, lattice)]
     periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
-    return Walls.joined([still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+    return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+
+
+def _stand_clear(scene: Scene, lattice: RestLattice) -> bool:
+    """Whether no fluid beside a solid at rest sees the container, whose walls then are those of one without solids."""
+    room = resting_room(scene)
+    if room.periods.any() or not all(solid.is_bounded for solid in room.solids):
+        return False
+    ends = np.concatenate([corners(*solid.extent()) for solid in room.solids])
+    return bool(room.region.distance(ends).max() < -2.0 * lattice.support - lattice.spacing)
 
 
 def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:

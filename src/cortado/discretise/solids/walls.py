@@ -145,10 +145,13 @@ class ExposedSurface:
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
         for solid in self.solids:
-            near = np.flatnonzero(np.abs(solid.distance_up_to(points, furthest)) < np.minimum(best, reach + fine))
+            within, near = np.minimum(best, reach + fine), np.arange(len(points))
+            if len(self.solids) > 1:
+                near = near[np.abs(solid.distance_up_to(points, furthest)) < within]
             feet = solid.nearest(points[near])
             up, distances = feet - points[near], np.linalg.norm(feet - points[near], axis=1)
             free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.room, self.spacing)
+            free &= distances < within[near]
             near = near[free]
             found[near], best[near] = feet[free], distances[free]
         between = np.flatnonzero(np.isinf(best))
