@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import DivergedError, Problem, Scene, SceneError, Simulation, certify
+from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
 from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.runs.run_pictures import run_page
@@ -300,3 +300,11 @@ def test_pictures_and_films_show_solids_where_they_are(tmp_path):
     (down, right), there = middle(films[0][2]) - middle(films[0][0]), run.solids["rotor"].positions
     moved = there[2] - there[0]
     assert right > 3.0 and down < -1.0 and right / -down == pytest.approx(moved[0] / moved[1], rel=0.3)
+
+
+def test_a_solid_that_no_run_moved_is_a_sentence():
+    run = Simulation(plane(ROTOR)).run(1)
+    with pytest.raises(InputError, match="solids has no 'paddle', as the run moved rotor"):
+        run.solids["paddle"]
+    assert run[-1:].solids["rotor"].positions.shape == (1, 2)
+    assert "paddle" not in run.solids

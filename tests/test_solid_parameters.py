@@ -261,7 +261,7 @@ def test_a_bad_place_is_a_sentence(name, value, sentence):
 
 def test_a_solid_at_rest_is_no_parameter():
     fixed = {name: ROTOR[name] for name in ("name", "shape", "lower", "upper")}
-    with pytest.raises(InputError, match=r"'rotor.position' is unknown"):
+    with pytest.raises(InputError, match=r"'rotor.position' is unknown, as the solid 'rotor' is at rest: only those"):
         problem_of(plane(fixed)).value({"rotor.position": [0.3, 0.2]})
 
 
