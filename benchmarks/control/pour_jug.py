@@ -92,7 +92,7 @@ class PourJug(Task):
         steady = -self.turn / self.steps
         so_far = np.tril(np.ones((self.steps, self.steps)))
         steadily = steady * np.arange(1, self.steps + 1)
-        return Controls("jug.turn", Affine(steadily, GREATEST * steady * so_far @ blocks_of(self.steps, self.blocks)))
+        return Controls({"jug.turn": Affine(steadily, GREATEST * steady * so_far @ blocks_of(self.steps, self.blocks))})
 
     @property
     def known(self) -> np.ndarray:
