@@ -26,7 +26,7 @@ simulation = cortado.Simulation(scene)
 problem = cortado.Problem(simulation, STEPS, cortado.losses.SolidPose("bottle", WANTED, 0.0, length=0.1))
 start = {"bottle.velocity": np.array([1.0, 1.8]), "bottle.angular_velocity": np.array(-9.0)}
 optimiser = cortado.optimisers.LineSearch(scale={"bottle.velocity": 0.3, "bottle.angular_velocity": 3.0})
-found = cortado.optimise(problem, start, optimiser, 5)
+found = cortado.optimise(problem, start, optimiser, 4)
 
 for name, throw in (("first throw", start), ("found", found.parameters)):
     run = simulation.run(STEPS, throw, record_every=20).solids["bottle"]

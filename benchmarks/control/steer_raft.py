@@ -27,8 +27,6 @@ BEGIN, WANTED = 0.325, 0.39
 """How far the middle of the raft is from the paddle at first, and where it shall be at the end [m]."""
 VISCOSITY = 0.1
 """[Pa s]"""
-AMPLITUDE = 0.04
-"""Of the longest wave [m]; that of k half periods is 1 / k of it."""
 KNOWN = (0.55, 0.35, -0.4, 0.15, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """What a search found, rounded."""
 
@@ -44,6 +42,8 @@ class SteerRaft(Task):
     moving: int
     """Steps."""
     modes: int
+    amplitude: float = 0.04
+    """Of the longest wave [m]; that of k half periods is 1 / k of it."""
 
     @classmethod
     def small(cls) -> Self:
@@ -81,7 +81,7 @@ class SteerRaft(Task):
         """Waves along x, (1 - cos(pi k t / T)) / k of the amplitude."""
         k = np.arange(1, self.modes + 1)
         waves = (1.0 - np.cos(np.pi * np.arange(1, self.steps + 1)[:, None] / self.steps * k)) / k
-        matrix = np.einsum("sk,d->sdk", AMPLITUDE * waves, [1.0, 0.0])
+        matrix = np.einsum("sk,d->sdk", self.amplitude * waves, [1.0, 0.0])
         return Controls({"paddle.displacement": Affine(np.zeros((self.steps, 2)), matrix)})
 
     @property

@@ -19,8 +19,6 @@ from .task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 
 LAG = 0.08
 """Of the run: in so long the stick comes nearer to where it is sent, by a factor of e."""
-REACH = 0.55
-"""How far from the middle the stick can be sent along an axis, in half the width of the cup."""
 VISCOSITY = 0.3
 """Of coffee and milk [Pa s]: thick enough for a line to stay where it is drawn."""
 STICK = 2.0
@@ -41,10 +39,12 @@ class StirMilk(Task):
     actions: int
     repeats: int
     """Steps that an action takes."""
+    reach: float = 0.55
+    """How far from the middle the stick can be sent along an axis, in half the width of the cup."""
 
     @classmethod
     def small(cls) -> Self:
-        return cls(20, 0.004, 0.004, actions=25, repeats=12)
+        return cls(14, 0.004, 0.004, actions=25, repeats=10)
 
     @classmethod
     def large(cls) -> Self:
@@ -71,7 +71,7 @@ class StirMilk(Task):
             discretisation={"spacing": self.spacing},
             phase=[{**one, "viscosity": VISCOSITY} for one in (COFFEE, {**MILK, "rest_density": 1000.0})],
             fluid=[box("coffee", -half, -band), box("milk", -band, band), box("coffee", band, half)],
-            solid=[{**stick, "motion": "path", "velocity": [0.0, 0.0], "slip": "no"}],
+            solid=[{**stick, "motion": "path", "velocity": [0.0, 0.0]}],
             forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"},
             solver={"kind": "projection", "time_step": self.time_step},
             render={"view": "plane", "resolution": [2 * self.cells, 2 * self.cells]},
@@ -84,7 +84,7 @@ class StirMilk(Task):
         response = np.where(j <= k, follow * (1.0 - follow) ** np.maximum(k - j, 0), 0.0)
         times = (np.arange(self.steps) + 1.0) / self.repeats
         hats = np.maximum(1.0 - np.abs(times[:, None] - 1.0 - j), 0.0)
-        reach = REACH * 0.5 * self.cells * self.spacing
+        reach = self.reach * 0.5 * self.cells * self.spacing
         matrix = reach * np.einsum("sk,da->sdka", hats @ response, np.eye(2))
         return Controls({"stick.displacement": Affine(np.zeros((self.steps, 2)), matrix.reshape(self.steps, 2, -1))})
 
@@ -104,5 +104,7 @@ class StirMilk(Task):
         return Frames(losses)
 
     def score(self, problem: Problem, parameters: Arrays) -> Score:
+        assert isinstance(problem.loss, Frames)
         last = problem.loss.losses[self.steps]
+        assert isinstance(last, Image)
         return {"-PSNR [dB]": -image_losses.psnr(last.image(problem.end(parameters)), last.target)}

@@ -53,7 +53,9 @@ class Controls:
 
     def adjoint(self, u: np.ndarray, bars: Arrays) -> np.ndarray:
         """(numbers,) the adjoint of the numbers for those of the parameters."""
-        return self.flat({name: self.mappings[name].adjoint(share, bars[name]) for name, share in self.named(u).items()})
+        return self.flat(
+            {name: self.mappings[name].adjoint(share, bars[name]) for name, share in self.named(u).items()}
+        )
 
 
 class Task(ABC):
