@@ -7,7 +7,7 @@ import numpy as np
 
 import cortado
 
-STRUCK, STEPS, REST, TIME_STEP, ITERATIONS = 140, 200, 700, 0.0025, 2  # steps, s
+STRUCK, STEPS, REST, TIME_STEP, ITERATIONS = 140, 220, 700, 0.0025, 3  # steps, s
 TRUE, GUESS = 1600.0, 1000.0  # kg/m3
 WIDTH, HEIGHT, PILLAR = 0.24, 0.3, 0.5  # m, of the mud at first, and where the pillar stands
 
@@ -36,7 +36,7 @@ true = push(REST, TRUE)
 values = np.full((STEPS + 1, 3), np.nan)  # two forces and a torque, of which one counts
 values[:, 0] = true[: STEPS + 1] * (1.0 + 0.02 * np.random.default_rng(0).normal(size=STEPS + 1))
 times, scale = TIME_STEP * np.arange(STEPS + 1), true[STRUCK]  # the first blow itself is too rough to fit
-series = cortado.losses.Series(sensor, times[STRUCK:], values[STRUCK:], TIME_STEP, every=5, scale=scale)
+series = cortado.losses.Series(sensor, times[STRUCK:], values[STRUCK:], TIME_STEP, every=4, scale=scale)
 
 problem, optimiser = cortado.Problem(simulation, STEPS, series), cortado.optimisers.LBFGS(scale=400.0)
 bounds = {"rest_density": (500.0, 3000.0)}

@@ -101,8 +101,11 @@ class PourJug(Task):
 
     @property
     def known(self) -> np.ndarray:
-        """Made by hand: turned steadily, and moved to over the glass meanwhile."""
-        return np.concatenate([np.zeros(self.blocks), 0.5 * (np.arange(self.blocks) < 0.6 * self.blocks)])
+        """What a search found, smoothed: turned faster at first, and moved to over the glass meanwhile."""
+        times = (np.arange(self.blocks) + 0.5) / self.blocks
+        faster = np.interp(times, [0.4, 0.7], [0.8, 0.0])
+        aside = np.interp(times, [0.0, 0.1, 0.3, 0.42, 0.8], [0.55, 0.25, 0.32, 0.7, 0.0])
+        return np.concatenate([faster, aside])
 
     def loss(self, simulation: Simulation) -> Frames:
         at = np.linspace(self.steps, FIRST * self.steps, FRAMES).astype(int)

@@ -48,7 +48,7 @@ class StirMilk(Task):
 
     @classmethod
     def large(cls) -> Self:
-        return cls(60, 0.004 / 3.0, 0.0012, actions=100, repeats=10)
+        return cls(60, 0.004 / 3.0, 0.0008, actions=100, repeats=12)
 
     @property
     def steps(self) -> int:
