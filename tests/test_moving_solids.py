@@ -109,8 +109,8 @@ def test_a_piston_pushes_water_before_it(kind):
 
 
 def sliding_plate(across, thickness, dt):
-    """Fluid between a floor and a plate that slides, 1 m apart and so many particles, at 1 m/s, with nu = 1 m^2 / s; the
-    plate is so many spacings thick."""
+    """Fluid between a floor and a plate that slides, 1 m apart and so many particles, at 1 m/s, with nu = 1 m^2 / s;
+    the plate is so many spacings thick."""
     spacing = 1.0 / across
     width = 10.0 * spacing
     return plane(
