@@ -16,7 +16,7 @@ MISTAKES = {
     "custom_loss.py": ("2.0 * (share - self.wanted)", "(share - self.wanted)", "the adjoint is not the derivative"),
     "carried_cup.py": ("2.0 * end.velocities", "-2.0 * end.velocities", "water is spilt, or sloshes"),
     "flipped_bottle.py": ("optimiser, 4)", "optimiser, 1)", "the bottle does not plunge upright where it should"),
-    "poured_jug.py": ("(2.0 * apart", "(-2.0 * apart", "too much of the syrup is not in the glass"),
+    "poured_jug.py": ("optimiser, 5, bounds", "optimiser, 1, bounds", "too much of the syrup is not in the glass"),
     "steered_raft.py": ("LineSearch(), 8,", "LineSearch(), 1,", "the raft is not where it should be"),
     "stirred_tank.py": ("optimiser, ITERATIONS,", "optimiser, 1,", "the viscosity is not that of the torque"),
     "struck_pillar.py": ("values[:, 0] = true", "values[:, 0] = 2.0 * true", "the density is not that of the load"),
