@@ -23,8 +23,7 @@ WALL = 4.0
 VISCOSITY = 0.3
 """Thick enough not to splash out of the glass [Pa s]."""
 FRAMES = 5
-"""States, from when most of the water falls to the end of the run, in which it is looked for. Of water that lies beside
-the glass no change of the path is felt any more."""
+"""States, from when most of the water falls to the end of the run, in which it is looked for."""
 FIRST = 0.64
 """That of them which comes first, over the run."""
 
