@@ -102,7 +102,7 @@ LAYERS = {
         r"parameter paddle\.turn has shape \(4, 3\), but must be \(\) or \(4,\)\.",
     ),
     "velocity of solid": (
-        lambda at: at.loss({"paddle.velocity": at.jnp.zeros(2)}),
+        lambda at: at.loss({"paddle.swing": at.jnp.zeros(2)}),
         r"parameter 'paddle\.velocity' is unknown, but must be one of",
     ),
     "string dtype": (
