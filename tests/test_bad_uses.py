@@ -103,7 +103,7 @@ LAYERS = {
     ),
     "velocity of solid": (
         lambda at: at.loss({"paddle.swing": at.jnp.zeros(2)}),
-        r"parameter 'paddle\.velocity' is unknown, but must be one of",
+        r"parameter 'paddle\.swing' is unknown, but must be one of",
     ),
     "string dtype": (
         lambda at: at.loss({"gravity": np.array(["a", "b"])}),
