@@ -108,7 +108,7 @@ class ParameterSpace:
         its schedule changes it.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or those in ``arrays``.
+        diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
