@@ -95,7 +95,10 @@ def run(
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: Precision = "float32",
-    record_every: int = 1,
+    record_every: int | None = None,
+    fps: float | None = None,
+    state: Path | None = None,
+    resume: Flag = False,
     overwrite: Flag = False,
     pictures: Flag = True,
     record: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
@@ -108,20 +111,28 @@ def run(
         time: Seconds that the scene is simulated, in the place of steps: the last step ends then or later.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        record_every: Steps from one frame of the trajectory to the next.
+        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
+        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
+        state: Begin at the end of another run, which is the folder of one or a trajectory file.
+        resume: Go on with the run in the folder, after it was stopped or killed.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
         record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
     """
-    require_at_least(1, record_every, "--record-every")
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    if fps is not None and record_every is not None:
+        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
+    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
     steps = steps_or_time(steps, time)
     words, wanted, told = as_text(overrides), as_text(record), command_line()
     require_toml(scene, words)
-    from cortado.cli.commands.run import run_scene
+    from cortado.cli.commands.run import RunRequest, run_scene
+    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 
-    return partial(
-        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted, time
-    )
+    frames = EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
+    asked = (steps, time, words, device, precision, frames, wanted, state, resume, overwrite, pictures, told)
+    return partial(run_scene, scene, RunRequest(out, *asked))
 
 
 @command(app, answers=True)
