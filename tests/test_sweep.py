@@ -74,6 +74,34 @@ def test_the_first_key_changes_slowest():
     ]
 
 
+def test_values_that_go_together_are_no_product():
+    found = combinations(["c=5,6"], zipped=["a=1,1", "b=3,4"])
+    assert [one.overrides for one in found] == [
+        ["c=5", "a=1", "b=3"],
+        ["c=5", "a=1", "b=4"],
+        ["c=6", "a=1", "b=3"],
+        ["c=6", "a=1", "b=4"],
+    ]
+    assert [one.name for one in combinations([], zipped=["a=1,2", "b=3,4"])] == ["a=1,b=3", "a=2,b=4"]
+
+
+@pytest.mark.parametrize(
+    "options, zipped, words",
+    [
+        ([], ["a=1,2", "b=3"], "--zip gives 2 of a, 1 of b, but must give as many values of each"),
+        (["a=1,2"], ["a=1,2"], "--zip gives a, which --set gives too"),
+        ([], ["a=1", "a=2"], "--zip gives a twice"),
+        ([], ["a"], "--zip is 'a', but must have the form"),
+        ([f"a={','.join(map(str, range(400)))}"], [f"b={','.join(map(str, range(400)))}"], "makes 160,000"),
+    ],
+)
+def test_values_that_do_not_go_together_are_a_sentence(options, zipped, words):
+    with pytest.raises(InputError) as caught:
+        combinations(options, zipped)
+    assert_one_sentence(str(caught.value))
+    assert words in str(caught.value)
+
+
 def test_values_may_hold_commas_within_brackets_and_quotes():
     (one, other) = combinations(["fluid.0.upper=[[1, 2], {a = 3, b = ','}],[4]"])
     assert one.values == (("fluid.0.upper", "[[1, 2], {a = 3, b = ','}]"),) and other.values[0][1] == "[4]"

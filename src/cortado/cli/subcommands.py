@@ -152,6 +152,21 @@ def compare(
     return partial(compare_runs, first, second, json)
 
 
+@command(app, answers=True)
+def convergence(
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
+    json: Json = False,
+) -> Work:
+    """Tell how fast a scene converges: of runs with different spacings or time steps the order, and the limit.
+
+    Args:
+        runs: Folders of at least three runs until the same time, or of a sweep of them.
+    """
+    from cortado.cli.commands.convergence import convergence_table
+
+    return partial(convergence_table, runs, json)
+
+
 @command(app)
 def optimise(
     task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
@@ -289,6 +304,7 @@ def view(
 def sweep(
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
     sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
+    zips: Annotated[UseAppendAction[tuple[str, ...]], arg(name="zip", metavar="KEY=VALUE,VALUE")] = (),
     steps: int | None = None,
     time: float | None = None,
     out: Path = Path("runs/sweep"),
@@ -303,6 +319,7 @@ def sweep(
     Args:
         file: The scene file, or the task file.
         sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
+        zips: What changes together: the first value of one with the first of the others; given again for each of them.
         steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
         time: Seconds that a scene is simulated, in the place of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
@@ -310,12 +327,14 @@ def sweep(
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """
-    combinations = as_text(sets)
+    combinations, together = as_text(sets), as_text(zips)
     require_toml(file)
     from cortado.cli.commands.executor import Where
     from cortado.cli.commands.sweep import run_sweep
 
-    return partial(run_sweep, file, combinations, steps, time, out, device, precision, Where(scheduler, workers))
+    return partial(
+        run_sweep, file, combinations, together, steps, time, out, device, precision, Where(scheduler, workers)
+    )
 
 
 @command(app)

@@ -120,6 +120,7 @@ class Member:
 def run_sweep(
     file: Path,
     options: list[str],
+    zipped: list[str],
     steps: int | None,
     time: float | None,
     out: Path,
@@ -129,7 +130,7 @@ def run_sweep(
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
-    chosen = combinations(options)
+    chosen = combinations(options, zipped)
     member = Member(file.absolute(), _duration(file, chosen, steps, time), out.absolute(), device, precision)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
