@@ -240,7 +240,7 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
-    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
+    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32", True)
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 
@@ -342,7 +342,10 @@ def test_runs_of_several_time_steps_end_at_the_same_time(sweep, values):
 
 def test_a_sweep_may_be_given_a_time(sweep):
     several = ("--set", "solver.time_step=0.001,0.002")
-    assert sweep("scene.toml", *several, "--time", 0.006, "--out", "runs")[0] == 0
+    assert sweep("scene.toml", *several, "--time", 0.006, "--out", "runs", "--no-pictures")[0] == 0
+    assert not list(Path("runs").glob("*/report.html")) and len(list(Path("runs").glob("*/result.json"))) == 2
+    code, _, err = sweep("task.toml", "--set", "optimise.iterations=1,2", "--no-pictures")
+    assert code == 2 and err == "--no-pictures is given, but must be left out of a sweep of a task.\n"
     assert list(ends("runs").values()) == pytest.approx([0.006] * 2)
     code, out, _ = sweep("scene.toml", *several, "--steps", 6, "--out", "runs")  # the same
     assert code == 0 and "2 of them there already" in out

@@ -138,15 +138,20 @@ def run(
 @command(app, answers=True)
 def compare(
     first: Annotated[Positional[Path], arg(metavar="RUN")],
-    second: Annotated[Positional[Path], arg(metavar="RUN")],
+    second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
     json: Json = False,
 ) -> Work:
-    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
+    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made. Or
+    compare the sensors of a run with measured data.
 
     Args:
         first: The folder of a run.
-        second: The folder of another.
+        second: The folder of another, or a table of measured data with the columns of sensors.csv.
     """
+    if second.suffix.lower() == ".csv":
+        from cortado.cli.commands.measured import compare_with_data
+
+        return partial(compare_with_data, first, second, json)
     from cortado.cli.commands.compare import compare_runs
 
     return partial(compare_runs, first, second, json)
@@ -310,6 +315,7 @@ def sweep(
     out: Path = Path("runs/sweep"),
     device: str = "cpu",
     precision: Precision = "float32",
+    pictures: Flag = True,
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
@@ -323,6 +329,7 @@ def sweep(
         steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
         time: Seconds that a scene is simulated, in the place of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
+        pictures: Leave out the figures and the reports of runs of a scene, which take longer than short runs do.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
@@ -332,9 +339,8 @@ def sweep(
     from cortado.cli.commands.executor import Where
     from cortado.cli.commands.sweep import run_sweep
 
-    return partial(
-        run_sweep, file, combinations, together, steps, time, out, device, precision, Where(scheduler, workers)
-    )
+    where = Where(scheduler, workers)
+    return partial(run_sweep, file, combinations, together, steps, time, out, device, precision, where, pictures)
 
 
 @command(app)

@@ -26,7 +26,18 @@ _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "re
 REPLAY_LOG = "replay.log"
 """In which a search notes its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
-_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", "residuals", "profiles", *NAMES)
+_PICTURES = (
+    "particles",
+    "measured",
+    "rendered",
+    "density_errors",
+    "loss",
+    "images",
+    "progress",
+    "residuals",
+    "profiles",
+    *NAMES,
+)
 _SHADED = ("first", "last", "picture", "found", "search")
 _FILMS = ("run", "estimate", "film", "found", "search")
 FIGURES = (

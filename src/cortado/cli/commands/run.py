@@ -53,6 +53,8 @@ class RunRequest:
     pictures: bool = False
     """Shaded ones, and the film."""
     command: Sequence[str] = ()
+    report: bool = True
+    """Whether figures are drawn, and report.html is written."""
 
     def settings(self, simulation: Simulation, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
         """What tells one run of a scene from another."""
@@ -91,7 +93,7 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
         if asked.resume:
             announce(f"It goes on after step {begun}." if begun else "No step of it is known: it begins anew.")
         with keeping(lambda: _kept(folder)):
-            _compute(recording, asked.pictures)
+            _compute(recording, asked)
     for told in trouble(rollout, scene):
         warnings.warn(told, CortadoWarning, stacklevel=2)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
@@ -117,9 +119,14 @@ def _checksum(state: RestartState) -> str:
     return sha256(told + b"".join(state[name].tobytes() for name in sorted(state.fields))).hexdigest()[:16]
 
 
-def _compute(recording: RunRecording, pictures: bool) -> None:
+def _compute(recording: RunRecording, asked: RunRequest) -> None:
     """Run, say how it went, and fill the folder, also where the run diverges."""
-    simulation, rollout, folder, watch = recording.simulation, recording.rollout, recording.folder, recording.watch
+    simulation, rollout, folder = recording.simulation, recording.rollout, recording.folder
+
+    def report(told: Section) -> None:
+        if asked.report:
+            write_run_report(simulation, rollout, folder, told, asked.pictures, recording.watch.readings())
+
     compile_ahead(rollout.solver, simulation.device)
     begun = time.perf_counter()
     try:
@@ -127,15 +134,12 @@ def _compute(recording: RunRecording, pictures: bool) -> None:
     except DivergedError as error:
         told = error.with_advice(f"{error.advice}; the frames so far are in {folder.path}")
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
-        write_run_report(
-            simulation, rollout, folder, Section("What came out", failures=[error]), pictures, watch.readings()
-        )
+        report(Section("What came out", failures=[error]))
         raise told from error
     summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
     announce(str(summary))
     folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
-    numbers = Section("In numbers", head=("", "value", "unit"), rows=summary.rows())
-    write_run_report(simulation, rollout, folder, numbers, pictures, watch.readings())
+    report(Section("In numbers", head=("", "value", "unit"), rows=summary.rows()))
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:

@@ -40,6 +40,8 @@ class Member:
     """The folder of the sweep."""
     device: str
     precision: str
+    report: bool
+    """Whether each run of a scene has figures and a report."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
         """What came out, as in result.json; of a folder that is finished, what is there. Warnings name the folder."""
@@ -114,7 +116,9 @@ class Member:
         frames = _frames(steps)
         command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(frames.steps)]
         asked = combination.overrides, self.device, self.precision, frames
-        return RunRequest(self.out / combination.name, steps, None, *asked, resume=begun, command=command)
+        return RunRequest(
+            self.out / combination.name, steps, None, *asked, resume=begun, command=command, report=self.report
+        )
 
 
 def run_sweep(
@@ -127,11 +131,15 @@ def run_sweep(
     device: str,
     precision: str,
     where: Where,
+    pictures: bool = True,
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
     chosen = combinations(options, zipped)
-    member = Member(file.absolute(), _duration(file, chosen, steps, time), out.absolute(), device, precision)
+    duration = _duration(file, chosen, steps, time)
+    if duration is None and not pictures:
+        raise InputError("--no-pictures is given, but must be left out of a sweep of a task.")
+    member = Member(file.absolute(), duration, out.absolute(), device, precision, pictures)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
     there = len(done)
