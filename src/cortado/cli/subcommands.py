@@ -32,17 +32,19 @@ app.command(gradients, name="gradients", help="Check the gradients of a scene; t
 @command(app)
 def new(
     name: Annotated[Positional[Path], arg(metavar="NAME")],
-    dimension: int = 2,
+    template: str = "dam",
+    dimension: int | None = None,
 ) -> Work:
     """Write a commented scene that runs at once, and the schema with which editors check it.
 
     Args:
         name: The file, dam.toml or only dam.
-        dimension: 2 or 3.
+        template: What happens in it: dam, drop, honey, jug, pillar, pour, raft, rayleigh_taylor, shaken or stirred.
+        dimension: 2 or 3, of the dam; 2 if left out.
     """
     from cortado.cli.commands.new import new_scene
 
-    return partial(new_scene, name, dimension)
+    return partial(new_scene, name, template, dimension)
 
 
 @command(app, answers=True)
