@@ -255,7 +255,7 @@ def picture(
         lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
         camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
         colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it; into the run's figures if left out.
+        out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
     from cortado.cli.commands.picture import draw_run, picture_settings
