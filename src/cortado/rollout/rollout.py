@@ -77,14 +77,13 @@ class Rollout:
         self.origins: list[Origin] = []
         """Of the particles of each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
-        """The scenes of a batch that lost a particle in the last forward run, by number. What stands in their states
-        after the step before means nothing."""
+        """The scenes of a batch that lost a particle in the last forward run, by number: what follows means nothing."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
         self.step_sizes: StepSizes = FixedSteps()
         """How long the steps are; in a scene that chooses them others, which a `ParameterSpace` makes."""
         self.progress = Progress()
-        """Where forward runs of the present evaluation begin: at its first state, unless another is given."""
+        """Where forward runs of the present evaluation begin; at its first state unless it is set."""
         self.taken = 0
         """The steps of the last forward run: all of them, unless it ended before."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
