@@ -18,6 +18,7 @@ import pytest
 
 import cortado.cli.commands.optimise
 import cortado.cli.commands.run
+import cortado.cli.commands.run_recording
 import cortado.files.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
@@ -27,7 +28,7 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
-from cortado.runs.run_folder import FIGURES, RunFolder
+from cortado.runs.run_folder import FIGURES
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
@@ -174,11 +175,12 @@ def interrupting(after):
 
 
 def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatch):
-    monkeypatch.setattr(cortado.cli.commands.run, "track", interrupting(after=3))
+    monkeypatch.setattr(cortado.cli.commands.run_recording, "track", interrupting(after=3))
     code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
-    assert err == f"Interrupted; the frames so far are in {Path('dam/trajectory.vtkhdf').absolute()}.\n"
+    there = Path("dam/trajectory.vtkhdf").absolute()
+    assert err == f"Interrupted; the frames so far are in {there}; --resume goes on with them.\n"
     assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
 
 
@@ -197,9 +199,9 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_comm
 
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
-    for module in (cortado.cli.commands.run, cortado.cli.commands.optimise):
+    for module in (cortado.cli.commands.run_recording, cortado.cli.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.cli.commands.run, "frame_writer", interrupting(after=-1))
+    monkeypatch.setattr(cortado.cli.commands.run_recording, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
@@ -535,7 +537,7 @@ def test_run_and_optimise_do_not_go_on_with_each_other(cortado_command):
     cortado_command("run", "scene.toml", "--out", "dam", "--steps", 1)
     refused = cortado_command("optimise", "task.toml", "--out", "dam", "--resume")
     assert_refused(refused, "`cortado run` wrote", "`cortado optimise` cannot go on")
-    _, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 1)
+    _, _, err = cortado_command("optimise", "task.toml", "--out", "dam")
     assert "--overwrite" in err and "--resume" not in err
 
 
@@ -571,8 +573,6 @@ def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
 
     if full == "trajectory.vtkhdf":
         monkeypatch.setattr(cortado.files.vtkhdf, "write_fully", until_full)
-    elif full == "metrics.jsonl":
-        monkeypatch.setattr(RunFolder, "metrics", Path("/dev/full"))
     else:
         monkeypatch.setattr(os, "replace", lambda old, new: refuse() if Path(new).name == full else replace(old, new))
     code, out, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 8)

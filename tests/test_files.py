@@ -45,3 +45,10 @@ def test_a_link_under_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
 
 def test_temporary_names_cannot_be_guessed(tmp_path):
     assert len({unfinished(tmp_path / "a") for _ in range(100)}) == 100
+
+
+def test_a_device_or_a_pipe_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a device or a pipe"):
+        write_atomically(tmp_path / "pipe", "text")
+    assert (tmp_path / "pipe").is_fifo() and len(list(tmp_path.iterdir())) == 1

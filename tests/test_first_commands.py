@@ -16,7 +16,7 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.new import scene_text
+from cortado.cli.commands.new import scene_text, templates
 from cortado.cli.commands.overview import COMMANDS
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.subcommands import app
@@ -97,6 +97,31 @@ def test_a_new_scene_runs_at_once(cortado_command, request, dimension, pictures)
     assert cortado.Simulation("dam.toml").particles == particles
     code, out, err = cortado_command("run", "dam.toml", "--steps", 3, "--quiet")
     assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize("template", sorted(set(templates()) - {"dam"}))
+def test_a_template_is_a_scene_that_says_how_it_is_run(cortado_command, template):
+    code, out, err = cortado_command("new", "a/mine", "--template", template)
+    text, first = Path("a/mine.toml").read_text(), Path("a/mine.toml").read_text().splitlines()[1]
+    told = re.fullmatch(
+        r"# .+: ([\d,]+) particles in [23]-D\. Run it: cortado run mine\.toml( --time \S+ --fps \d+)", first
+    )
+    assert (code, err) == (0, "") and out.endswith(f"Run it: cortado run a/mine.toml{told[2]}\n")
+    VALIDATOR.validate(tomllib.loads(text))
+    scene = cortado.load_scene("a/mine.toml")
+    bodies = [*scene.fluid, *([scene.emitter] if scene.emitter else [])]
+    count = sum(len(body.particles(scene.discretisation.spacing)) for body in bodies)
+    assert count == pytest.approx(int(told[1].replace(",", "")), rel=0.1), "but for those where solids are"
+
+
+def test_there_are_ten_templates_and_the_help_names_them(cortado_command):
+    assert len(templates()) == 10
+    told = " ".join(cortado_command("new", "--help")[1].split())
+    assert all(re.search(rf"\b{name}\b", told) for name in templates())
+    assert_refused(
+        cortado_command("new", "x", "--template", "lake"), "--template is 'lake', but must be one of dam, drop"
+    )
+    assert_refused(cortado_command("new", "x", "--template", "drop", "--dimension", 3), "--dimension is given")
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -9,8 +9,8 @@ from cortado.losses import CentreOfMass
 from cortado.runs.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.motions import greatest_speed
-from cortado.scene.solids import rotation_matrix
 from cortado.scene.stability import stability_limits
+from cortado.scene.turns import rotation_matrix
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
 ROTOR = {

@@ -73,7 +73,7 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     (folder.checkpoint / "1").mkdir(parents=True)
     (folder.checkpoint / "replay.log").write_text("")
     (folder.checkpoint / "1" / "replay.log").write_text("")
-    with pytest.raises(InputError, match=r"--out, or replace it with --overwrite\.$"):
+    with pytest.raises(InputError, match=r"--out, or replace it with --overwrite, or .* --resume\.$"):
         new_run(folder.path)
     with pytest.raises(InputError, match=r"--overwrite\.$"):
         new_run(folder.path, kind="optimise")

@@ -9,7 +9,8 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
-from cortado.cli.commands.run import run_scene
+from cortado.cli.commands.run import RunRequest, run_scene
+from cortado.runs.frame_choice import EverySteps
 from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.scene.solvers import PackageSolver
 from cortado.solvers.build import particle_system
@@ -265,8 +266,7 @@ def run_command(tmp_path, monkeypatch, kind):
     on_path(tmp_path, monkeypatch)
     (tmp_path / "scene.toml").write_text(SCENE.replace("KIND", kind))
     out = tmp_path / "out"
-    settings = {"device": "cpu", "precision": "float32", "record_every": 4, "overwrite": False, "command": []}
-    return out, run_scene(tmp_path / "scene.toml", 20, out, overrides=[], **settings)
+    return out, run_scene(tmp_path / "scene.toml", RunRequest(out, steps=20, frames=EverySteps(4)))
 
 
 def test_the_run_command_reports_any_solver(monkeypatch, tmp_path):

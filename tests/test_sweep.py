@@ -74,6 +74,34 @@ def test_the_first_key_changes_slowest():
     ]
 
 
+def test_values_that_go_together_are_no_product():
+    found = combinations(["c=5,6"], zipped=["a=1,1", "b=3,4"])
+    assert [one.overrides for one in found] == [
+        ["c=5", "a=1", "b=3"],
+        ["c=5", "a=1", "b=4"],
+        ["c=6", "a=1", "b=3"],
+        ["c=6", "a=1", "b=4"],
+    ]
+    assert [one.name for one in combinations([], zipped=["a=1,2", "b=3,4"])] == ["a=1,b=3", "a=2,b=4"]
+
+
+@pytest.mark.parametrize(
+    "options, zipped, words",
+    [
+        ([], ["a=1,2", "b=3"], "--zip gives 2 of a, 1 of b, but must give as many values of each"),
+        (["a=1,2"], ["a=1,2"], "--zip gives a, which --set gives too"),
+        ([], ["a=1", "a=2"], "--zip gives a twice"),
+        ([], ["a"], "--zip is 'a', but must have the form"),
+        ([f"a={','.join(map(str, range(400)))}"], [f"b={','.join(map(str, range(400)))}"], "makes 160,000"),
+    ],
+)
+def test_values_that_do_not_go_together_are_a_sentence(options, zipped, words):
+    with pytest.raises(InputError) as caught:
+        combinations(options, zipped)
+    assert_one_sentence(str(caught.value))
+    assert words in str(caught.value)
+
+
 def test_values_may_hold_commas_within_brackets_and_quotes():
     (one, other) = combinations(["fluid.0.upper=[[1, 2], {a = 3, b = ','}],[4]"])
     assert one.values == (("fluid.0.upper", "[[1, 2], {a = 3, b = ','}]"),) and other.values[0][1] == "[4]"
@@ -212,7 +240,7 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
-    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
+    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32", True)
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 
@@ -314,7 +342,10 @@ def test_runs_of_several_time_steps_end_at_the_same_time(sweep, values):
 
 def test_a_sweep_may_be_given_a_time(sweep):
     several = ("--set", "solver.time_step=0.001,0.002")
-    assert sweep("scene.toml", *several, "--time", 0.006, "--out", "runs")[0] == 0
+    assert sweep("scene.toml", *several, "--time", 0.006, "--out", "runs", "--no-pictures")[0] == 0
+    assert not list(Path("runs").glob("*/report.html")) and len(list(Path("runs").glob("*/result.json"))) == 2
+    code, _, err = sweep("task.toml", "--set", "optimise.iterations=1,2", "--no-pictures")
+    assert code == 2 and err == "--no-pictures is given, but must be left out of a sweep of a task.\n"
     assert list(ends("runs").values()) == pytest.approx([0.006] * 2)
     code, out, _ = sweep("scene.toml", *several, "--steps", 6, "--out", "runs")  # the same
     assert code == 0 and "2 of them there already" in out

@@ -5,8 +5,10 @@ import sys
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from cortado.errors import ComputationError, InputError
+from cortado.files.animation import moving_picture
 from cortado.files.srgb import to_srgb
 from cortado.files.video import BITS, write_video, writing
 from cortado.pictures.image_files import COFFEE, MILK, heart
@@ -91,3 +93,28 @@ def test_noise_takes_no_more_than_10_mb_a_minute(tmp_path):
     most = BITS * pixels**0.75 / 8  # bytes a second
     assert 1.0 * most < path.stat().st_size < 1.1 * (3.0 + 4.0) * most
     assert BITS / 8 * (60 + 4) < 10e6
+
+
+def test_an_animation_has_its_frames_at_their_times(tmp_path):
+    grey = [np.full((18, 32, 3), light) for light in (0.1, 0.5, 0.9)]
+    with moving_picture(tmp_path / "a.webp", 25.0) as animation:
+        for image, time in zip(grey, (0.0, 0.04, 0.24), strict=True):
+            animation.add(image, time)
+    with Image.open(tmp_path / "a.webp") as found:
+        assert (found.format, found.n_frames, found.size, found.info["loop"]) == ("WEBP", 3, (32, 18), 0)
+        durations = []
+        for k, image in enumerate(grey):
+            found.seek(k)
+            np.testing.assert_allclose(np.asarray(found.convert("RGB")), to_srgb(image), atol=3)
+            durations.append(found.info["duration"])
+    assert durations == [40, 200, 1500]
+
+
+def test_an_animation_that_is_stopped_keeps_its_frames(tmp_path):
+    with pytest.raises(KeyboardInterrupt), moving_picture(tmp_path / "a.webp", 25.0) as animation:
+        animation.add(np.zeros((18, 32, 3)), 0.0)
+        raise KeyboardInterrupt
+    assert Image.open(tmp_path / "a.webp").size == (32, 18)
+    with pytest.raises(InputError, match="has no frames"), moving_picture(tmp_path / "b.webp", 25.0):
+        pass
+    assert not (tmp_path / "b.webp").exists()

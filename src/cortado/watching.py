@@ -61,6 +61,14 @@ class Watch:
             moment = Moment.of(self._rollout, step, state, self._evaluator)
             self._log.read(Snapshot(state, self._dimension, self._colours, moment))
 
+    def known(self, readings: Mapping[str, Readings]) -> float:
+        """The last step of which an earlier process has left all readings; infinite without sensors."""
+        return self._log.known(readings)
+
+    def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
+        """Have what sensors of an earlier process read of the first states, up to that after so many steps."""
+        self._log.go_on(steps, readings)
+
     def readings(self) -> dict[str, Readings]:
         """What the sensors have read, by their names."""
         clock, steps = self._rollout.clocks[0], np.arange(self._rollout.steps + 1)

@@ -22,6 +22,7 @@ from cortado.cli.arguments import (
 )
 from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
+from cortado.cli.many_runs import convergence, dataset, sweep
 from cortado.cli.parsing import Program, completion_script
 from cortado.errors import InputError
 
@@ -32,17 +33,19 @@ app.command(gradients, name="gradients", help="Check the gradients of a scene; t
 @command(app)
 def new(
     name: Annotated[Positional[Path], arg(metavar="NAME")],
-    dimension: int = 2,
+    template: str = "dam",
+    dimension: int | None = None,
 ) -> Work:
     """Write a commented scene that runs at once, and the schema with which editors check it.
 
     Args:
         name: The file, dam.toml or only dam.
-        dimension: 2 or 3.
+        template: What happens in it: dam, drop, honey, jet, pillar, pour, raft, rayleigh_taylor, shaken or stirred.
+        dimension: 2 or 3, of the dam; 2 if left out.
     """
     from cortado.cli.commands.new import new_scene
 
-    return partial(new_scene, name, dimension)
+    return partial(new_scene, name, template, dimension)
 
 
 @command(app, answers=True)
@@ -95,7 +98,10 @@ def run(
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: Precision = "float32",
-    record_every: int = 1,
+    record_every: int | None = None,
+    fps: float | None = None,
+    state: Path | None = None,
+    resume: Flag = False,
     overwrite: Flag = False,
     pictures: Flag = True,
     record: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
@@ -108,34 +114,47 @@ def run(
         time: Seconds that the scene is simulated, in the place of steps: the last step ends then or later.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        record_every: Steps from one frame of the trajectory to the next.
+        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
+        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
+        state: Begin at the end of another run, which is the folder of one or a trajectory file.
+        resume: Go on with the run in the folder, after it was stopped or killed.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
         record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
     """
-    require_at_least(1, record_every, "--record-every")
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    if fps is not None and record_every is not None:
+        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
+    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
     steps = steps_or_time(steps, time)
     words, wanted, told = as_text(overrides), as_text(record), command_line()
     require_toml(scene, words)
-    from cortado.cli.commands.run import run_scene
+    from cortado.cli.commands.run import RunRequest, run_scene
+    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 
-    return partial(
-        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted, time
-    )
+    frames = EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
+    asked = (steps, time, words, device, precision, frames, wanted, state, resume, overwrite, pictures, told)
+    return partial(run_scene, scene, RunRequest(out, *asked))
 
 
 @command(app, answers=True)
 def compare(
     first: Annotated[Positional[Path], arg(metavar="RUN")],
-    second: Annotated[Positional[Path], arg(metavar="RUN")],
+    second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
     json: Json = False,
 ) -> Work:
-    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
+    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made. Or
+    compare the sensors of a run with measured data.
 
     Args:
         first: The folder of a run.
-        second: The folder of another.
+        second: The folder of another, or a table of measured data with the columns of sensors.csv.
     """
+    if second.suffix.lower() == ".csv":
+        from cortado.cli.commands.measured import compare_with_data
+
+        return partial(compare_with_data, first, second, json)
     from cortado.cli.commands.compare import compare_runs
 
     return partial(compare_runs, first, second, json)
@@ -222,7 +241,7 @@ def picture(
         lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
         camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
         colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it; into the run's figures if left out.
+        out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
     from cortado.cli.commands.picture import draw_run, picture_settings
@@ -274,68 +293,9 @@ def view(
     return partial(show, path, as_text(overrides), device, precision, port)
 
 
-@command(app)
-def sweep(
-    file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
-    sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
-    steps: int | None = None,
-    time: float | None = None,
-    out: Path = Path("runs/sweep"),
-    device: str = "cpu",
-    precision: Precision = "float32",
-    scheduler: str | None = None,
-    workers: int | None = None,
-) -> Work:
-    """Run a scene, or optimise a task, with every combination of some values, each in a folder of its own; folders that
-    are finished already are not repeated.
-
-    Args:
-        file: The scene file, or the task file.
-        sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
-        steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
-        time: Seconds that a scene is simulated, in the place of steps.
-        out: Folder of the sweep, with a folder for each combination and a table of them all.
-        device: "cpu", or "cuda:0" for the first GPU, of each worker.
-        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
-        workers: Number of worker processes on this machine; on a GPU each has one of its own.
-    """
-    combinations = as_text(sets)
-    require_toml(file)
-    from cortado.cli.commands.executor import Where
-    from cortado.cli.commands.sweep import run_sweep
-
-    return partial(run_sweep, file, combinations, steps, time, out, device, precision, Where(scheduler, workers))
-
-
-@command(app)
-def dataset(
-    file: Annotated[Positional[Path], arg(metavar="SCENE.toml|TASK.toml")],
-    runs: int = 100,
-    out: Path = Path("runs/dataset"),
-    overrides: Overrides = (),
-    device: str = "cpu",
-    precision: Precision = "float32",
-    scheduler: str | None = None,
-    workers: int | None = None,
-) -> Work:
-    """Compute many runs of a scene with varied values, to train learned simulators on; the same command goes on with
-    those that are missing.
-
-    Args:
-        file: A file with the table [dataset], which says what varies.
-        runs: How many, those for validation and tests included.
-        out: Folder of the data set: train.h5, valid.h5, test.h5 and metadata.json, as LagrangeBench reads them.
-        overrides: Replace a value of the file, such as dataset.steps=200; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU, of each worker.
-        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
-        workers: Number of worker processes on this machine; on a GPU each has one of its own.
-    """
-    words = as_text(overrides)
-    require_toml(file, words)
-    from cortado.cli.commands.dataset import make_dataset
-    from cortado.cli.commands.executor import Where
-
-    return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
+command(app)(sweep)
+command(app, answers=True)(convergence)
+command(app)(dataset)
 
 
 @command(app, answers=True)

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from cortado.errors import LONGEST
 
 _COMMAND = re.compile(
-    r"(new|examples|describe|run|compare|optimise|fit|picture|export|view|sweep|dataset|schema|completion"
+    r"(new|examples|describe|run|compare|convergence|optimise|fit|picture|export|view|sweep|dataset|schema|completion"
     r"|gradients( check)?|figure|study)(?= |$)"
 )
 _EDGES = "│|╭╮╰╯─-+ "

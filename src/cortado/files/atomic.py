@@ -29,10 +29,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
     Raises:
         ComputationError: the disk is full.
-        InputError: there can be no such file.
+        InputError: there can be no such file, or something of that name is no file, such as a device.
     """
     temporary = unfinished(path)
     with sentences(path):
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path} is a device or a pipe, which would be replaced; choose the name of a file.")
         try:
             with open(temporary, "xb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)

@@ -98,7 +98,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
     """
     av, path = pyav(), Path(path)
     if path.suffix.lower() != ".mp4":
-        raise InputError(f"The video {path} must end in .mp4.")
+        raise InputError(f"The film {path} must end in .mp4, or in .webp.")
     if not 0.0 < frames_per_second < np.inf:
         raise InputError(f"frames_per_second is {frames_per_second}, but must be a positive number.")
     temporary = unfinished(path)

@@ -29,8 +29,8 @@ from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frames_seed
 class TrajectoryWriter:
     """Writes frames as they are computed; a context manager.
 
-    The file appears at `path` with its first frame and can be opened, by ParaView too, while it grows: frames that
-    are not written yet, or never were because the run ended early, have no particles there.
+    The file appears at `path` with its first frame, or with those that are `kept`, and can be opened, by ParaView too,
+    while it grows: frames that are not written yet, or never were as the run ended early, have no particles there.
 
     Args:
         path: the file, replaced when it exists.
@@ -46,6 +46,7 @@ class TrajectoryWriter:
         diagnostics: the type of each number that `append_steps` will be told of a step, by name.
         origin: what the particles are of, as a text of JSON.
         expected: how many frames are likely to come, which the disk must have room for; all of them if left out.
+        kept: so many frames are those of the file that is there, which is replaced when they are written.
 
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
@@ -68,6 +69,7 @@ class TrajectoryWriter:
         diagnostics: Mapping[str, DTypeLike] | None = None,
         origin: str = "",
         expected: int | None = None,
+        kept: int = 1,
     ) -> None:
         moments = np.array(times, dtype=np.float64, ndmin=1)
         if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
@@ -76,7 +78,7 @@ class TrajectoryWriter:
                 f"{len(moments)} frames, {particles} particles, dimension {dimension} and {steps} steps."
             )
         self.path = Path(path)
-        self.frames_written = 0
+        self.frames_written, self._kept = 0, kept
         self.steps_written = 0
         self._layout = FileLayout(
             moments,
@@ -159,7 +161,7 @@ class TrajectoryWriter:
                 self._write("VTKHDF/Steps/Values", 8 * frame, moment.tobytes())
             self._write("VTKHDF/Steps/PartOffsets", 8 * frame, struct.pack("<q", WRITTEN))
             self._write("cortado/progress", 0, struct.pack("<II", frame + 1, checksum))
-            if frame == 0:
+            if frame + 1 == self._kept:
                 os.replace(self._unfinished, self.path)
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
@@ -185,9 +187,9 @@ class TrajectoryWriter:
         self.steps_written, self._steps_checksum = last, checksum
 
     def close(self) -> None:
-        """Ends the file; without any frame, none is left behind."""
+        """Ends the file; without any frame, or all that are kept, none is left behind."""
         self._file.close()
-        if self.frames_written == 0:
+        if self.frames_written < self._kept:
             self._unfinished.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:

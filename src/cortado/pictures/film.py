@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from cortado.files.animation import moving_picture
 from cortado.files.progress import track
-from cortado.files.video import writing
 from cortado.pictures.notebook import with_video
 from cortado.pictures.pace import Pace
 from cortado.pictures.page import Page
@@ -52,7 +52,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     next call of the same film goes on after it."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
-    with writing(path, pace.frames_per_second, note, len(shown)) as video:
+    with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
             for image, time in zip(page.images(shown[there:]), pace.times[there:], strict=True):

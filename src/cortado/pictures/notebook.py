@@ -24,8 +24,10 @@ def with_view(found: object, view: str, draw: Callable[[Path], Any]) -> str:
 
 
 def with_video(found: object, path: Path) -> str:
-    """HTML of an object: its repr, and a video in a file, which is part of the page."""
+    """HTML of an object: its repr, and a video, or an animation, in a file, which is part of the page."""
     content = b64encode(path.read_bytes()).decode()
+    if path.suffix.lower() == ".webp":
+        return f'{as_words(found)}<img src="data:image/webp;base64,{content}" style="width: 100%">'
     source = f"data:video/mp4;base64,{content}"
     return f'{as_words(found)}<video controls loop muted playsinline src="{source}" style="width: 100%"></video>'
 

@@ -24,6 +24,7 @@ from cortado.rollout.chunks import chunk_length
 from cortado.rollout.counted import require_counted
 from cortado.rollout.divergence import diverged
 from cortado.rollout.evaluation import Pending, PutAside
+from cortado.rollout.progress import Progress
 from cortado.rollout.step_sizes import FixedSteps, StepSizes
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepTangent
@@ -76,12 +77,13 @@ class Rollout:
         self.origins: list[Origin] = []
         """Of the particles of each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
-        """The scenes of a batch that lost a particle in the last forward run, by number. What stands in their states
-        after the step before means nothing."""
+        """The scenes of a batch that lost a particle in the last forward run, by number: what follows means nothing."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
         self.step_sizes: StepSizes = FixedSteps()
         """How long the steps are; in a scene that chooses them others, which a `ParameterSpace` makes."""
+        self.progress = Progress()
+        """Where forward runs of the present evaluation begin; at its first state unless it is set."""
         self.taken = 0
         """The steps of the last forward run: all of them, unless it ended before."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
@@ -112,7 +114,7 @@ class Rollout:
     def diagnostics(self) -> Mapping[str, np.ndarray]:
         """(steps,) by name, in a batch (steps, batch), of the steps of the last forward run: see `StepLog`."""
         found = self.log.diagnostics
-        return {**found, **self.step_sizes.diagnostics(len(found["converged"]))}
+        return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
 
     def is_last(self, step: int) -> bool:
         """Whether the state after so many steps, which was observed, is the last one of the run."""
@@ -134,7 +136,7 @@ class Rollout:
         if self.pending:
             self._checkpoints = Checkpoints(self.initial, self._interval)
         self.pending.clear()
-        self.evaluation = next(self._evaluations)
+        self.progress, self.evaluation = Progress(), next(self._evaluations)
 
     def put_aside(self) -> PutAside:
         """What the next evaluation overwrites."""
@@ -157,12 +159,12 @@ class Rollout:
         self._spare += self._checkpoints.release()
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self.lost = {}
-        state, step, ended = self.initial, 0, False
+        state, step, ended = self.progress.begin(self.initial, self.step_sizes, keep)
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
         if self.steps > 0:
             compile_ahead(self.solver, self._device)
-        self.solver.reset()
+        self.solver.reset(step)
         try:
             while step < self.steps and not ended:
                 last = min(step + min(len(self._chunk), self.step_sizes.longest_chunk), self.steps)

@@ -43,6 +43,10 @@ class StepSizes(Protocol):
     def begin_at(self, state: State) -> None:
         """The length of the first step, from a state."""
 
+    def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
+        """Have the steps before a state as an earlier process chose them, (step,) [s], and choose the one after it.
+        Returns whether the run ends with the state."""
+
     def choose(self, state: State) -> None:
         """The length of the step after a state, whose number the solver has counted: launches alone."""
 
@@ -77,6 +81,10 @@ class FixedSteps:
 
     def begin_at(self, state: State) -> None:
         """See `StepSizes`."""
+
+    def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
+        """See `StepSizes`."""
+        return False
 
     def choose(self, state: State) -> None:
         """See `StepSizes`."""
@@ -148,6 +156,18 @@ class ChosenSteps:
         self._solver.step_number.fill_(0)
         self.choose(state)
         self._look(0, 0)
+
+    def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
+        """See `StepSizes`. Times are added up as the device does, one step after the other in float64."""
+        assert sizes is not None
+        times = np.cumsum([self._read.times[0, 0], *sizes[: step - 1].astype(np.float64)])
+        self._sizes[:step].assign(sizes[:step, None])
+        self._times[:step].assign(times[:, None])
+        self._solver.step_number.fill_(step)
+        self.choose(state)
+        for first, last in [(0, step)] if self._fill is None else [(n, n) for n in range(step + 1)]:
+            self._look(first, last)
+        return self.is_end(step)
 
     def end_after(self, duration: float) -> None:
         """The run, of a single scene, ends with the first state that is so much later than its first [s]."""

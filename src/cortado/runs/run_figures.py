@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cortado.pictures.canvas import DASHED, FAINT, PALETTE, drawing, whole_numbers
 from cortado.runs.sensors.log import Readings
+from cortado.runs.sensors.measured import Measured
 from cortado.runs.trajectory import Trajectory
 
 
@@ -59,6 +60,22 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
                 label = label.replace("_", " ")
                 panel.plot(own.times, own[column], color=PALETTE[k % len(PALETTE)], linewidth=1.3, label=label)
             panel.set_ylabel(f"[{unit}]")
+            panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+        panels[-1].set_xlabel("time [s]")
+    return Path(path)
+
+
+def beside_measured(found: Mapping[str, Readings], measured: Sequence[Measured], path: str | Path) -> Path:
+    """A panel for each number that was measured: its points, the curve of the sensor, and the error in the title."""
+    with drawing(path, height=1.5 + 2.5 * len(measured)) as figure:
+        panels = figure.subplots(len(measured), 1, sharex=True, squeeze=False)[:, 0]
+        for panel, one in zip(panels, measured, strict=True):
+            name, _, column = one.name.rpartition(".")
+            panel.plot(found[name].times, found[name][column], color=PALETTE[0], linewidth=1.3, label="simulated")
+            panel.plot(one.times, one.values, "o", color=PALETTE[6], markersize=3.5, label="measured")
+            error = f"apart by {one.errors['root_mean_square']:.3g} {one.unit} (root mean square)"
+            panel.set_title(f"{name} {column}: {error}".replace("_", " "))
+            panel.set_ylabel(f"[{one.unit}]")
             panel.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         panels[-1].set_xlabel("time [s]")
     return Path(path)

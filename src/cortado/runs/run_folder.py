@@ -14,19 +14,30 @@ from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.runs.run_environment import as_json, plain, require_same, session
 from cortado.runs.run_files import bytes_of, computed, cut_torn_line, finite, in_present_words, read_json
-from cortado.runs.sensors.log import Readings, as_csv
+from cortado.runs.sensors.log import Readings, as_csv, from_csv
 from cortado.scene.parameters.values import NAMES
 from cortado.scene.scene import Scene
 
 _FORMAT = 2
 """Of run folders, in environment.json; of those before it says nothing."""
-_RESUMABLE = "optimise"
-"""The command that has --resume."""
+_RESUMABLE = ("run", "optimise")
+"""The commands that have --resume."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
 """In which a search notes its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
-_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", "residuals", "profiles", *NAMES)
+_PICTURES = (
+    "particles",
+    "measured",
+    "rendered",
+    "density_errors",
+    "loss",
+    "images",
+    "progress",
+    "residuals",
+    "profiles",
+    *NAMES,
+)
 _SHADED = ("first", "last", "picture", "found", "search")
 _FILMS = ("run", "estimate", "film", "found", "search")
 FIGURES = (
@@ -170,6 +181,11 @@ class RunFolder:
         if readings:
             write_atomically(self.sensors, as_csv(readings))
 
+    def read_sensors(self) -> dict[str, Readings]:
+        """What `write_sensors` wrote, bit for bit; nothing where it wrote nothing. Raises `InputError` for a damaged
+        file."""
+        return from_csv(self.sensors) if self.sensors.exists() else {}
+
     @property
     def checkpoint(self) -> Path:
         """The optimiser's own folder, from which it resumes."""
@@ -220,6 +236,12 @@ class RunFolder:
         with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(line)
 
+    def write_metrics(self, columns: Mapping[str, Any]) -> None:
+        """Writes metrics.jsonl with a line for each step, from (steps,) of each name; whole or not at all."""
+        rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
+        lines = [json.dumps({"step": step, **row}, default=plain) + "\n" for step, row in enumerate(rows, 1)]
+        write_atomically(self.metrics, "".join(lines))
+
     def read_metrics(self) -> list[dict[str, Any]]:
         """All lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
 
@@ -252,7 +274,7 @@ class RunFolder:
         elif not self._holds_run():
             raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
         elif not overwrite:
-            resumable = kind == _RESUMABLE == read_json(self.environment).get("kind")
+            resumable = kind in _RESUMABLE and kind == read_json(self.environment).get("kind")
             advice = ", or go on with it by --resume" if resumable else ""
             raise InputError(
                 f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."

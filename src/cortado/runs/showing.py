@@ -40,7 +40,7 @@ class Showing:
         frames, and the same call goes on after them. See `docs/pictures.md`.
 
         Args:
-            path: ends in .mp4.
+            path: ends in .mp4, or in .webp, an animation that pages of text show, and which does not go on.
             scene: that of the run, or the path of its file; needed of a trajectory that was loaded from a file.
             device: of the rays, "cpu" or "cuda:0".
             settings: keys of the scene's table [picture], such as ``colour="speed"``, ``film_speed=0.25`` or

@@ -239,9 +239,14 @@ class Trajectory(Showing):
         own = {name: array[:1] for name, array in self.quantities.items()}
         with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin, own) as writer:
             writer.append_steps(**self.diagnostics)
-            for k, step in enumerate(self.steps):
-                recorded = {name: array[k] for name, array in self.quantities.items()}
-                append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step), recorded)
+            self.write_frames(writer)
+
+    def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
+        """Writes all frames to a file that has room for them."""
+        for k, step in enumerate(self.steps):
+            recorded = {name: array[k] for name, array in self.quantities.items()}
+            frame = {name: array[k] for name, array in self._fields.items()}
+            append_frame(writer, frame, int(step), recorded, float(self.times[k]))
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
         """Writes the surface of the fluid, coloured by phase, its particles, and solids for other programs: see

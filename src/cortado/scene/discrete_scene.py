@@ -103,12 +103,21 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
     if scene.discretisation.jitter:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
+    fluid = replace(fluid, velocities=_velocities(scene, fluid))
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
         told = check_crowding(crowding, spacing, "the points of the fluid")
         if told is not None:
             warnings.warn(told, CortadoWarning, stacklevel=3)
     return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+
+
+def _velocities(scene: Scene, fluid: FluidSample) -> Points:
+    """(n, d) first velocities [m/s], where those of a body that spins follow from the places of its particles."""
+    found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
+    for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
+        found[end - size : end] = body.velocities(fluid.positions[end - size : end])
+    return found
 
 
 def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> Points:

@@ -12,7 +12,7 @@ from cortado.discretise.solids.solid import Placed, Solid
 from cortado.scene.fields import FieldPath, Length
 from cortado.scene.fluids import ALIGNED, BoxFluid, CylinderFluid, PointsFluid, RegionFluid, SphereFluid
 from cortado.scene.outlines import MeshShape, PolygonShape
-from cortado.scene.solids import Rotation, check_turn, rotation_matrix
+from cortado.scene.turns import Rotation, check_turn, rotation_matrix
 
 
 class FilledShape(RegionFluid):

@@ -13,6 +13,7 @@ from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, blo
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table
+from cortado.scene.turns import Turning, check_turn
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 ALIGNED = 1e-3
@@ -43,6 +44,29 @@ class Fluid(FluidBody):
 
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Velocity at the start [m/s]."""
+    angular_velocity: Turning | None = None
+    """How fast it spins about its middle at the start, not at all if left out: in 3-D a vector, in 2-D one number,
+    counterclockwise [rad/s]."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        check_turn((*path, "angular_velocity"), self.angular_velocity, dimension)
+        return super().in_dimension(dimension, path)
+
+    def velocities(self, points: Points) -> Points:
+        """(n, d) [m/s] at the start, of its particles at points (n, d) [m], whose mean is its middle."""
+        found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
+        if self.angular_velocity is None:
+            return found
+        arms = points - points.mean(axis=0)
+        if len(self.angular_velocity) == 1:
+            return found + self.angular_velocity[0] * np.stack([-arms[:, 1], arms[:, 0]], axis=1)
+        return found + np.cross(self.angular_velocity, arms)
+
+    def greatest_speed(self, spacing: float) -> float:
+        """Of its particles at the start, or somewhat more [m/s]."""
+        spin = np.linalg.norm(self.angular_velocity or 0.0)
+        lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
+        return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
     def box_corners(self, spacing: float) -> Points:
         """(2^d, d) the corners of the extent [m]."""

@@ -24,6 +24,8 @@ class FluidSample:
     """(n, d) [m/s]"""
     phase: NDArray[np.int64]
     """(n,) index into the scene's phases"""
+    sizes: tuple[int, ...]
+    """How many particles each body of fluid has, without those of the emitter."""
     bodies: tuple[CutBody, ...]
     """Those whose particles are to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
@@ -61,7 +63,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
     for index, (particles, body) in enumerate(zip(positions, bodies, strict=True)):
         if not len(particles):
             raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
-    velocities = [np.tile(fluid.velocity, (len(x), 1)) for fluid, x in zip(scene.fluid, positions, strict=True)]
+    velocities = [fluid.velocities(x) for fluid, x in zip(scene.fluid, positions, strict=True)]
     phases = [names.index(fluid.phase) for fluid in scene.fluid]
     emitted = None
     if scene.emitter is not None:
@@ -75,6 +77,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
         positions=np.concatenate(positions),
         velocities=np.concatenate(velocities),
         phase=np.repeat(phases, sizes),
+        sizes=tuple(sizes[: len(scene.fluid)]),
         bodies=tuple(body for body in bodies if body is not None),
         is_packed=np.repeat([body is not None for body in bodies], sizes),
         is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),

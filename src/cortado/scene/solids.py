@@ -2,11 +2,10 @@
 
 from abc import abstractmethod
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
@@ -14,20 +13,7 @@ from cortado.errors import Words, shown
 from cortado.scene.containers import Container
 from cortado.scene.fields import MISSING, Colour, FieldPath, Length, Text, field_error, quantity
 from cortado.scene.tables import Table
-
-Angle = Annotated[float, quantity("rad")]
-
-
-def _in_a_list(value: Any) -> Any:
-    return [value] if isinstance(value, (int, float)) else value
-
-
-Rotation = Annotated[tuple[Angle, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
-Turning = Annotated[
-    tuple[Annotated[float, quantity("rad/s")], ...],
-    Field(min_length=1, max_length=3, fail_fast=True),
-    BeforeValidator(_in_a_list),
-]
+from cortado.scene.turns import Rotation, Turning, check_turn, rotation_matrix
 
 
 class SolidTable(Table):
@@ -126,22 +112,6 @@ class SolidTable(Table):
             check_turn((*path, name), getattr(self, name), dimension)
         _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
-
-
-def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
-    """A rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
-    if value is not None and len(value) != 2 * dimension - 3:
-        wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
-        raise field_error(path, value, wanted)
-
-
-def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
-    """(d, d) of a rotation vector [rad], or in 2-D of an angle."""
-    from scipy.spatial.transform import Rotation as Turn
-
-    if len(rotation) == 1:
-        return np.asarray(Turn.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
-    return np.asarray(Turn.from_rotvec(rotation).as_matrix())
 
 
 def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:

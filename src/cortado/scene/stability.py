@@ -159,7 +159,8 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
-        speed = max((float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid), default=0.0)
+        spacing = scene.discretisation.spacing
+        speed = max((fluid.greatest_speed(spacing) for fluid in scene.fluid), default=0.0)
     if scene.emitter is None:
         return speed
     faster = float(values.get("flow_rate", scene.emitter.flow_rate)) / scene.emitter.flow_rate

@@ -37,10 +37,10 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
     scenes = [_json(folder.scene) for folder in (one, other)]
     found: dict[str, Any] = {
         "runs": [str(one.path), str(other.path)],
-        "scene": _differences(scenes[0], scenes[1]),
-        "settings": _differences(settings[0], settings[1]),
-        "environment": _differences(environments[0], environments[1]),
-        "result": _differences(one.read_result() or {}, other.read_result() or {}),
+        "scene": differences(scenes[0], scenes[1]),
+        "settings": differences(settings[0], settings[1]),
+        "environment": differences(environments[0], environments[1]),
+        "result": differences(one.read_result() or {}, other.read_result() or {}),
         "metrics": _other_steps(settings, scenes) or _metrics(one, other),
         "last_state": _last_states(one, other),
     }
@@ -75,7 +75,7 @@ def _table(value: Any) -> dict[str, Any]:
     return dict(value) if isinstance(value, Mapping) else {}
 
 
-def _differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
+def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
     """Both values of whatever differs, by dotted names."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, _MISSING), other.get(key, _MISSING)) for key in {**one, **other}}
@@ -85,7 +85,7 @@ def _differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
         return {} if one == other else {name: [one, other]}
     before = f"{name}." if name else ""
     return {
-        key: pair for part, values in pairs.items() for key, pair in _differences(*values, f"{before}{part}").items()
+        key: pair for part, values in pairs.items() for key, pair in differences(*values, f"{before}{part}").items()
     }
 
 

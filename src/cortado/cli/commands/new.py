@@ -1,9 +1,9 @@
-"""``cortado new``: a commented scene to begin with."""
+"""``cortado new``: a commented scene to begin with, one of ten."""
 
 from pathlib import Path
 from string import Template
 
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.files.atomic import is_taken, sentences, write_atomically
 from cortado.files.shipped import SCHEMA
 
@@ -115,10 +115,27 @@ _DIMENSIONS = {
 """What differs between 2-D and 3-D."""
 
 
-def new_scene(path: Path, dimension: int) -> str:
+DAM = "dam"
+"""The template that explains every line, in 2-D and in 3-D."""
+TEMPLATES = Path(__file__).parents[1] / "templates"
+"""Files of the others, each a scene whose first line says what it is and how it is run."""
+_SCENE_FILE = "SCENE.toml"
+"""What that line calls the file."""
+
+
+def templates() -> list[str]:
+    """Their names."""
+    return [DAM, *sorted(path.stem for path in TEMPLATES.glob("*.toml"))]
+
+
+def new_scene(path: Path, template: str, dimension: int | None) -> str:
     """Write a scene, and beside it the schema that editors complete and check it with; nothing that is there is
     replaced."""
-    if dimension not in _DIMENSIONS:
+    if template not in templates():
+        raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
+    if dimension is not None and template != DAM:
+        raise InputError(f"--dimension is given, but must be left out, as only {DAM} is there in 2-D and in 3-D.")
+    if dimension not in (None, *_DIMENSIONS):
         raise InputError(f"--dimension is {dimension}, but must be 2 or 3.")
     if path.name in ("", ".."):
         raise InputError("NAME must be the name of a file, such as dam.toml.")
@@ -128,13 +145,26 @@ def new_scene(path: Path, dimension: int) -> str:
     schema = file.with_name(SCHEMA.name)
     with sentences(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, scene_text(file, dimension))
+    text, options = (scene_text(file, dimension or 2), "") if template == DAM else template_text(file, template)
+    write_atomically(file, text)
     if not is_taken(schema):
         write_atomically(schema, SCHEMA.read_bytes())
-    return f"The scene is {file}; {schema} tells editors what may stand in it. Run it: cortado run {file}"
+    return f"The scene is {file}; {schema} tells editors what may stand in it. Run it: cortado run {file}{options}"
 
 
 def scene_text(file: Path, dimension: int) -> str:
     """The scene that is written to a file."""
-    named = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
+    named = _printable(file.name)
     return _SCENE.substitute(_DIMENSIONS[dimension], dimension=dimension, file=named, name=named.removesuffix(".toml"))
+
+
+def template_text(file: Path, template: str) -> tuple[str, str]:
+    """The scene of a template that is written to a file, and the options with which it is run."""
+    text = (TEMPLATES / f"{template}.toml").read_text(encoding="utf-8")
+    options = text.splitlines()[0].partition(_SCENE_FILE)[2]
+    return f"#:schema ./{SCHEMA.name}\n{text.replace(_SCENE_FILE, _printable(file.name), 1)}", options
+
+
+def _printable(name: str) -> str:
+    """A name as it may stand in a scene."""
+    return "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in name)

@@ -65,8 +65,10 @@ class RunSummary:
     """That was simulated [s]."""
     sizes: str
     """How long steps were, in words."""
+    computed: int
+    """Of the steps, those that the present process took: the others were there already."""
     seconds: float
-    """That the steps took, with what was recorded of them."""
+    """That these took, with what was recorded of them."""
     first: Energy
     last: Energy
     turned: bool
@@ -87,6 +89,7 @@ class RunSummary:
             found = float(densities.min()), float(densities.max())
         return cls(
             steps=taken,
+            computed=taken - rollout.progress.step,
             time=simulated(rollout),
             sizes=sizes_in_words(rollout),
             seconds=seconds,
@@ -101,7 +104,11 @@ class RunSummary:
     @property
     def milliseconds(self) -> float:
         """That a step took."""
-        return 1e3 * self.seconds / self.steps
+        return 1e3 * self.seconds / max(self.computed, 1)
+
+    @property
+    def _computed_in_words(self) -> str:
+        return "all" if self.computed == self.steps else f"the last {self.computed}"
 
     def for_machines(self) -> dict[str, Any]:
         """What is the same in every run, by names."""
@@ -121,7 +128,7 @@ class RunSummary:
             ("steps", self.steps, ""),
             ("simulated time", f"{self.time:.4g}", "s"),
             ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
-            ("time that all steps took", f"{self.seconds:.3g}", "s"),
+            (f"time that {self._computed_in_words} steps took", f"{self.seconds:.3g}", "s"),
             *energies,
             *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
             *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
@@ -129,8 +136,10 @@ class RunSummary:
 
     def __str__(self) -> str:
         last = self.last
+        last_ones = "" if self.computed == self.steps else f", {self._computed_in_words} of them"
+        took = f"{last_ones} in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step"
         text = (
-            f"{self.steps} steps of {self.sizes} in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step; "
+            f"{self.steps} steps of {self.sizes}{took if self.computed else ', which were there already'}; "
             f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
             f"{self.first.total:.4g} J"
         )

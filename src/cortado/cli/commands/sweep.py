@@ -10,7 +10,7 @@ from cortado.arrays import check_steps
 from cortado.cli.arguments import STEPS
 from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
-from cortado.cli.commands.run import run_scene, run_settings
+from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import Interrupted, keeping
@@ -18,6 +18,7 @@ from cortado.files.progress import track, untracked
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.sweep.combinations import Combination, combinations
 from cortado.optimisation.sweep.table import NAME, failed, write_table
+from cortado.runs.frame_choice import EverySteps
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
@@ -39,6 +40,8 @@ class Member:
     """The folder of the sweep."""
     device: str
     precision: str
+    report: bool
+    """Whether each run of a scene has figures and a report."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
         """What came out, as in result.json; of a folder that is finished, what is there. Warnings name the folder."""
@@ -64,7 +67,7 @@ class Member:
             scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
         else:
             scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
-            settings = run_settings(steps, self.precision, _record_every(steps))
+            settings = run_settings(steps, self.precision, _frames(steps))
         folder = self._folder(combination)
         if folder is None:
             return None
@@ -97,10 +100,7 @@ class Member:
                     command = ["cortado", "optimise", *words]
                     optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
                 else:
-                    steps = self.steps(combination)
-                    every = _record_every(steps)
-                    command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(every)]
-                    run_scene(self.file, steps, out, overrides, self.device, self.precision, every, begun, command)
+                    run_scene(self.file, self._request(combination, begun, words))
         except Interrupted as stop:  # what is kept of one combination says less than the sweep does
             raise Interrupted(stop.args[0]) from None
         except CortadoError as error:
@@ -110,21 +110,36 @@ class Member:
         assert folder is not None
         return folder.read_result() or {"failures": ["It left no result."]}
 
+    def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
+        """The run of a combination; one that was begun goes on."""
+        steps = self.steps(combination)
+        frames = _frames(steps)
+        command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(frames.steps)]
+        asked = combination.overrides, self.device, self.precision, frames
+        return RunRequest(
+            self.out / combination.name, steps, None, *asked, resume=begun, command=command, report=self.report
+        )
+
 
 def run_sweep(
     file: Path,
     options: list[str],
+    zipped: list[str],
     steps: int | None,
     time: float | None,
     out: Path,
     device: str,
     precision: str,
     where: Where,
+    pictures: bool = True,
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
-    chosen = combinations(options)
-    member = Member(file.absolute(), _duration(file, chosen, steps, time), out.absolute(), device, precision)
+    chosen = combinations(options, zipped)
+    duration = _duration(file, chosen, steps, time)
+    if duration is None and not pictures:
+        raise InputError("--no-pictures is given, but must be left out of a sweep of a task.")
+    member = Member(file.absolute(), duration, out.absolute(), device, precision, pictures)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
     there = len(done)
@@ -192,9 +207,9 @@ def _time_step(file: Path, combination: Combination) -> float:
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 
-def _record_every(steps: int) -> int:
+def _frames(steps: int) -> EverySteps:
     """About a hundred frames."""
-    return max(steps // 100, 1)
+    return EverySteps(max(steps // 100, 1))
 
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:

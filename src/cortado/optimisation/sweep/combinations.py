@@ -41,25 +41,40 @@ class Combination:
         return f"{plain}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
-def combinations(options: Sequence[str]) -> list[Combination]:
-    """Every combination of the values of all keys, the first key changing slowest; raises `InputError`."""
-    if not options:
+def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
+    """Every combination of the values of all keys, the first key changing slowest; the values of ``zipped`` keys go
+    together, the first of one with the first of the others, and change fastest. Raises `InputError`."""
+    if not options and not zipped:
         raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
+    keys, together = _values(options, "--set"), _values(zipped, "--zip")
+    if both := keys.keys() & together.keys():
+        raise InputError(f"--zip gives {min(both)}, which --set gives too, but must give other keys.")
+    lengths = {len(values) for values in together.values()}
+    if len(lengths) > 1:
+        told = ", ".join(f"{len(values)} of {key}" for key, values in together.items())
+        raise InputError(f"--zip gives {told}, but must give as many values of each, as they go together.")
+    rows = [tuple(zip(together, row, strict=True)) for row in zip(*together.values(), strict=True)]
+    number = prod(map(len, keys.values())) * max(len(rows), 1)
+    if number > MOST:
+        raise InputError(f"--set makes {number:,} combinations, but there may be {MOST:,} at most.")
+    own = [tuple(zip(keys, values, strict=True)) for values in product(*keys.values())]
+    return [Combination((*values, *row)) for values in own for row in rows or [()]]
+
+
+def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
+    """The values of each key; raises `InputError`, in which the option has its name."""
     keys: dict[str, list[str]] = {}
     for option in options:
         key, equals, text = option.partition("=")
         key, values = key.strip(), [value.strip() for value in _split(text)]
         if not equals or not key or not all(values):
-            raise InputError(f"--set is {shown(option)}, but must have the form key=value,value.")
+            raise InputError(f"{name} is {shown(option)}, but must have the form key=value,value.")
         if key in keys:
-            raise InputError(f"--set gives {key} twice, but must give each key once, with all its values.")
-        if len(set(values)) < len(values):
-            raise InputError(f"--set is {shown(option)}, but must give each value of {key} once.")
+            raise InputError(f"{name} gives {key} twice, but must give each key once, with all its values.")
+        if len(set(values)) < len(values) and name == "--set":
+            raise InputError(f"{name} is {shown(option)}, but must give each value of {key} once.")
         keys[key] = values
-    number = prod(map(len, keys.values()))
-    if number > MOST:
-        raise InputError(f"--set makes {number:,} combinations, but there may be {MOST:,} at most.")
-    return [Combination(tuple(zip(keys, values, strict=True))) for values in product(*keys.values())]
+    return keys
 
 
 def _split(text: str) -> list[str]:

@@ -4,13 +4,19 @@ import csv
 import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import inf
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import DivergedError, InputError, shown
+from cortado.files.csv_columns import read_columns
 from cortado.runs.sensors.sensor import Reading, Sensor, value_of
+
+TIME = "time [s]"
+"""The first column of a table of readings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +59,16 @@ class SensorLog:
         for name, sensor in self.sensors.items():
             self._rows[name].append(self._value(name, sensor, at))
 
+    def known(self, readings: Mapping[str, Readings]) -> float:
+        """The last step of which there are all readings of these sensors; infinite without sensors."""
+        if any(name not in readings or readings[name].units != self._units[name] for name in self.sensors):
+            return -1
+        return min((len(readings[name].times) - 1 for name in self.sensors), default=inf)
+
+    def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
+        """Have what was read of the first state and after so many steps."""
+        self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
+
     def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
         """NaN where the step after the state loses a particle: the run says so where it takes it."""
         try:
@@ -74,9 +90,26 @@ def as_csv(readings: Mapping[str, Readings]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     heads = [f"{name}.{column} [{unit}]" for name, own in readings.items() for column, unit in own.units.items()]
-    writer.writerow(["time [s]", *heads])
+    writer.writerow([TIME, *heads])
     writer.writerows(_rows(list(readings.values())))
     return text.getvalue()
+
+
+def from_csv(path: Path) -> dict[str, Readings]:
+    """What `as_csv` wrote into a file; raises `InputError` for anything else."""
+    columns = read_columns(path)
+    times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
+    if not len(times):
+        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {TIME}.")
+    for head in columns:
+        name, dot, number = head.partition(" [")[0].rpartition(".")
+        if not dot or not head.endswith("]"):
+            raise InputError(f"{path} has the column {head!r}, but must be a table of readings that Cortado wrote.")
+        found.setdefault(name, {})[number] = head.partition(" [")[2].removesuffix("]")
+    return {
+        name: Readings(times, np.stack([columns[f"{name}.{n} [{unit}]"] for n, unit in units.items()], axis=1), units)
+        for name, units in found.items()
+    }
 
 
 def _rows(readings: list[Readings]) -> Iterable[list[str]]:

@@ -1,0 +1,98 @@
+"""Which states of a run become frames of its trajectory: every so many steps, or so many in a simulated second."""
+
+from dataclasses import dataclass
+from math import floor, inf
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import InputError
+from cortado.rollout.durations import expected_frames
+from cortado.rollout.rollout import Rollout
+from cortado.scene.restart import Clock
+
+SAME = 1e-9
+"""Of a frame: a state that comes earlier than a frame is due by less is that frame, as times are rounded."""
+
+
+class FrameChoice(Protocol):
+    """Which states are frames, besides the first and the last."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """By which one run is told from another."""
+
+    def is_due(self, step: int, before: float, now: float) -> bool:
+        """Whether the state after a step is a frame, given the times of the state before and of itself [s]."""
+
+    def announced(self, rollout: Rollout) -> NDArray[Any]:
+        """(frames,) [s] as many as there can be, at the times that are known before the run, others about then."""
+
+    def expected(self, rollout: Rollout) -> int:
+        """How many frames are likely to come."""
+
+
+@dataclass(frozen=True)
+class EverySteps:
+    """A frame for every so many steps."""
+
+    steps: int
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """See `FrameChoice`."""
+        return {"record_every": self.steps}
+
+    def is_due(self, step: int, before: float, now: float) -> bool:
+        """See `FrameChoice`."""
+        return step % self.steps == 0
+
+    def announced(self, rollout: Rollout) -> NDArray[Any]:
+        """See `FrameChoice`."""
+        recorded = np.array([*range(0, rollout.steps, self.steps), rollout.steps])
+        return _clock(rollout).times(recorded, float(rollout.time_steps[0]))
+
+    def expected(self, rollout: Rollout) -> int:
+        """See `FrameChoice`."""
+        return expected_frames(rollout, self.steps)
+
+
+@dataclass(frozen=True)
+class FramesPerSecond:
+    """So many frames in each second that is simulated: each is the first state at its time or after it.
+
+    Raises:
+        InputError: a rate that is not a number greater than 0.
+    """
+
+    rate: float
+    """[1/s]"""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.rate < inf:
+            raise InputError(f"--fps is {self.rate:g}, but must be a number of frames in a second greater than 0.")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """See `FrameChoice`."""
+        return {"fps": self.rate}
+
+    def is_due(self, step: int, before: float, now: float) -> bool:
+        """See `FrameChoice`."""
+        return floor(now * self.rate + SAME) > floor(before * self.rate + SAME)
+
+    def announced(self, rollout: Rollout) -> NDArray[Any]:
+        """See `FrameChoice`."""
+        start, size = rollout.clocks[0].time, float(rollout.time_steps[0])  # where steps are chosen the longest one
+        duration = min(rollout.steps * size, rollout.step_sizes.end - start + size)
+        return start + np.arange(min(rollout.steps, floor(duration * self.rate) + 1) + 2) / self.rate
+
+    def expected(self, rollout: Rollout) -> int:
+        """See `FrameChoice`."""
+        return len(self.announced(rollout))
+
+
+def _clock(rollout: Rollout) -> Clock:
+    """Of the first state, as steps of one length go on from it."""
+    return Clock(rollout.clocks[0].steps, rollout.clocks[0].time)
