@@ -38,8 +38,6 @@ def lacking(scene: Scene) -> str | None:
     missing."""
     picture = scene.picture or Picture()
     needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
-    if scene.dimension == 3 and picture.surface == "liquid":
-        needed["pysplashsurf"] = "pysplashsurf"
     missing = [name for module, name in needed.items() if find_spec(module) is None]
     if not missing:
         return None

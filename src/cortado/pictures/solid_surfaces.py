@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lit_surface import LitSurface
-from cortado.pictures.shadow import solid_shadow
+from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage
@@ -37,9 +36,11 @@ class SolidSurfaces:
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
-    def shadow(self, solids: Sequence[ShownSolid]) -> Points:
-        """As `solid_shadow` returns it; ``solids``: those of the stage, in poses."""
-        return solid_shadow(self._stage, [(one, mesh) for one, mesh in self._placed(solids) if not one.is_tank])
+    def cast(self, shadow: FloorShadow, solids: Sequence[ShownSolid]) -> None:
+        """Add their shadows; ``solids``: those of the stage, in poses."""
+        for one, mesh in self._placed(solids):
+            if not one.is_tank:
+                shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
         """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of; ``solids``: those
@@ -69,7 +70,7 @@ class SolidSurfaces:
         """Several as one."""
         mesh = SolidMesh.joined([one for _, one in solids])
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
-        return DeviceSurface.of(mesh.points, mesh.triangles, mesh.normals, colours, self._device), mesh
+        return DeviceSurface.on(self._device, mesh.points, mesh.triangles, mesh.normals, colours), mesh
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
