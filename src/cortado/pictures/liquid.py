@@ -17,6 +17,8 @@ REACH = 3.0
 """Of the bumps of particles, in spacings."""
 REACH_OF_COLOURS = 2.25
 """Of what colours come from."""
+ROUNDS, ROUNDS_OF_LIGHT = 37, 12
+"""Of smoothing: of the surface, and of the light on it, which comes from few directions."""
 FINE, COARSE = 30_000, 60_000
 """Particles up to which cubes are a third of a spacing wide, and two fifths; half a spacing beyond."""
 MOST_CELLS = 1 << 26
@@ -37,6 +39,13 @@ class LiquidSurface:
     """(p,) of vec3, unit vectors outwards"""
     colours: wp.array
     """(p,) of vec3, linear, from 0 to 1"""
+    neighbours: wp.array
+    """(p,) the points beside each, as `smoothed` takes them"""
+
+    def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
+        """The light at its points (p,) of vec3 without the steps that few directions leave."""
+        everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
+        return smoothed(light, self.neighbours, everywhere, ROUNDS_OF_LIGHT, launch)
 
 
 @wp.func
@@ -101,9 +110,11 @@ def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -
         raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
     weights, colours = wp.empty(count, dtype=wp.float32, device=device), wp.empty_like(points)
     launch(find_weights, count, s=s, reach=reach, points=points, weights=weights)
-    points = smoothed(points, net.neighbours, weights, launch)
+    points = smoothed(points, net.neighbours, weights, ROUNDS, launch)
     launch(find_colours, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours)
-    return LiquidSurface(points, triangles_of(net, points, launch), normals_of(net, points, launch), colours)
+    return LiquidSurface(
+        points, triangles_of(net, points, launch), normals_of(net, points, launch), colours, net.neighbours
+    )
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:

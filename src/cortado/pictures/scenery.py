@@ -1,6 +1,7 @@
 """What rays meet: the surface of the fluid of one state, and the shadow on the floor, on the device that draws them."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +54,8 @@ def scenery(home: Stage, state: State, launch: BandLauncher) -> Scenery:
     shadow.of_fluid(particles)
     if stage.picture.surface == "liquid":
         found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch)
-        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours)
+        softened = partial(found.softened, launch=launch)
+        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
     else:
         balls = spheres(particles.places.numpy(), np.asarray(state.colours), stage.spacing)
         surface = DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)

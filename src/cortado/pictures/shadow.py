@@ -40,16 +40,23 @@ def cast(
     fading: wp.float32,
     thickness: wp.array2d(dtype=wp.vec4),
 ):
-    """Add to the nodes of the floor what is above them, seen along a slope: its colour times its thickness, and its
-    thickness; the less the higher it is, by ``fading`` [1/m]."""
+    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
+    and its thickness; the less the higher it is, by ``fading`` [1/m]."""
     i = wp.tid()
     height = places[i][1] - corner[1]
-    u = int(wp.round((places[i][0] - height * slope[0] - corner[0]) / cell))
-    v = int(wp.round((places[i][2] - height * slope[1] - corner[2]) / cell))
-    if u >= 0 and v >= 0 and u < thickness.shape[0] and v < thickness.shape[1]:
+    x = (places[i][0] - height * slope[0] - corner[0]) / cell
+    z = (places[i][2] - height * slope[1] - corner[2]) / cell
+    u = int(wp.floor(x))
+    v = int(wp.floor(z))
+    if u >= 0 and v >= 0 and u + 1 < thickness.shape[0] and v + 1 < thickness.shape[1]:
         c = colours[i]
-        above = volumes[i] * wp.exp(-fading * height) / (cell * cell)
-        wp.atomic_add(thickness, u, v, above * wp.vec4(c[0], c[1], c[2], 1.0))
+        above = volumes[i] * wp.exp(-fading * height) / (cell * cell) * wp.vec4(c[0], c[1], c[2], 1.0)
+        for n in range(4):
+            m = n & 1
+            k = n >> 1
+            a = 1.0 - wp.abs(x - float(u + m))
+            b = 1.0 - wp.abs(z - float(v + k))
+            wp.atomic_add(thickness, u + m, v + k, a * b * above)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)

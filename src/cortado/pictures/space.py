@@ -13,7 +13,6 @@ from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lighting import illuminate_kernel
 from cortado.pictures.marked import marked
 from cortado.pictures.scenery import Scenery, State, scenery
-from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.trace import Eye, find_contrast, trace_kernel
@@ -57,7 +56,7 @@ class SpacePainter:
         return (self.image(*state) for state in states)
 
     def _rays(self, fluid: Scenery) -> Points:
-        stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[tuple[DeviceSurface, SolidMesh]]()
+        stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[DeviceSurface]()
         picture = stage.picture
         seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
         seen.lit.is_flat = int(not picture.shaded)
@@ -66,9 +65,8 @@ class SpacePainter:
             s.solids, solids = self._solids.on_device(stage.solids)
         given = {"s": s, "surface": seen.lit}
         self._illuminate(seen, self._lamps, given)
-        for one, mesh in solids:
+        for one in solids:
             self._illuminate(one, self._lamps_of_solids, given)
-            one.lit.light.assign(mesh.smoothed(one.lit.light.numpy()))
         image = wp.empty(picture.width * picture.height, dtype=wp.vec3, device=self.device)
         given |= {"eye": _eye(stage), "shadow": fluid.shadow.light, "image": image}
         once, again = self._offsets
@@ -87,6 +85,8 @@ class SpacePainter:
         how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
         count = len(surface.mesh.points)
         self._launch(self._illuminates, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
+        if surface.softened is not None:
+            wp.copy(surface.lit.light, surface.softened(surface.lit.light))
 
     def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
         """Directions to all around, and to so many points of the lamp."""

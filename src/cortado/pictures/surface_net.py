@@ -14,8 +14,8 @@ from cortado.pictures.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_
 from cortado.pictures.marked import last_of
 from cortado.pictures.particles import MODULE
 
-ROUNDS, ROUNDS_OF_NORMALS = 37, 15
-"""How often the net is smoothed, and how often its normals are."""
+ROUNDS_OF_NORMALS = 15
+"""Of smoothing."""
 Neighbours = wp.types.vector(6, wp.int32)
 """Those in the cubes below and above along each axis; -1 where there is none."""
 
@@ -265,13 +265,13 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
     return SurfaceNet(cubes, signs, points, own, beside, sides)
 
 
-def smoothed(points: wp.array, neighbours: wp.array, weights: wp.array, launch: BandLauncher) -> wp.array:
-    """Points (p,) of vec3, moved towards the means of their neighbours `ROUNDS` times, by weights (p,) from 0 to 1."""
-    other = wp.empty_like(points)
-    for _ in range(ROUNDS):
-        launch(smooth, len(points), neighbours=neighbours, weights=weights, values=points, found=other)
-        points, other = other, points
-    return points
+def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
+    """Values (p,) of vec3, moved towards the means of their neighbours so many times, by weights (p,) from 0 to 1."""
+    found, other = wp.clone(values), wp.empty_like(values)
+    for _ in range(rounds):
+        launch(smooth, len(values), neighbours=neighbours, weights=weights, values=found, found=other)
+        found, other = other, found
+    return found
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
