@@ -1,5 +1,7 @@
 """Linear light and what files and screens hold: eight bits of sRGB (IEC 61966-2-1)."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -8,6 +10,8 @@ from cortado.errors import InputError
 
 MOST_LIGHT = 2.0
 """Of a picture that somebody gives: more is taken for values of a file, up to 255; noise may leave 0 to 1."""
+STEPS = 1 << 14
+"""Equal parts of the light from 0 to 1, short against what one of 256 values stands for."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
@@ -34,8 +38,18 @@ def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
     if not np.isfinite(linear).all():
         raise InputError("The image has values that are not finite; look where it was computed.")
     linear = np.clip(linear, 0.0, 1.0)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * curved).astype(np.uint8)
+    bounds, values = _steps()
+    found = values[(STEPS * linear).astype(np.uint16)]
+    found += linear >= bounds[found]  # at most one value begins within a step
+    return found
+
+
+@cache
+def _steps() -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """(256,) the light from which on each next value is the nearest, and (STEPS + 1,) the value where a step begins."""
+    middles = (np.arange(1, 257) - 0.5) / 255.0
+    bounds = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
+    return bounds, np.searchsorted(bounds, np.arange(STEPS + 1) / STEPS, side="right").astype(np.uint8)
 
 
 def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
