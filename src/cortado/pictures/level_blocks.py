@@ -100,6 +100,19 @@ level_near = sum_near(volume, wp.float32)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
+def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
+    """Give those that a particle may reach a level that is not 0."""
+    p = s.places[first + wp.tid()] - b.lower
+    wide = b.cube * float(WIDTH)
+    low = (p - wp.vec3(reach)) / wide
+    high = (p + wp.vec3(reach)) / wide
+    for k in range(wp.max(int(wp.ceil(low[2])), 0), wp.min(int(wp.floor(high[2])), b.shape[2]) + 1):
+        for j in range(wp.max(int(wp.ceil(low[1])), 0), wp.min(int(wp.floor(high[1])), b.shape[1]) + 1):
+            for i in range(wp.max(int(wp.ceil(low[0])), 0), wp.min(int(wp.floor(high[0])), b.shape[0]) + 1):
+                b.corners[i, j, k] = 1.0
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
 def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
     n = first + wp.tid()
     columns = b.shape[0] + 1
@@ -108,7 +121,8 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
     j = (n / columns) % rows
     k = n / (columns * rows)
     w = float(WIDTH)
-    b.corners[i, j, k] = level_near(s, place_of(b, w * float(i), w * float(j), w * float(k)), reach)
+    if b.corners[i, j, k] > 0.0:
+        b.corners[i, j, k] = level_near(s, place_of(b, w * float(i), w * float(j), w * float(k)), reach)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -142,7 +156,8 @@ def level_blocks(
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)
     b.lower, b.cube, b.shape = wp.vec3(*(low * wide)), cube, wp.vec3i(*shape)
-    b.corners = wp.empty(tuple(shape + 1), dtype=wp.float32, device=device)
+    b.corners = wp.zeros(tuple(shape + 1), dtype=wp.float32, device=device)
+    launch(mark_corners, len(s.places), s=s, reach=reach, b=b)
     launch(find_corners, b.corners.size, s=s, reach=reach, b=b)
     passed = wp.empty(int(shape.prod()), dtype=wp.int32, device=device)
     launch(find_passed, len(passed), b=b, left=bump_at(0.5 * 3.0**0.5 * wide / reach), passed=passed)

@@ -1,6 +1,7 @@
 """The surface of a fluid, found on the device where its particles are."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 import warp as wp
@@ -17,10 +18,10 @@ REACH = 3.0
 """Of the bumps of particles, in spacings."""
 REACH_OF_COLOURS = 2.25
 """Of what colours come from."""
-ROUNDS, ROUNDS_OF_LIGHT = 37, 12
+ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 """Of smoothing: of the surface, and of the light on it, which comes from few directions."""
-FINE, COARSE = 30_000, 60_000
-"""Particles up to which cubes are a third of a spacing wide, and two fifths; half a spacing beyond."""
+CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
+"""Up to how many particles cubes have which width, in spacings."""
 MOST_CELLS = 1 << 26
 """One spacing wide, in which particles are looked for."""
 FULL = wp.constant(wp.float32(2.84))
@@ -101,7 +102,7 @@ def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -
         ComputationError: there is none.
     """
     device, reach, ends = launch.device, REACH * spacing, _shown(particles, spacing, launch)
-    cube = (0.325 if len(particles) <= FINE else 0.4 if len(particles) <= COARSE else 0.5) * spacing
+    cube = next(width for most, width in CUBE_WIDTHS if len(particles) <= most) * spacing
     s = near_particles(particles, ends, spacing, reach, launch)
     b, blocks = level_blocks(s, ends, cube, reach, launch)
     net = net_of(b, blocks, launch)
@@ -118,10 +119,10 @@ def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:
-    """The ends of all particles, or of nearly all, if a few are very far away."""
-    ends = particles.ends(launch)
-    if not np.prod((ends[1] - ends[0]) / spacing + 1.0) > MOST_CELLS:
-        return ends
-    lower, upper = np.quantile(particles.places.numpy(), (0.002, 0.998), axis=0)
-    around = 0.5 * (upper - lower).max()
-    return np.maximum(lower - around, ends[0]), np.minimum(upper + around, ends[1])
+    """The ends of all particles, or of those around the middle one, where some are very far away."""
+    lower, upper = particles.ends(launch)
+    if np.prod((upper - lower) / spacing + 1.0) <= MOST_CELLS:
+        return lower, upper
+    middle = np.quantile(particles.places.numpy(), 0.5, axis=0, method="nearest")
+    reach = 0.5 * MOST_CELLS ** (1.0 / 3.0) * spacing
+    return np.maximum(lower, middle - reach), np.minimum(upper, middle + reach)

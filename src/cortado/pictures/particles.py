@@ -8,6 +8,8 @@ import warp as wp
 
 from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError
+from cortado.words import counted
 
 MODULE = wp.get_module("cortado_liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
@@ -26,7 +28,10 @@ class Particles:
 
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points) -> "Particles":
-        """Those of arrays of NumPy, (n, 3) each."""
+        """Those of arrays of NumPy, (n, 3) each; raises `ComputationError` for places that are not finite."""
+        astray = len(places) - int(np.isfinite(places).all(axis=1).sum())
+        if astray:
+            raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
         return cls(
             *(wp.array(np.asarray(one, dtype=np.float32), dtype=wp.vec3, device=device) for one in (places, colours))
         )

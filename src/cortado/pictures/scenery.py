@@ -12,6 +12,7 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.environment import environment_of
 from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.particles import Particles
 from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.stage import Stage
 from cortado.pictures.surface import spheres
@@ -52,11 +53,21 @@ def scenery(home: Stage, state: State, launch: BandLauncher) -> Scenery:
     s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
     particles = particles_of(stage, state.positions, state.colours, launch)
     shadow.of_fluid(particles)
+    return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
+
+
+def _surface(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> DeviceSurface:
+    if not len(particles):
+        return _nothing(stage, launch.device)
     if stage.picture.surface == "liquid":
         found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch)
         softened = partial(found.softened, launch=launch)
-        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
-    else:
-        balls = spheres(particles.places.numpy(), np.asarray(state.colours), stage.spacing)
-        surface = DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
-    return Scenery(stage, s, surface, shadow)
+        return DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
+    balls = spheres(particles.places.numpy(), particles.colours.numpy(), stage.spacing)
+    return DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
+
+
+def _nothing(stage: Stage, device: Any) -> DeviceSurface:
+    """A triangle that is too small and too far below the floor to be seen: meshes need one."""
+    places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
+    return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))
