@@ -23,8 +23,6 @@ from cortado.scene.scene import Scene
 WATER = 0.1, 0.32, 0.62
 SLOWEST = 8
 """Kernels that are named."""
-MOST_COMPARED = 200_000
-"""Particles up to which the CPU draws the same."""
 
 
 def bench_pictures(particles: Sequence[int], lines: int, repeats: int, device: str, as_json: bool) -> str:
@@ -44,7 +42,7 @@ def _measured(count: int, lines: int, repeats: int, device: str) -> dict[str, An
     image = draw()
     row: dict[str, Any] = {"particles": len(positions), "s": median(_seconds(draw) for _ in range(repeats))}
     row["ms_of_kernels"], row["ms_of_the_rest"] = _by_kernel(draw, device)
-    if not wp.get_device(device).is_cpu and len(positions) <= MOST_COMPARED:
+    if not wp.get_device(device).is_cpu:
         row["psnr_to_the_cpu"] = psnr(image, painter(scene, positions[None], "cpu").image(*state))
     return row
 
