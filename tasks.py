@@ -24,7 +24,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "lint": ("ruff", "check", "."),
     "format": ("ruff", "format", "--check", "."),
     "types": ("mypy",),
-    "tests": ("pytest",),
+    "tests": ("pytest", "--short"),
+    "tests-all": ("pytest",),
     "unit": ("pytest", "-m", "not slow and not validation"),
     "validation": ("pytest", "-m", "validation"),
     "slow": ("pytest", "-m", "slow"),
@@ -36,6 +37,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 SEVERAL = {
     "setup": (),
     "test": ("lint", "format", "types", "tests"),
+    "test-all": ("lint", "format", "types", "tests-all"),
     **{name: (name,) for name in COMMANDS},
     "docs-browser": ("docs", "docs-browser"),
 }

@@ -16,6 +16,7 @@ from matplotlib.image import imsave
 from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
+from short import is_long, with_each_value
 
 WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
 collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_study.py"]
@@ -238,14 +239,23 @@ def tier(file: str, test: str) -> str:
     return "slow" if file in SLOW or test in SLOW_TESTS.get(file, ()) else "unit"
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks tests by their tier. Long files come first, so that no core ends with one while the others have nothing to
-    do; ``--no-loadscope-reorder`` in pyproject.toml keeps this order."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--short", action="store_true", help="as make test does: without what make test-all alone runs")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks tests by their tier, and leaves out with ``--short`` what only `make test-all` runs. Long files come first,
+    so that no core ends with one while the others have nothing to do; ``--no-loadscope-reorder`` in pyproject.toml
+    keeps this order."""
     items.sort(key=lambda item: (item.path.stem not in VALIDATION, item.path.stem not in {*SLOW, *SLOW_TESTS}))
     for item in items:
         found = tier(item.path.stem, getattr(item, "originalname", item.name))
         if found != "unit":
             item.add_marker(getattr(pytest.mark, found))
+    if config.getoption("--short"):
+        run = {id(item) for item in with_each_value([item for item in items if not is_long(item)])}
+        config.hook.pytest_deselected(items=[item for item in items if id(item) not in run])
+        items[:] = [item for item in items if id(item) in run]
 
 
 @pytest.fixture

@@ -76,5 +76,6 @@ class Stress:
         normals = self.feet / depths[:, None]
         above = ((x[:, None] - self.walls - self.feet) * normals).sum(-1)
         held = np.where(above.real > self.closest, above, self.closest)
-        weights = -self.volume * self.wall_weights * wall_slopes * (above + depths) / held
+        across = np.where((above + depths).real > 0, above + depths, 0)
+        weights = -self.volume * self.wall_weights * wall_slopes * across / held
         return weights, np.where(above.real > 0, above, 0)[..., None] * normals

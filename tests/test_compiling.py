@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import cortado
-from compiling_notice import COMPILING
+from compiling_notice import COMPILING, UNOPTIMISED
 from cortado.device.compiling import kernels_of
 from cortado.device.kernels import is_derivative
 from scenes import plane, pour
@@ -57,7 +57,7 @@ WORK
 
 def process(cache, work):
     environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
-    program = RUN.replace("WORK", work)
+    program = UNOPTIMISED + RUN.replace("WORK", work)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, **pipes)
 

@@ -6,10 +6,9 @@ import sys
 
 import pytest
 
-from compiling_notice import COMPILING
+from compiling_notice import COMPILING, UNOPTIMISED
 
-FIRST = """
-import warp as wp
+FIRST = f"""{UNOPTIMISED}
 BEFORE
 import cortado
 simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
@@ -67,7 +66,8 @@ def test_the_command_line_says_the_same(compiled, tmp_path):
     folder, _ = compiled
     scene = "docs/figures/dam_break_plane.toml"
     options = ["--set", "forces.viscosity=laminar", "--steps", "2", "--no-pictures", "--overwrite"]
-    command = [sys.executable, "-m", "cortado", "run", scene, "--out", str(tmp_path), *options]
+    program = UNOPTIMISED + "import runpy; runpy.run_module('cortado', run_name='__main__')"
+    command = [sys.executable, "-c", program, "run", scene, "--out", str(tmp_path), *options]
     errors = []
     for _ in range(2):
         environment = {**os.environ, "WARP_CACHE_PATH": str(folder)}

@@ -151,4 +151,5 @@ class Force(Protocol):
         depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes after all others.
         One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.solve_record`. One
         with which walls act on fluid has what they do, a `cortado.sph.wall_sums.WallAction`, as ``wall_action``, or
-        loads on solids lack it."""
+        loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is another one, of the sum of
+        y x a, with which a acts at x_i - y."""

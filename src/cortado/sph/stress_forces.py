@@ -215,3 +215,24 @@ def stress_work(d: Discretisation) -> Any:
         return (-hold(x_ij, foot, constants[0], s) / m_i) * wp.dot(pull, acceleration_bar_i)
 
     return stress_work
+
+
+def stress_couple_work(d: Discretisation) -> Any:
+    """That of the couples y_ib x a_ib of what walls give to a particle: they act y_ib beneath it, on their surface."""
+    precision, fall, force = d.precision, contact_functions(d).fall, wp.func(stress_work(d))
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+
+    def stress_couple_work(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        T_i: matrix,
+        eta_i: real,
+        couple_bar_i: vector,
+        constants: pair,
+        foot: vector,
+        s: neighbourhood_type(precision),
+    ) -> real:
+        return force(x_ij, v_ij, m_i, T_i, eta_i, wp.cross(couple_bar_i, fall(x_ij, foot)), constants, foot, s)
+
+    return stress_couple_work

@@ -10,11 +10,11 @@ from typing import Any, Protocol
 import warp as wp
 
 from cortado.device.binding import Named
+from cortado.particles.solid_shares import WorkMaker
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import stress_work
 from cortado.sph.stress_wall_kernels import stress_wall_kernels
 from cortado.sph.wall_sums import WallSums
 
@@ -46,11 +46,14 @@ class StressWalls:
         of: Mapping[str, wp.array],
         packed: Packed,
         stress: Resisting,
+        work: WorkMaker,
+        bar: str,
     ):
-        """``made_for``: what its kernels are made for; ``of``: M, A, R, T and eta of all particles."""
+        """``made_for``: what its kernels are made for; ``of``: M, A, R, T and eta of all particles; ``work`` and
+        ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their couples."""
         self._made_for, self._constants, self._of, self._packed, self._stress = made_for, constants, of, packed, stress
         self._layout = setting.layout
-        term = WallTerm(setting.discretisation, "viscous_stress", stress_work, "acceleration_bar", rubs=True)
+        term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (constants["least"], constants["control"]))
 
     def total(self, step: StepContext, solid: int) -> wp.array:

@@ -13,6 +13,7 @@ from cortado.sph.formula import compiled
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.stress_forces import stress_couple_work, stress_work
 from cortado.sph.stress_kernels import stress_kernels, stress_solid_kernels
 from cortado.sph.stress_walls import StressWalls
 from cortado.sph.viscosity_law import Law, newtonian_law
@@ -45,7 +46,8 @@ class ViscousStress:
         self._change = {name: wp.zeros(dtype=kind, **sizes) for name, kind in kinds.items()}
         """Tangents of T and eta, or adjoints of M, A and R."""
         own = setting, self._made_for, self._constants, self._of, self._packed, self
-        self.wall_action = StressWalls(*own) if scene.sticks else None
+        self.wall_action = StressWalls(*own, stress_work, "acceleration_bar") if scene.sticks else None
+        self.wall_couple = StressWalls(*own, stress_couple_work, "couple_bar") if scene.sticks else None
 
     def compile(self, what: str) -> None:
         """Compile the law in it; raises `InputError` where Warp cannot."""

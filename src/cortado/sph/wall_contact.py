@@ -2,12 +2,13 @@
 
 With the normal n of the wall, the distance d of particle i from its surface, and a particle b of the wall at x_b,
 
-    y_ib = d n,   s_w = w_b s_ib (n . x_ib) / max(d, e),
+    y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
 for the weight s_ib of two particles of the fluid (`cortado.sph.stress_kernels`), as if velocities went on behind the
 wall with their sign turned (Morris, Fox and Zhu 1997). d is 0 behind the surface, and e is a distance, ``least``,
-closer than which a wall pulls no harder; at both the derivative has a corner. Functions know n by the ``foot``, the
-vector from x_b to the surface.
+closer than which a wall pulls no harder. n . x_ib is below 0 where b belongs to the other side of a thin wall, or to
+another face of an edge, and then b does not count: with a weight below 0 it would drive the particle on. At all three
+the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
 """
 
 from dataclasses import dataclass
@@ -48,10 +49,14 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
         return -s.volume * slope(x, s)
 
     @wp.func
+    def rise(x_ib: vector, foot: vector) -> real:
+        """n . x_ib"""
+        return wp.dot(x_ib, foot) / wp.length(foot)
+
+    @wp.func
     def height(x_ib: vector, foot: vector) -> real:
         """d, negative behind the surface."""
-        depth = wp.length(foot)
-        return wp.dot(x_ib, foot) / depth - depth
+        return rise(x_ib, foot) - wp.length(foot)
 
     @wp.func
     def fall(x_ib: vector, foot: vector) -> vector:
@@ -59,8 +64,7 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
 
     @wp.func
     def hold(x_ib: vector, foot: vector, least: real, s: neighbourhood) -> real:
-        d = height(x_ib, foot)
-        return weight(x_ib, s) * (d + wp.length(foot)) / wp.max(d, least)
+        return weight(x_ib, s) * wp.max(rise(x_ib, foot), real(0.0)) / wp.max(height(x_ib, foot), least)
 
     @wp.func
     def fall_change(x_ib: vector, u: vector, foot: vector) -> vector:
@@ -69,9 +73,11 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
 
     @wp.func
     def hold_gradient(x_ib: vector, foot: vector, least: real, s: neighbourhood) -> vector:
-        depth, d = wp.length(foot), height(x_ib, foot)
+        above, d = rise(x_ib, foot), height(x_ib, foot)
+        if above <= real(0.0):
+            return vector()
         per = real(1.0) / wp.max(d, least)
-        along = weight(x_ib, s) * per * (real(1.0) - wp.where(d > least, (d + depth) * per, real(0.0)))
-        return (-s.volume * (d + depth) * per) * slope_gradient(x_ib, s) + (along / depth) * foot
+        along = weight(x_ib, s) * per * (real(1.0) - wp.where(d > least, above * per, real(0.0)))
+        return (-s.volume * above * per) * slope_gradient(x_ib, s) + (along / wp.length(foot)) * foot
 
     return ContactFunctions(weight, fall, fall_change, hold, hold_gradient)

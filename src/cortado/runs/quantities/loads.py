@@ -22,23 +22,53 @@ from cortado.sph.parts import Tangents
 from cortado.sph.wall_sums import WallAction
 
 
+@dataclass(frozen=True)
+class _Rubbing:
+    """factor m_i sum a_i over what walls do by forces, (n, 3)."""
+
+    actions: list[WallAction]
+    factor: float
+
+    def value(self, at: Particles, sums: Sums, solid: int) -> NDArray:
+        return self.factor * at["m"][:, None] * self._total(at, sums, solid)
+
+    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
+        found = dot["m"][:, None] * self._total(at, sums, solid)
+        for action in self.actions:
+            found += at["m"][:, None] * vectors(action.tangent(sums.context, along, solid))
+        return self.factor * found
+
+    def adjoint(self, at: Particles, sums: Sums, own_bar: NDArray, bar: Particles, solid: int) -> None:
+        bar["m"][:] += self.factor * (own_bar * self._total(at, sums, solid)).sum(axis=1)
+        total_bar = sums.on_device(self.factor * at["m"][:, None] * own_bar)
+        for action in self.actions:
+            action.adjoint(sums.context, bar.within.bar, solid, total_bar, bar.within.v_star)
+
+    def _total(self, at: Particles, sums: Sums, solid: int) -> NDArray:
+        totals = (vectors(action.total(sums.context, solid)) for action in self.actions)
+        return sum(totals, np.zeros((len(at["m"]), 3)))
+
+
 class WallLoads:
     """Of a solver's particles, (n, 3) in float64. ``solid`` is the number of a solid's wall particles, or
     `cortado.particles.solid_shares.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
-        self._cell, self._power = solver.lattice.cell, solver.density_power
-        self._scale = self._cell * solver.lattice.volume
+        cell, self._power = solver.lattice.cell, solver.density_power
+        self._scale = cell * solver.lattice.volume
         self._push = solver.wall_push()
-        walls = (getattr(force, "wall_action", None) for force in solver.forces)
-        self._rubs: list[WallAction] = [action for action in walls if action is not None]
+
+        def of(name: str) -> list[WallAction]:
+            return [action for force in solver.forces if (action := getattr(force, name, None)) is not None]
+
+        self._rubbing = _Rubbing(of("wall_action"), -cell)
+        self.couples = _Rubbing(of("wall_couple"), cell)
+        """What f_i that act beneath particles twist walls with [N m]."""
 
     def forces(self, at: Particles, sums: Sums, solid: int) -> NDArray:
         """f [N]"""
-        found = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
-        for action in self._rubs:
-            found -= self._cell * at["m"][:, None] * vectors(action.total(sums.context, solid))
-        return found
+        pushed = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
+        return pushed + self._rubbing.value(at, sums, solid)
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
         """That of f."""
@@ -46,11 +76,7 @@ class WallLoads:
         pushed = vectors(self._push.total(sums.context, solid))
         pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
         found = strength_dot[:, None] * pushed + self._strength(at)[:, None] * pushed_dot
-        for action in self._rubs:
-            a = vectors(action.total(sums.context, solid))
-            a_dot = vectors(action.tangent(sums.context, along, solid))
-            found -= self._cell * (dot["m"][:, None] * a + at["m"][:, None] * a_dot)
-        return found
+        return found + self._rubbing.tangent(at, sums, dot, along, solid)
 
     def adjoint(self, at: Particles, sums: Sums, forces_bar: NDArray, bar: Particles, solid: int) -> None:
         """From that of f, add to those of the particles."""
@@ -60,10 +86,7 @@ class WallLoads:
         bar["n"][:] -= self._power * strength_bar * strength / at["n"]
         within = bar.within
         self._push.adjoint(step, within.bar, solid, sums.on_device(strength[:, None] * forces_bar), within.v_star)
-        for action in self._rubs:
-            bar["m"][:] -= self._cell * (forces_bar * vectors(action.total(step, solid))).sum(axis=1)
-            total_bar = sums.on_device(-self._cell * at["m"][:, None] * forces_bar)
-            action.adjoint(step, within.bar, solid, total_bar, within.v_star)
+        self._rubbing.adjoint(at, sums, forces_bar, bar, solid)
 
     def _strength(self, at: Particles) -> NDArray:
         return np.asarray(self._scale * at.p / at["n"] ** self._power)
@@ -72,8 +95,8 @@ class WallLoads:
 @dataclass(frozen=True)
 class SolidLoad:
     """Force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at the end of the
-    step, where its walls are, to particle i. Each scene has F and T one behind the other, in the plane the component of
-    T that stands on it."""
+    step, where its walls are, to particle i; of viscosity as a stress to the surface beneath it, where that acts. Each
+    scene has F and T one behind the other, in the plane the component of T that stands on it."""
 
     loads: WallLoads
     solver: ParticleSolver
@@ -82,14 +105,16 @@ class SolidLoad:
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
         forces = self.loads.forces(at, sums, self.solid.number)
-        return self._joined(forces, np.cross(self._arms(at), forces))
+        couples = self.loads.couples.value(at, sums, self.solid.number)
+        return self._joined(forces, np.cross(self._arms(at), forces) + couples)
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
         forces = self.loads.forces(at, sums, self.solid.number)
         forces_dot = self.loads.tangent(at, sums, dot, along, self.solid.number)
         moving = self.solver.search.moving
         shift = self._each(None if moving is None else moving.after_dot.positions, np.zeros(3))
-        return self._joined(forces_dot, np.cross(dot["x"] - shift, forces) + np.cross(self._arms(at), forces_dot))
+        turned = np.cross(dot["x"] - shift, forces) + np.cross(self._arms(at), forces_dot)
+        return self._joined(forces_dot, turned + self.loads.couples.tangent(at, sums, dot, along, self.solid.number))
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
         d, members, number = self.dimension, len(own), self.solid.number
@@ -98,6 +123,7 @@ class SolidLoad:
         force_bar, torque_bar = (self._for_each(array) for array in (force_bar, torque_bar))
         pulled = np.cross(self.loads.forces(at, sums, number), torque_bar)
         self.loads.adjoint(at, sums, force_bar + np.cross(torque_bar, self._arms(at)), bar, number)
+        self.loads.couples.adjoint(at, sums, torque_bar, bar, number)
         bar["x"][:] += pulled
         if number >= 0:
             layout = self.solver.layout
