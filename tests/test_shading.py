@@ -1,6 +1,7 @@
 """Shaded pictures: what they show, that they show it whatever the order of particles, and that they change nothing."""
 
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
 from cortado.device.bands import BandLauncher
 from cortado.device.launching import launch
+from cortado.device.threads import WARP
 from cortado.discretise.shapes import corners
 from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.srgb import to_srgb
@@ -82,6 +84,13 @@ def test_27_particles_are_seen(surface, shape):
     assert image.shape == (64, 96, 3) and image.min() >= 0.0 and image.max() <= 1.0
     blue = (image[..., 2] > 1.3 * image[..., 0]).mean()
     assert 0.01 < blue < 0.65
+
+
+@pytest.mark.parametrize("surface", ["liquid", "spheres"])
+def test_a_scene_without_fluid_is_empty(surface):
+    scene = scene_of(picture={"surface": surface})
+    image = painter(scene, FILLED).image(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert not (image[..., 2] > 1.3 * image[..., 0]).any() and 0.02 < image.std() < 0.2
 
 
 def test_what_is_above_is_above_and_what_is_right_is_right():
@@ -279,6 +288,31 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
         frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
         assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 34, "yuv420p")
     assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
+
+
+def test_a_picture_is_drawn_while_the_one_before_is_used():
+    """Also where the caller holds what the painter needs; what it raises comes when its picture is due."""
+    begun, free = [], threading.Event()
+
+    def images():
+        for k in range(3):
+            with WARP:
+                begun.append(k)
+            if len(begun) == 2:
+                free.set()
+            yield np.full((2, 2, 3), k)
+        raise InputError("nothing more")
+
+    drawn_ahead = shading_film._ahead(images())
+    assert next(drawn_ahead)[0, 0, 0] == 0 and free.wait(10.0)
+    with WARP:
+        assert [next(drawn_ahead)[0, 0, 0] for _ in range(2)] == [1, 2]
+        with pytest.raises(InputError, match="nothing more"):
+            next(drawn_ahead)
+    with WARP:
+        left = shading_film._ahead(images())
+        next(left)
+        left.close()  # does not wait for ever
 
 
 def shown_in(path):
