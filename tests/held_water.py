@@ -13,7 +13,15 @@ from cortado.scene.solids import SolidTable, rotation_matrix
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
 GRAVITY = 9.81
-MESHES = ("torus", "cup with a handle", "bodies that overlap", "box as a tank", "200,000 triangles")
+MESHES = (
+    "torus",
+    "cup with a handle",
+    "bodies that overlap",
+    "box as a tank",
+    "200,000 triangles",
+    "a sheet one spacing thick",
+    "a torus that crosses itself",
+)
 
 
 def simulated(dimension: int, spacing: float, step: float, steps: int, every: int, **tables: Any) -> Any:
@@ -73,7 +81,7 @@ def cup_turned(across: int, steps: int) -> dict[str, float]:
     """A cup, so many particles wide, is turned upside down above a floor and back: how many particles went through its
     wall, how many were poured over its rim, and the greatest depth of one in it, in spacings."""
     spacing, radius, height, thickness = 1.0 / across, 0.5, 1.2, 5.0 / across
-    step = 0.045 * spacing
+    step = 0.03 * spacing
     time = step * steps
     base = np.array([0.0, 1.0])
     cup = {
@@ -135,7 +143,7 @@ def meshes(steps: int, name: str, bottom: bool = True) -> dict[str, float]:
 
 
 def _meshes(bottom: bool) -> dict[str, tuple[trimesh.Trimesh, dict[str, Any]]]:
-    """Torus, cup with a handle, bodies that overlap, 200,000 triangles, and a box as a tank; y is upwards."""
+    """What `MESHES` names; y is upwards."""
     torus = trimesh.creation.torus(0.2, 0.09, major_sections=60, minor_sections=30)
     fine = trimesh.creation.torus(0.2, 0.09, major_sections=400, minor_sections=250)
     side = [[0.3, 0.0], [0.3, 0.5], [0.22, 0.5]]
@@ -146,7 +154,9 @@ def _meshes(bottom: bool) -> dict[str, tuple[trimesh.Trimesh, dict[str, Any]]]:
     boxes = [([-0.25, -0.1, -0.1], [0.1, 0.1, 0.1]), ([0.0, -0.2, -0.15], [0.2, 0.15, 0.05])]
     overlapping = trimesh.util.concatenate([trimesh.creation.box(bounds=ends) for ends in boxes])
     upright = trimesh.transformations.rotation_matrix(-0.5 * np.pi, [1.0, 0.0, 0.0])
-    for mesh in (torus, fine, cup):
+    sheet = trimesh.creation.box(extents=[0.5, 0.05, 0.5])
+    spindle = trimesh.creation.torus(0.1, 0.15, major_sections=60, minor_sections=40)  # goes around its middle twice
+    for mesh in (torus, fine, cup, spindle):
         mesh.apply_transform(upright)
     tank = trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [0.6, 0.5, 0.4]])
     container = {"shape": "box", "lower": [-0.35, 0.0, -0.35], "upper": [0.35, 0.8, 0.35]}
@@ -157,6 +167,8 @@ def _meshes(bottom: bool) -> dict[str, tuple[trimesh.Trimesh, dict[str, Any]]]:
     return {
         "torus": (torus, dict(around)),
         "200,000 triangles": (fine, dict(around)),
+        "a sheet one spacing thick": (sheet, dict(around)),
+        "a torus that crosses itself": (spindle, {**around, "mesh": {"position": [0.0, 0.3, 0.0]}}),
         "bodies that overlap": (overlapping, {**around, "mesh": {"position": [0.0, 0.3, 0.0]}}),
         "cup with a handle": (cup, {"fluid": [poured]}),
         "box as a tank": (tank, {"fluid": [in_tank], "mesh": {"side": "inside"}}),

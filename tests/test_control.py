@@ -9,7 +9,7 @@ import pytest
 from benchmarks.control.__main__ import main
 from benchmarks.control.catalogue import TASKS, task
 from benchmarks.control.contenders import CONTENDERS, Descent
-from benchmarks.control.curves import curves
+from benchmarks.control.curves import curves, reached
 from benchmarks.control.multiple_shooting import Gaps, MultipleShooting
 from benchmarks.control.objective import BudgetSpent, Objective
 from benchmarks.control.records import Record, Records, Run
@@ -21,12 +21,14 @@ from finite_differences import decades, distance
 SHORT = {
     "carry": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
     "carry_cup": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
-    "pour_jug": {"turning": 12, "blocks": 4, "turn": 0.02},
+    "pour_jug": {"turning": 12, "blocks": 4, "turn": 0.02, "aside": 0.01},
     "splash": {"blocks": 4, "repeats": 3},
     "splash_projection": {"blocks": 4, "repeats": 3},
     "latte": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
     "latte_dense": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
     "mix": {"blocks": 4, "repeats": 3},
+    "steer_raft": {"moving": 12, "amplitude": 1e-3},
+    "stir_milk": {"actions": 4, "repeats": 3, "reach": 0.01},
 }
 """The small tasks for a few steps."""
 tasks = pytest.mark.parametrize("name", TASKS)
@@ -64,8 +66,8 @@ def test_controls_are_bounded(name, size):
     chosen = task(name, size)
     assert np.abs(chosen.known).max() <= 1.0 and np.abs(chosen.baseline).max() <= 0.5
     assert chosen.known.shape == (chosen.controls.numbers,)
-    (parameter,) = chosen.controls.parameters(chosen.known).values()
-    assert parameter.shape == ((chosen.steps,) if name == "pour_jug" else (chosen.steps, chosen.scene.dimension))
+    for parameter, value in chosen.controls.parameters(chosen.known).items():
+        assert value.shape == ((chosen.steps,) if parameter == "jug.turn" else (chosen.steps, chosen.scene.dimension))
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -314,3 +316,13 @@ def test_curves_are_quartiles_of_the_least_loss():
     assert (steps[0], steps[-1]) == (2.0, 10.0) and 0 < before.shape[1] < len(steps)
     np.testing.assert_array_equal(before, np.tile([[2.25], [3.5], [4.75]], before.shape[1]))
     np.testing.assert_array_equal(found[:, -1], np.percentile([0.5, 1.0, 1.5, 2.0, 5.0, 9.0], (25, 50, 75)))
+
+
+def test_steps_until_a_loss_are_medians_over_runs():
+    def of(who, *losses):
+        run = Run("carry", "small", who, len(losses), 30.0, "cpu", "float32")
+        return Record(run, [10.0, 20.0, 30.0][: len(losses)], list(losses), [], {}, 0, 0, 0.0, "")
+
+    rows = reached([of("exact", 1.0, 0.4, 0.15), of("exact", 1.0, None, 0.3), of("cma_es", 1.0, 0.9)]).splitlines()
+    assert rows[0].split(" | ")[-2:] == ["exact", "cma_es |"]
+    assert [row.split(" | ")[2:] for row in rows[2:]] == [["0.5", "25", "> 30 |"]]

@@ -457,7 +457,7 @@ BAD_PARAMETERS = {
     "text": (lambda: {"viscosity": "thick"}, "parameter viscosity is 'thick', but must be a number"),
     "complex": (lambda: {"viscosity": 1j}, "parameter viscosity is 1j, but must be a number"),
     "nothing": (lambda: {"viscosity": None}, "parameter viscosity is None, but must be a number"),
-    "both": (lambda: {"tilt": [3.0], "gravity": [0.0, 1.0]}, "gravity is given, but must be left out, as the tilt"),
+    "both": (lambda: {"tilt": [3.0], "gravity": [0.0, 1.0]}, "gravity is given, but must be left out, as tilt is"),
 }
 
 

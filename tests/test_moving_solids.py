@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import DivergedError, Problem, Scene, SceneError, Simulation, certify
-from cortado.errors import MissingDerivativeError
+from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
 from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.runs.run_pictures import run_page
@@ -243,7 +242,8 @@ def test_steps_that_are_chosen_know_how_fast_solids_are():
     fast = {**ROTOR, "angular_velocity": 60.0, "velocity": None}
     scene = plane(fast)
     speed = 60.0 * np.hypot(0.1, 0.05)
-    assert greatest_speed(scene.solid) == pytest.approx(speed)
+    assert greatest_speed(scene.solid, {}) == pytest.approx(speed)
+    assert greatest_speed(scene.solid, {"rotor.velocity": [3.0, 4.0]}) == pytest.approx(speed + 5.0)
     assert stability_limits(scene)["the speed of solids"] == pytest.approx(0.2 * 0.05 / speed)
     chosen = plane(fast, solver={"kind": "projection", "time_step": "auto"})
     run = Simulation(chosen).run(20)
@@ -258,15 +258,6 @@ def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
     falling = {"name": "block", "shape": "box", "lower": [0.2, 0.5], "upper": [0.4, 0.7], "motion": "path"}
     with pytest.raises(DivergedError, match="entered the solid 'block' and was at"):
         Simulation(plane({**falling, "velocity": [0.0, -1.0]})).run(400)
-
-
-@pytest.mark.parametrize("ask", ["value_and_gradient", "tangent"])
-def test_the_time_step_has_no_derivative_where_the_scene_moves_a_solid(ask):
-    """As its path would have to be differentiated with respect to when it is where; a turn alone does not give it."""
-    problem = Problem(Simulation(plane(ROTOR)), 5, CentreOfMass([0.5, 0.3]))
-    given = ({"time_step": 0.001, "rotor.turn": 0.01}, {"time_step": 1.0})[: 2 if ask == "tangent" else 1]
-    with pytest.raises(MissingDerivativeError, match="solids that move have no derivative"):
-        getattr(problem, ask)(*given)
 
 
 @pytest.mark.parametrize(
@@ -322,3 +313,11 @@ def test_pictures_and_films_show_solids_where_they_are(tmp_path):
     (down, right), there = middle(films[0][2]) - middle(films[0][0]), run.solids["rotor"].positions
     moved = there[2] - there[0]
     assert right > 3.0 and down < -1.0 and right / -down == pytest.approx(moved[0] / moved[1], rel=0.3)
+
+
+def test_a_solid_that_no_run_moved_is_a_sentence():
+    run = Simulation(plane(ROTOR)).run(1)
+    with pytest.raises(InputError, match="solids has no 'paddle', as the run moved rotor"):
+        run.solids["paddle"]
+    assert run[-1:].solids["rotor"].positions.shape == (1, 2)
+    assert "paddle" not in run.solids

@@ -13,7 +13,7 @@ from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, distance
-from test_moving_solids import ROTOR, WATER, plane, space
+from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
 
 PASTE = {
     "name": "paste",
@@ -245,7 +245,13 @@ def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
         ("rotor.displacement", np.zeros((3, 2)), r"has shape \(3, 2\), but must be \(2,\) or \(5, 2\) in m"),
         ("rotor.turn", np.zeros((STEPS, 1)), r"has shape \(5, 1\), but must be \(\) or \(5,\) in rad"),
         ("rotor.position", [np.nan, 0.0], "has a value that is not finite"),
-        ("ball.position", [0.1, 0.1], r"'ball.position' is unknown, but must be one of .*, rotor.turn in this scene"),
+        (
+            "ball.position",
+            [0.1, 0.1],
+            r"'ball.position' is unknown, but must be one of .*, rotor.angular_velocity in this scene",
+        ),
+        ("rotor.velocity", [0.1], r"has shape \(1,\), but must be \(2,\) in m/s"),
+        ("rotor.angular_velocity", np.inf, "has a value that is not finite, but must be numbers in rad/s"),
     ],
 )
 def test_a_bad_place_is_a_sentence(name, value, sentence):
@@ -255,7 +261,7 @@ def test_a_bad_place_is_a_sentence(name, value, sentence):
 
 def test_a_solid_at_rest_is_no_parameter():
     fixed = {name: ROTOR[name] for name in ("name", "shape", "lower", "upper")}
-    with pytest.raises(InputError, match=r"'rotor.position' is unknown"):
+    with pytest.raises(InputError, match=r"'rotor.position' is unknown, as the solid 'rotor' is at rest: only those"):
         problem_of(plane(fixed)).value({"rotor.position": [0.3, 0.2]})
 
 
@@ -277,3 +283,60 @@ def test_a_solid_that_jumps_is_warned_of():
         warnings.simplefilter("error", CortadoWarning)
         simulation.run(1, controls={"rotor.position": [0.3, 0.3]}, state=first.last_state)
         Simulation(plane(ROTOR)).run(4)
+
+
+def steady_of(scene, seed=0):
+    """How fast all solids of a scene go, by the names of parameters, with the time step, and a direction there."""
+    random, d = np.random.default_rng(seed), scene.dimension
+    point, along = {"time_step": np.array(scene.solver.time_step)}, {"time_step": np.array(1e-3)}
+    for name in (table.name for table in scene.solid):
+        for rate, shape in ((f"{name}.velocity", (d,)), (f"{name}.angular_velocity", () if d == 2 else (3,))):
+            point[rate], along[rate] = random.normal(size=shape), random.normal(size=shape)
+    return point, along
+
+
+PROPELLER = {
+    **{key: PADDLE[key] for key in ("name", "shape", "start", "end", "radius", "rotation", "motion")},
+    "velocity": [0.1, 0.0, 0.2],
+}
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *(plane(ROTOR, BALL, solver={"kind": kind, "time_step": 0.001}) for kind in ("projection", "pcisph")),
+        *(space(solid=[PROPELLER], solver={"kind": kind, "time_step": 0.001}) for kind in ("projection", "pcisph")),
+    ],
+    ids=["plane, projection", "plane, pcisph", "space, projection", "space, pcisph"],
+)
+def test_steady_motion_has_derivatives(scene):
+    check(problem_of(scene), *steady_of(scene))
+
+
+def test_a_velocity_is_that_of_a_scene_that_says_so():
+    """To the last bit, and also where a run goes on."""
+    told = Simulation(plane({**ROTOR, "velocity": [0.3, -0.1], "angular_velocity": 2.0}), precision="float64")
+    given = {"rotor.velocity": [0.3, -0.1], "rotor.angular_velocity": 2.0}
+    simulation = Simulation(plane(ROTOR), precision="float64")
+    whole, first = told.run(STEPS), simulation.run(2, given)
+    rest = simulation.run(STEPS - 2, given, state=first.last_state)
+    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
+    np.testing.assert_array_equal(rest.solids["rotor"].rotations, whole.solids["rotor"].rotations[2:])
+
+
+def test_a_path_with_times_has_a_derivative_with_respect_to_the_time_step():
+    knots = {"times": [0.0, 0.0023, 0.01], "positions": [[0.45, 0.2], [0.4503, 0.2], [0.45, 0.2]]}
+    own = {key: value for key, value in ROTOR.items() if key not in ("angular_velocity", "velocity")}
+    scene = plane({**own, "position": [0.45, 0.2], **knots})
+    check(problem_of(scene), {"time_step": np.array(0.001)}, {"time_step": np.array(1e-3)})
+
+
+def test_a_velocity_and_a_displacement_are_one_too_many():
+    problem = problem_of(plane(ROTOR))
+    both = {"rotor.velocity": [0.1, 0.0], "rotor.displacement": [0.0, 0.0]}
+    with pytest.raises(InputError, match=r"rotor.displacement is given, but must be left out, as rotor.velocity is"):
+        problem.value(both)
+    with pytest.raises(InputError, match=r"direction rotor.velocity is given, .* as rotor.displacement is given in"):
+        problem.tangent({"rotor.displacement": [0.0, 0.0]}, {"rotor.velocity": [0.1, 0.0]})
+    with pytest.raises(InputError, match=r"'paddle.velocity' is unknown"):  # which has times
+        problem_of(space()).value({"paddle.velocity": [0.1, 0.0, 0.0]})

@@ -141,7 +141,11 @@ NOTHING_PULLS = {"forces": {"gravity": [0.0, 0.0, 0.0]}}
 @pytest.mark.parametrize(
     ("made", "values", "words"),
     [
-        (splash, {"tilt": [0.0, 0.0], "gravity": [0.0, -9.81, 0.0]}, "gravity is given, but must be left out, as the"),
+        (
+            splash,
+            {"tilt": [0.0, 0.0], "gravity": [0.0, -9.81, 0.0]},
+            "gravity is given, but must be left out, as tilt is",
+        ),
         (splash, {"tilt": [0.0, 0.0, 0.0]}, r"tilt has shape \(3,\), but must be \(2,\) or \(12, 2\) in °"),
         (plane, {"tilt": 0.0}, r"tilt has shape \(\), but must be \(1,\) or \(12, 1\) in °"),
         (splash, {"tilt": [np.nan, 0.0]}, "tilt has a value that is not finite"),

@@ -10,6 +10,9 @@ from scipy.spatial import cKDTree
 from cortado.discretise.calibration import SLACK
 from cortado.discretise.smoothing import KERNELS
 from cortado.discretise.walls.layers import SHALLOW, wall_layers
+from cortado.discretise.walls.points import box_walls
+from cortado.discretise.walls.short_box import ShortBox
+from cortado.scene.containers import BoxContainer, Container
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.scene import Scene
 
@@ -99,8 +102,8 @@ def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
 # ---- containers --------------------------------------------------------------------------------------------------
 
 
-def filled(container: dict[str, Any], kernel: str, support: float, **fluid: Any) -> DiscreteScene:
-    """A container full of water."""
+def filled(container: dict[str, Any], kernel: str, support: float, solid: Any = (), **fluid: Any) -> DiscreteScene:
+    """A container full of water, around solids."""
     dimension = len(container.get("lower", container.get("base")))
     body = {key: value for key, value in container.items() if key not in ("periodic", "lid")}
     scene = Scene(
@@ -109,6 +112,7 @@ def filled(container: dict[str, Any], kernel: str, support: float, **fluid: Any)
         phase=[{"name": "water", "rest_density": 1000, "viscosity": 0.0}],
         fluid=[{**body, "phase": "water", **fluid}],
         container=container,
+        solid=list(solid),
         solver={"time_step": 1e-4},
     )
     return discretise(scene)
@@ -221,3 +225,34 @@ def test_the_side_of_a_cup_stops_a_particle_alone(kernel, support):
     alone = discrete.kernel.weight(np.zeros(1), 3, discrete.lattice.support)
     of_wall = discrete.kernel.weight(apart, 3, discrete.lattice.support) @ discrete.walls.weights
     assert (discrete.lattice.volume * (alone + of_wall)).min() > 1.0
+
+
+@pytest.mark.parametrize(("kernel", "support"), [("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 4.0)])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_a_long_box_has_the_weights_that_are_found_for_all_of_it(monkeypatch, kernel, support, periodic):
+    """Of which one side is longer than the shorter box's and the other no multiple of the spacing."""
+    long = box([100, 12.2], periodic=[periodic, False])
+    found = filled(long, kernel, support).walls
+    monkeypatch.setattr(BoxContainer, "shortened", Container.shortened)
+    whole = filled(long, kernel, support).walls
+    np.testing.assert_array_equal(found.positions, whole.positions)
+    np.testing.assert_allclose(found.weights, whole.weights, rtol=1e-6)
+
+
+def test_a_short_box_has_every_wall_particle_of_a_long_one_where_it_folds_it():
+    lower, upper = np.array([-0.1, 0.0, 0.2]), np.array([4.9, 0.63, 3.7])
+    short = ShortBox.of(lower, upper, SPACING, 2.6 * SPACING)
+    assert short.left_out.tolist() == [67, 0, 37]
+    walls, those = (box_walls(lower, end, [False] * 3, SPACING, 0.02) for end in (upper, short.upper))
+    assert len(those) < 0.4 * len(walls)
+    assert cKDTree(those).query(short.folded(walls))[0].max() < 1e-12
+
+
+def test_a_container_clear_of_solids_has_the_walls_that_it_has_without_them():
+    """And one that is not has others."""
+    alone = filled(box([24, 24]), "wendland_c2", 2.6).walls
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.2}
+    for height, same in ((0.6, True), (0.5, False)):
+        walls = filled(box([24, 24]), "wendland_c2", 2.6, solid=[{**ball, "centre": [0.6, height]}]).walls
+        own = walls.weights[walls.solid == -1]
+        assert (len(own) == len(alone.weights) and np.array_equal(own, alone.weights)) is same

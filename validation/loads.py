@@ -112,5 +112,6 @@ LOADS = {
     "plunged-box, 12 particles long, pcisph": lambda: plunged_box(12, "pcisph"),
     "taylor-couette, 10 across": lambda: taylor_couette(10),
     "taylor-couette, 20 across": lambda: taylor_couette(20),
+    "taylor-couette, 40 across": lambda: taylor_couette(40),
     "turning-cup, 20 across": lambda: turning_cup(20),
 }

@@ -17,7 +17,7 @@ from cortado.files.progress import track
 
 from .catalogue import SIZES, TASKS, task
 from .contenders import CONTENDERS, contender
-from .curves import draw, medians
+from .curves import draw, medians, reached
 from .records import Record, Records, Run, outcome
 
 BUDGETS = {"small": 20_000.0, "large": 200_000.0}
@@ -91,7 +91,7 @@ def main(given: Sequence[str] | None = None) -> int:
         found = [record for record in records.read() if record.run in runs]
         for name in asked.task:
             draw(name, asked.size, [record for record in found if record.run.task == name], asked.out)
-        print(medians(found))
+        print(medians(found), reached(found), sep="\n\n")
         return 0
     except CortadoError as error:
         print(error, file=sys.stderr)

@@ -112,7 +112,7 @@ class Carry(Task):
         base, matrix = np.zeros((self.steps, 2)), np.zeros((self.steps, 2, self.blocks))
         base[:, 0], base[:, 1] = -self.accelerations.base, -GRAVITY
         matrix[:, 0] = -self.accelerations.matrix
-        return Controls("gravity", Affine(base, matrix))
+        return Controls({"gravity": Affine(base, matrix)})
 
     @cached_property
     def known(self) -> np.ndarray:

@@ -56,7 +56,7 @@ class CarryCup(Carry):
         base, matrix = np.zeros((self.steps, 2)), np.zeros((self.steps, 2, self.blocks))
         base[:, 0] = twice @ self.accelerations.base
         matrix[:, 0] = twice @ self.accelerations.matrix
-        return Controls("cup.displacement", Affine(base, matrix))
+        return Controls({"cup.displacement": Affine(base, matrix)})
 
     def score(self, problem: Problem, parameters: Arrays) -> Score:
         states, frames, path = problem.states(parameters, self.frames), self.frames, parameters["cup.displacement"]

@@ -8,10 +8,13 @@ from .latte import Latte, LatteDense
 from .mix import Mix
 from .pour_jug import PourJug
 from .splash import Splash, SplashProjection
+from .steer_raft import SteerRaft
+from .stir_milk import StirMilk
 from .task import Task
 
 TASKS: dict[str, type[Task]] = {
-    one.name: one for one in (Carry, CarryCup, Splash, SplashProjection, Latte, LatteDense, Mix, PourJug)
+    one.name: one
+    for one in (Carry, CarryCup, Splash, SplashProjection, Latte, LatteDense, Mix, PourJug, SteerRaft, StirMilk)
 }
 SIZES = ("small", "large")
 

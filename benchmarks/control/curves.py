@@ -18,6 +18,8 @@ from .records import Record
 POINTS = 400
 """Of a curve."""
 QUARTILES = (25, 50, 75)
+SHARES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+"""Of the first loss, to which searches lower it."""
 
 
 def curves(records: list[Record]) -> tuple[np.ndarray, np.ndarray]:
@@ -117,3 +119,28 @@ def medians(records: list[Record]) -> str:
                 f"| {name} | {who} | {len(runs)} | {spread} | {sum(one.diverged for one in runs)} | {', '.join(said)} |"
             )
     return "\n".join(lines)
+
+
+def reached(records: list[Record]) -> str:
+    """A table for a document: for each task, and each of `SHARES` of its first loss that a contender reaches, the
+    medians of the simulated steps until then; more than the budget where half of the runs do not reach it."""
+    names = list(by_contender(records))
+    lines = [f"| task | first loss | loss | {' | '.join(names)} |", "|---" * (3 + len(names)) + "|"]
+    for name in dict.fromkeys(one.run.task for one in records):
+        of_task = [one for one in records if one.run.task == name]
+        first = float(np.median([one.so_far[0] for one in of_task]))
+        for loss in first * np.array(SHARES):
+            cells = {who: _steps_to(loss, runs) for who, runs in by_contender(of_task).items()}
+            if not all(cell.startswith(">") for cell in cells.values()):
+                row = " | ".join(cells.get(who, "-") for who in names)
+                lines.append(f"| {name} | {first:.3g} | {loss:.3g} | {row} |")
+    return "\n".join(lines)
+
+
+def _steps_to(loss: float, runs: list[Record]) -> str:
+    """The median over runs of the simulated steps until the loss is so low, in words."""
+    each = [
+        next((at for at, so_far in zip(one.steps, one.so_far, strict=True) if so_far <= loss), np.inf) for one in runs
+    ]
+    median = np.median(each)
+    return f"{median:,.0f}" if np.isfinite(median) else f"> {max(one.run.budget for one in runs):,.0f}"

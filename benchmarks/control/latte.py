@@ -125,7 +125,7 @@ class Latte(Task):
         hats = np.maximum(1.0 - np.abs(times[:, None] - 1.0 - j), 0.0)
         matrix = REACH * self.cup * np.einsum("sk,da->sdka", hats @ response, np.eye(self.dimension)[:, axes])
         base = np.tile(self.outlet, (self.steps, 1))
-        return Controls("nozzle_path", Affine(base, matrix.reshape(self.steps, self.dimension, -1)))
+        return Controls({"nozzle_path": Affine(base, matrix.reshape(self.steps, self.dimension, -1))})
 
     @cached_property
     def baseline(self) -> np.ndarray:

@@ -100,7 +100,7 @@ class Gaps:
     def value_and_gradient(self, parameters: Mapping[str, np.ndarray], gradient: None = None) -> tuple[float, Arrays]:
         """Of controls and states by name. Raises `BudgetSpent`."""
         controls = self._objective.task.controls
-        over_time = controls.mapping.parameter(parameters["controls"])
+        over_time = controls.parameters(parameters["controls"])
         total, bars = 0.0, []
         found = {name: np.zeros_like(parameters[name]) for name in self._units}
         for k, ((part, problem), first) in enumerate(zip(self._parts, self._firsts(parameters), strict=True)):
@@ -109,15 +109,17 @@ class Gaps:
                 self._borders[k].expect({name: parameters[name][k] for name in self._units}, self.penalty)
             self._objective.steps.forward += problem.steps
             self._objective.steps.backward += problem.steps
-            one = problem.estimate({controls.parameter: over_time[part], **first}, self._estimator)
+            of_part = {name: value[part] for name, value in over_time.items()}
+            one = problem.estimate({**of_part, **first}, self._estimator)
             total += one.loss
-            bars.append(one.gradient[controls.parameter])
+            bars.append(one.gradient)
             for name, unit in self._units.items():
                 if k > 0:
                     found[name][k - 1] += unit * one.gradient[f"initial_{name}"]
                 if k < len(self._borders):
                     found[name][k] -= self._borders[k].pull[name]
-        return total, {"controls": controls.mapping.adjoint(parameters["controls"], np.concatenate(bars)), **found}
+        all_bars = {name: np.concatenate([one[name] for one in bars]) for name in over_time}
+        return total, {"controls": controls.adjoint(parameters["controls"], all_bars), **found}
 
     def _firsts(self, parameters: Mapping[str, np.ndarray]) -> Iterator[Arrays]:
         """The first states of the segments, as parameters of their problems."""

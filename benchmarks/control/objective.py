@@ -36,7 +36,6 @@ class Objective:
         self.task, self.budget, self.steps = task, budget, Steps()
         self.inner = problem
         """Whose steps are not counted."""
-        self._name = task.controls.parameter
         self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
         self._begin(task.baseline, first_positions(problem, seed))
 
@@ -45,9 +44,10 @@ class Objective:
         """(numbers,) where searches begin."""
         self.fixed = fixed
         """Parameters in the place of the scene's, such as the seed's first positions."""
-        self._changed = np.arange(start.size) >= (1.0 - late) * start.size
+        shares = self.named(start).items()
+        self._changed = self._flat({name: np.arange(len(u)) >= (1.0 - late) * len(u) for name, u in shares})
         counted: Any = Counted(FixedParameters(self.inner, fixed), self.inner.steps, self.steps)
-        self.problem = Transformed(counted, {self._name: self.task.controls.mapping})
+        self.problem = Transformed(counted, self.task.controls.mappings)
         self.curve: list[tuple[float, float]] = []
         """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
         self.best, self.best_loss = start, math.inf
@@ -62,7 +62,11 @@ class Objective:
 
     def named(self, u: np.ndarray) -> Arrays:
         """The numbers as what `problem` is given."""
-        return {self._name: u}
+        return self.task.controls.named(u)
+
+    def _flat(self, named: Arrays) -> np.ndarray:
+        """(numbers,) of what `problem` is given."""
+        return self.task.controls.flat(named)
 
     def values(self, points: Sequence[np.ndarray]) -> np.ndarray:
         """(points,) the losses, as many at a time in one launch as the device takes; of those that diverged a bad one.
@@ -79,26 +83,26 @@ class Objective:
                 losses = [self._value(one) for one in part]
             each = (self.steps.cost - before) / len(part)
             for k, (u, loss) in enumerate(zip(part, losses, strict=True), 1):
-                found.append(self._noted(u[self._name], loss, before + k * each))
+                found.append(self._noted(self._flat(u), loss, before + k * each))
         return np.array(found)
 
     def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
         """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; its
         numbers that overflowed are 0."""
         self.require_budget()
-        u = parameters[self._name]
+        u = self._flat(parameters)
         try:
             found = self.problem.estimate(parameters, gradient)
         except DivergedError:  # of this run, or of another one in an ensemble around it
             loss = math.inf if isinstance(gradient, AdjointEstimator) else self._value(parameters)
             return self._noted(u, loss, self.steps.cost), self.named(self._away_from_best(u))
-        slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
+        slopes = np.nan_to_num(self._flat(found.gradient), nan=0.0, posinf=0.0, neginf=0.0)
         slopes = np.clip(np.where(self._changed, slopes, 0.0), -GREATEST, GREATEST)
         return self._noted(u, found.loss, self.steps.cost), self.named(slopes)
 
     def value(self, parameters: Arrays) -> float:
         """As a line search asks."""
-        return float(self.values([parameters[self._name]])[0])
+        return float(self.values([self._flat(parameters)])[0])
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
         """See `Batchable.room`."""
@@ -106,7 +110,7 @@ class Objective:
 
     def together(self, points: Sequence[Arrays], estimator: None = None) -> list[Estimate]:
         """See `Batchable.together`; losses alone."""
-        return [Estimate(loss, {}) for loss in self.values([point[self._name] for point in points])]
+        return [Estimate(loss, {}) for loss in self.values([self._flat(point) for point in points])]
 
     def score(self) -> dict[str, float]:
         """Of the best controls."""

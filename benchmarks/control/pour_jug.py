@@ -1,7 +1,7 @@
-"""`pour_jug`: a jug turns, and its water shall be in a glass.
+"""`pour_jug`: a jug turns and moves, and its water shall be in a glass.
 
-After PourWater of SoftGym (Lin et al. 2020). The controls are by how much faster or slower than steadily the jug turns
-in blocks of time; it may turn back.
+After PourWater of SoftGym (Lin et al. 2020). The controls, in blocks of time, are by how much faster or slower than
+steadily the jug turns, and how fast it moves sideways.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ WALL = 4.0
 VISCOSITY = 0.3
 """Thick enough not to splash out of the glass [Pa s]."""
 FRAMES = 5
-"""States, at the end of the run, in which water is looked for."""
-GREATEST = 2.0
-"""How far the jug's angular velocity may be from the steady one, in that one."""
+"""States, from when most of the water falls to the end of the run, in which it is looked for."""
+FIRST = 0.64
+"""That of them which comes first, over the run."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +40,18 @@ class PourJug(Task):
     blocks: int
     jug: tuple[int, int] = (12, 12)
     """Width and depth of its water."""
-    turn: float = 2.0
-    """By which the jug is turned, clockwise, if nothing is searched [rad]."""
+    turn: float = 2.4
+    """By which the jug is turned, clockwise, if nothing is searched [rad]; at most twice as fast, and not back."""
+    aside: float = 3.3
+    """How far the jug could move, in widths of its water."""
 
     @classmethod
     def small(cls) -> Self:
-        return cls(0.0125, 0.002, 500, blocks=50)
+        return cls(0.0125, 0.0022, 550, blocks=25)
 
     @classmethod
     def large(cls) -> Self:
-        return cls(0.005, 0.001, 1000, blocks=100, jug=(36, 36))
+        return cls(0.005, 0.0011, 1100, blocks=50, jug=(36, 36))
 
     @property
     def steps(self) -> int:
@@ -89,18 +91,23 @@ class PourJug(Task):
 
     @cached_property
     def controls(self) -> Controls:
-        steady = -self.turn / self.steps
-        so_far = np.tril(np.ones((self.steps, self.steps)))
-        steadily = steady * np.arange(1, self.steps + 1)
-        return Controls("jug.turn", Affine(steadily, GREATEST * steady * so_far @ blocks_of(self.steps, self.blocks)))
+        steadily = -self.turn * np.arange(1, self.steps + 1) / self.steps
+        so_far = np.cumsum(blocks_of(self.steps, self.blocks), axis=0) / self.steps
+        reach = self.aside * self.jug[0] * self.spacing
+        aside = reach * np.einsum("sb,d->sdb", so_far, [1.0, 0.0])
+        turn = Affine(steadily, -self.turn * so_far)
+        return Controls({"jug.turn": turn, "jug.displacement": Affine(np.zeros((self.steps, 2)), aside)})
 
     @property
     def known(self) -> np.ndarray:
-        """Made by hand: faster, and then slower, as far as without a search."""
-        return 0.4 * np.sign(0.5 * (self.blocks - 1) - np.arange(self.blocks))
+        """What a search found, smoothed: turned faster at first, and moved to over the glass meanwhile."""
+        times = (np.arange(self.blocks) + 0.5) / self.blocks
+        faster = np.interp(times, [0.4, 0.7], [0.8, 0.0])
+        aside = np.interp(times, [0.0, 0.1, 0.3, 0.42, 0.8], [0.55, 0.25, 0.32, 0.7, 0.0])
+        return np.concatenate([faster, aside])
 
     def loss(self, simulation: Simulation) -> Frames:
-        at = np.linspace(self.steps, 0.8 * self.steps, FRAMES).astype(int)
+        at = np.linspace(self.steps, FIRST * self.steps, FRAMES).astype(int)
         return Frames({int(step): Outside(*self.glass, 1.0 / FRAMES) for step in at})
 
     def score(self, problem: Problem, parameters: Arrays) -> Score:

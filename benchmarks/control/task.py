@@ -25,21 +25,37 @@ Score = dict[str, float]
 
 @dataclass(frozen=True)
 class Controls:
-    """Numbers from -1 to 1, of which a parameter of the scene over time is made."""
+    """Numbers from -1 to 1, of which parameters of the scene over time are made."""
 
-    parameter: str
-    """Its name, such as gravity."""
-    mapping: Affine
-    """From the numbers (numbers,) to the parameter (steps, d)."""
+    mappings: Mapping[str, Affine]
+    """By the name of a parameter, such as gravity: from its share of the numbers to it, (steps, ...)."""
 
     @property
     def numbers(self) -> int:
         """How many there are."""
-        return self.mapping.matrix.shape[-1]
+        return sum(self._shares)
+
+    @property
+    def _shares(self) -> list[int]:
+        return [mapping.matrix.shape[-1] for mapping in self.mappings.values()]
+
+    def named(self, u: np.ndarray) -> Arrays:
+        """The share of each parameter in the numbers (numbers,)."""
+        return dict(zip(self.mappings, np.split(u, np.cumsum(self._shares)[:-1]), strict=True))
+
+    def flat(self, named: Arrays) -> np.ndarray:
+        """(numbers,) of the shares."""
+        return np.concatenate([named[name] for name in self.mappings])
 
     def parameters(self, u: np.ndarray) -> Arrays:
         """What a `Problem` is given."""
-        return {self.parameter: self.mapping.parameter(u)}
+        return {name: self.mappings[name].parameter(share) for name, share in self.named(u).items()}
+
+    def adjoint(self, u: np.ndarray, bars: Arrays) -> np.ndarray:
+        """(numbers,) the adjoint of the numbers for those of the parameters."""
+        return self.flat(
+            {name: self.mappings[name].adjoint(share, bars[name]) for name, share in self.named(u).items()}
+        )
 
 
 class Task(ABC):
@@ -129,4 +145,4 @@ def shaken(steps: int, blocks: int, strength: float, dimension: int, axes: int) 
     base = np.zeros((steps, dimension))
     base[:, 1] = -GRAVITY
     matrix = np.einsum("sb,da->sdba", strength * blocks_of(steps, blocks), np.eye(dimension, axes))
-    return Controls("gravity", Affine(base, matrix.reshape(steps, dimension, blocks * axes)))
+    return Controls({"gravity": Affine(base, matrix.reshape(steps, dimension, blocks * axes))})

@@ -8,7 +8,6 @@ from cortado.errors import InputError, shown
 from cortado.problem import Problem
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
-from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.parameters.values import Arrays, Values
 
 PERTURBATION = 0.05
@@ -24,9 +23,11 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
             "velocities are moved, too."
         )
     values = ParameterSpace(simulation, problem.steps).defaults()
-    tilt = BY_NAME["tilt"]
-    if tilt.present(simulation.scene) and not simulation.scene.schedule.leads_gravity:
-        values["tilt"] = tilt.value(simulation)
+    for view, other in simulation.known.views.items():
+        parameter = simulation.known[view]
+        led = other == "gravity" and simulation.scene.schedule.leads_gravity
+        if parameter.present(simulation.scene) and not led:
+            values[view] = parameter.value(simulation)
     if not isinstance(parameters, (Mapping, Sequence)) or isinstance(parameters, (str, bytes)):
         raise InputError(f"parameters is {shown(parameters)}, but must be values by name, or a list of names.")
     known = ", ".join(values)
@@ -57,7 +58,7 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
         parameter = problem.simulation.known[name]
         over_time = parameter.axis is Axis.STEP
         idle = over_time and problem.steps == 0
-        idle = idle or (name == "gravity" and "tilt" in chosen)
+        idle = idle or any(view in chosen and name == other for view, other in problem.simulation.known.views.items())
         idle = idle or not _moves_both_ways(parameter, value)
         if idle or not parameter.acts(problem.simulation, values):
             continue

@@ -48,8 +48,9 @@ class ParameterSpace:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
-        if "tilt" in values and "gravity" in values:
-            raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
+        for view, name in self._known.views.items():
+            if view in values and name in values:
+                raise InputError(f"{what} {name} is given, but must be left out, as {view} is given in its place.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
         if what != "direction" and not self._is_judged(found):
             check_sizes(found, self._simulation.precision, self._known)
@@ -226,7 +227,7 @@ class ParameterSpace:
         """Adjoints of the first state, unless it was given, and of the parameters, for the names and in the shapes of
         ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one."""
         dimension = self._simulation.dimension
-        read = {"gravity" if name == "tilt" else name for name in values}
+        read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
         run = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in read}
         run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}

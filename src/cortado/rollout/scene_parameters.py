@@ -15,6 +15,7 @@ from cortado.errors import InputError
 from cortado.particles.fields import first_values
 from cortado.particles.state import State
 from cortado.scene.discrete_scene import Lattice
+from cortado.scene.motions import Steady
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Axis, Changing, Source
 from cortado.scene.parameters.reference_density import (
@@ -93,7 +94,13 @@ class SceneParameters:
         """Those of the schedule, and of forces, that act: a gravity or a tilt that is given replaces either."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
-        return {name: course for name, course in courses.items() if name not in values and name not in replaced}
+        found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
+        return found | {name: Steady(values[rate]) for rate, name in self._rates(values).items()}
+
+    def _rates(self, values: Arrays) -> dict[str, str]:
+        """Of the values those that say how fast others grow, with the names of these."""
+        known = self._known
+        return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
         """(steps,) [s] when the rows of a scheduled parameter are; of steps that are chosen, the clock has recorded
@@ -166,11 +173,13 @@ class SceneParameters:
     ) -> tuple[Arrays, Arrays]:
         """A direction by name as tangents of the fields of the first state and of what steps depend on, where the first
         state is at a clock whose time has a tangent."""
-        if "gravity" in along and "tilt" in values:
-            raise InputError("direction gravity is given, but must be left out, as tilt is given in its place.")
+        for view, replaced in self._known.views.items():
+            for name, other in ((view, replaced), (replaced, view)):
+                if name in along and other in values:
+                    raise InputError(
+                        f"direction {name} is given, but must be left out, as {other} is given in its place."
+                    )
         if "tilt" in along:
-            if "gravity" in values:
-                raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
             if "tilt" not in values and self._simulation.scene.schedule.leads_gravity:
                 raise InputError(
                     "direction tilt is given, but must be left out, as the scene's schedule says where gravity points: "
@@ -180,7 +189,11 @@ class SceneParameters:
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
         rates = self._scheduled_rates(values, clock) if "time_step" in along else {}
         later = self._scheduled_rates(values, clock, of_clock=True) if time_dot else {}
+        grown = {
+            name: Steady(along[rate]).at(self._times(name, values, clock)) for rate, name in self._rates(along).items()
+        }
         along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
+        along |= {name: along[name] + rows for name, rows in grown.items()}
         fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
         density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
         first = {**first_values(self._simulation.initial.fields, along), DENSITY: density}
@@ -206,6 +219,8 @@ class SceneParameters:
                     found[field.first] = found.get(field.first, 0.0) + first[field.name].reshape(own)
         if "tilt" in values:
             found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
+        for rate, name in self._rates(values).items():
+            found[rate] = np.tensordot(self._times(name, values, clock), run[name], axes=1)
         if "time_step" in values:
             later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values, clock).items())
             found["time_step"] = found["time_step"] + later

@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.errors import InputError, shown
 from cortado.scene.motions import (
     AXES,
     angular_velocity_name,
@@ -39,14 +40,27 @@ class SolidMotion:
         return type(self)(self.positions[frames], self.rotations[frames], *moving)
 
 
-def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:
+class SolidMotions(dict[str, SolidMotion]):
+    """Of the solids of a run that move, by their names."""
+
+    def __missing__(self, name: object) -> SolidMotion:
+        """Raises `InputError`."""
+        known = f"moved {', '.join(self)}" if self else "moved none"
+        raise InputError(f"solids has no {shown(name)}, as the run {known}.")
+
+    def in_frames(self, frames: slice) -> "SolidMotions":
+        """In some of the frames."""
+        return SolidMotions({name: motion[frames] for name, motion in self.items()})
+
+
+def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> SolidMotions:
     """Of the solids of a scene that move, by their names, from recorded fields (frames, 1, ...) of states."""
-    return {table.name: _motion(table.name, fields, scene.dimension) for table in moved(scene, fields)}
+    return SolidMotions({table.name: _motion(table.name, fields, scene.dimension) for table in moved(scene, fields)})
 
 
-def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> dict[str, SolidMotion]:
+def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
     """Of all solids of which recorded fields (frames, 1, ...) of states tell, by their names."""
-    return {name: _motion(name, fields, dimension) for name in solids_in(fields)}
+    return SolidMotions({name: _motion(name, fields, dimension) for name in solids_in(fields)})
 
 
 def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:

@@ -21,7 +21,7 @@ from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.sensors.log import Readings
 from cortado.runs.showing import Showing
-from cortado.runs.solid_motion import SolidMotion, motions_in
+from cortado.runs.solid_motion import SolidMotions, motions_in
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
@@ -72,7 +72,7 @@ class Trajectory(Showing):
     """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
     """what sensors have read in every step, by their names; it is not in files"""
-    solids: Mapping[str, SolidMotion] = field(default_factory=dict)
+    solids: SolidMotions = field(default_factory=SolidMotions)
     """where solids that move are, by their names"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
@@ -161,7 +161,7 @@ class Trajectory(Showing):
         kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
         each = {name: getattr(self, name) for name in ("others", "quantities")}
         kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
-        kept["solids"] = {name: motion[frames] for name, motion in self.solids.items()}
+        kept["solids"] = self.solids.in_frames(frames)
         return replace(self, **kept)
 
     @property

@@ -1,6 +1,7 @@
 """The shapes that a container may have, each with its walls."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Literal, Self
 
@@ -12,6 +13,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Box, HalfSpace, Hollow, Placed, Revolved, Solid
 from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
+from cortado.discretise.walls.short_box import ShortBox
 from cortado.errors import Words
 from cortado.scene.fields import FieldPath, Flag, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
@@ -45,6 +47,11 @@ class Container(Table):
     @abstractmethod
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
         """Where fluid may rest less than ``reach`` [m] from a wall."""
+
+    def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
+        """A container whose walls have the weights of those of this one beside fluid with a spacing and a support [m],
+        which may be found sooner; and which of its walls has that of each, by where both (b, d) are [m]."""
+        return self, lambda points: points
 
     @abstractmethod
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
@@ -114,6 +121,10 @@ class BoxContainer(Container):
         axes = np.eye(dimension)[~periodic]
         lowest = [HalfSpace(axis, float(lower @ axis), *ends) for axis in axes]
         return (*lowest, *(HalfSpace(-axis, -float(upper @ axis), *ends) for axis in axes))
+
+    def shortened(self, spacing: float, support: float) -> tuple[Container, Callable[[Points], Points]]:
+        short = ShortBox.of(*self.extent(), spacing, support)
+        return self.model_copy(update={"upper": tuple(short.upper.tolist())}), short.folded
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)

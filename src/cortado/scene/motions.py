@@ -1,13 +1,12 @@
 """How solids that move are displaced and turned from where they begin, over time."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import MissingDerivativeError
 from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role, Source
 from cortado.scene.schedule import along_lines
 from cortado.scene.solids import SolidTable
@@ -34,13 +33,13 @@ class Steady:
         return float(np.linalg.norm(self.rate))
 
     def rates(self, times: NDArray) -> NDArray:
-        """See `_no_rates`."""
-        raise _no_rates()
+        """(n,) or (n, components) the derivatives with respect to time."""
+        return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Straight lines between values at some times, constant before the first and after the last."""
+    """Straight lines between values at some times, constant after the last."""
 
     times: NDArray[np.float64]
     """(k,) [s]"""
@@ -54,21 +53,17 @@ class Knots:
 
     def greatest(self) -> float:
         """Size of the greatest rate."""
-        changes = np.diff(self.values.reshape(len(self.times), -1), axis=0)
-        return float((np.linalg.norm(changes, axis=1) / np.diff(self.times)).max())
+        return float(np.linalg.norm(self._slopes.reshape(len(self.times), -1), axis=1).max())
 
     def rates(self, times: NDArray) -> NDArray:
-        """See `_no_rates`."""
-        raise _no_rates()
+        """(n,) or (n, components) the derivatives with respect to time, at a knot that of what comes after."""
+        return self._slopes[np.searchsorted(self.times, times, side="right") - 1]
 
-
-def _no_rates() -> MissingDerivativeError:
-    """What asks for derivatives of a path with respect to time asks for those of a run with respect to when its steps
-    are, through where solids are, which nobody computes yet."""
-    return MissingDerivativeError(
-        "solids that move have no derivative with respect to the time step, or to when a run begins: leave time_step "
-        "out of the parameters, or let solids be fixed."
-    )
+    @property
+    def _slopes(self) -> NDArray[np.float64]:
+        """(k,) or (k, components) after each of the times."""
+        lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
+        return np.concatenate([np.diff(self.values, axis=0) / lengths, 0.0 * self.values[:1]])
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
@@ -102,28 +97,34 @@ def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
-def greatest_speed(solids: Sequence[SolidTable]) -> float:
-    """How fast the fastest point of a solid moves at most [m/s]."""
+def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
+    """How fast the fastest point of a solid moves at most [m/s], with values of parameters that replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shape, middle = solid.shape_about()
         reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)))
         d = len(middle)
-        shift, turn = (
-            _course(solid, "positions", "velocity", d),
-            _course(solid, "rotations", "angular_velocity", 2 * d - 3),
-        )
-        found.append(shift.greatest() + reach * turn.greatest())
+        shift = values.get(velocity_name(solid.name))
+        turn = values.get(angular_velocity_name(solid.name))
+        shifts = _course(solid, "positions", "velocity", d) if shift is None else Steady(shift)
+        turns = _course(solid, "rotations", "angular_velocity", 2 * d - 3) if turn is None else Steady(turn)
+        found.append(shifts.greatest() + reach * turns.greatest())
     return max(found)
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Of solids that move: where they begin, and where they are at the end of each step, as from there; of free bodies
-    how they begin, and their density."""
+    """Of solids that move: where they begin, and where they are at the end of each step, as from there, or, if their
+    motion is steady, how fast they go; of free bodies how they begin, and their density."""
     found = [make(solid) for solid in told(solids) for make in (_position, _rotation, _displacement, _turn)]
+    steady = [
+        replace(make(solid), role=Role.VIEW, in_place_of=name(solid.name))
+        for solid in told(solids)
+        if solid.times is None
+        for make, name in ((_velocity, displacement_name), (_angular_velocity, turn_name))
+    ]
     makers = (_position, _rotation, _velocity, _angular_velocity)
     begun = [replace(make(solid), role=Role.STATE) for solid in free(solids) for make in makers]
-    return [*found, *begun, *map(_density, free(solids))]
+    return [*found, *steady, *begun, *map(_density, free(solids))]
 
 
 def position_name(solid: str) -> str:
@@ -153,12 +154,13 @@ def turn_name(solid: str) -> str:
 
 
 def velocity_name(solid: str) -> str:
-    """Of the parameter that says how fast the middle of a free body is at the start, and of the field of a state."""
+    """Of the parameter that says how fast the middle of a solid is, of a free body at the start, and of the field of a
+    state."""
     return f"{solid}.velocity"
 
 
 def angular_velocity_name(solid: str) -> str:
-    """Of the parameter that says how fast a free body turns at the start, and of the field of a state."""
+    """Of the parameter that says how fast a solid turns, a free body at the start, and of the field of a state."""
     return f"{solid}.angular_velocity"
 
 
@@ -199,7 +201,7 @@ def _velocity(solid: SolidTable) -> Parameter:
     return Parameter(
         velocity_name(solid.name),
         "m/s",
-        f"how fast the middle of the body {solid.name} is at the start",
+        f"how fast the middle of the solid {solid.name} is{_when(solid)}",
         Axis.SCALAR,
         lambda source: begun,
         components=lambda dimension, phases: dimension,
@@ -213,12 +215,16 @@ def _angular_velocity(solid: SolidTable) -> Parameter:
     return Parameter(
         angular_velocity_name(solid.name),
         "rad/s",
-        f"how fast the body {solid.name} turns at the start",
+        f"how fast the solid {solid.name} turns about its middle{_when(solid)}",
         Axis.SCALAR,
         lambda source: begun.reshape(_shape_of(angles)),
         components=None if angles == 1 else lambda dimension, phases: dimension,
         change=lambda source, value: np.ones(np.shape(value)),
     )
+
+
+def _when(solid: SolidTable) -> str:
+    return " at the start" if solid.motion == "free" else ""
 
 
 def _density(solid: SolidTable) -> Parameter:

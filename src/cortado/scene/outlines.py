@@ -1,6 +1,5 @@
 """Shapes that solids and bodies of fluid may both have: polygons, and meshes from files."""
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Literal, Self
 
@@ -76,7 +75,7 @@ class MeshShape(Table):
 def _about_middle(mesh: Mesh, scale: float) -> tuple[Mesh, Points]:
     """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
     middle = scale * mesh.middle()
-    return replace(mesh, vertices=scale * mesh.vertices - middle), middle
+    return mesh.moved(scale, -middle), middle
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:

@@ -110,7 +110,7 @@ def standing_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
     """Those of the `stability_limits` [s] that do not depend on how fast the fluid is."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
-    if (fastest := greatest_speed(scene.solid)) > 0.0:
+    if (fastest := greatest_speed(scene.solid, values)) > 0.0:
         own["the speed of solids"] = SOLID_STEP * scene.discretisation.spacing / fastest
     return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
 

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, corners
 from cortado.discretise.solids.solid import Placed, Solid
 from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
 from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
 from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
 from cortado.errors import InputError
-from cortado.scene.containers import Container
+from cortado.scene.containers import Container, NoContainer
 from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.room import resting_room
 from cortado.scene.scene import Scene
@@ -57,22 +57,49 @@ class Walls:
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
-    still = _around(scene, layers, lattice) if resting_room(scene).solids else _container_walls(scene, layers, lattice)
+    if not resting_room(scene).solids:
+        still = [_container_walls(scene, layers, lattice)]
+    elif _stand_clear(scene, lattice):
+        inner = scene.model_copy(update={"container": NoContainer()})
+        still = [_container_walls(scene, layers, lattice), _around(inner, layers, lattice)]
+    else:
+        still = [_around(scene, layers, lattice)]
     periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
-    return Walls.joined([still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+    return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+
+
+def _stand_clear(scene: Scene, lattice: RestLattice) -> bool:
+    """Whether no fluid beside a solid at rest sees the container, whose walls then are those of one without solids."""
+    room = resting_room(scene)
+    if room.periods.any() or not all(solid.is_bounded for solid in room.solids):
+        return False
+    ends = np.concatenate([corners(*solid.extent()) for solid in room.solids])
+    return bool(room.region.distance(ends).max() < -2.0 * lattice.support - lattice.spacing)
 
 
 def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of the container, in layers of even particles."""
-    container, dimension, spacing = scene.container, scene.dimension, lattice.spacing
-    room, lower = resting_room(scene), container.periods(dimension)[0]
+    from scipy.spatial import cKDTree
+
+    (short, folded), dimension = scene.container.shortened(lattice.spacing, lattice.support), scene.dimension
+    points, sought = (
+        _even_points(container, dimension, layers, lattice.spacing) for container in (scene.container, short)
+    )
+    lower, lengths = short.periods(dimension)
+    room = Room(short.region(dimension).opened(lengths), (), lengths)
+    surface = WallSurface(sought.positions, sought.flat, lattice, room, lower, lengths, even_changes)
+    weights = surface.weights(short.places(dimension, lattice.spacing, lattice.support))
+    same = cKDTree(sought.positions).query(folded(points.positions))[1] if len(sought) else slice(0)
+    return Walls.of(points, weights[same], np.full(len(points), scene.container.sticks))
+
+
+def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
+    """The wall particles of a container."""
     particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
     positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
-    points = WallPoints(positions, flat, room.region.nearest(positions) - positions)
-    surface = WallSurface(positions, flat, lattice, room, lower, room.periods, even_changes)
-    weights = surface.weights(container.places(dimension, spacing, lattice.support))
-    return Walls.of(points, weights, np.full(len(points), container.sticks))
+    region = container.region(dimension).opened(container.periods(dimension)[1])
+    return WallPoints(positions, flat, region.nearest(positions) - positions)
 
 
 def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:

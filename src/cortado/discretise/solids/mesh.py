@@ -32,6 +32,13 @@ class Mesh(Solid):
     """(k, 3) which vertices are the corners of each, counterclockwise as seen from outside"""
     parts: Sequence[Numbers] = ()
     """The triangles of each part; without any, all are one, which does not cross itself."""
+    known_trees: Sequence[TriangleTree] = ()
+    """Of the parts, where somebody has made them before."""
+
+    def moved(self, scale: float, shift: Points) -> "Mesh":
+        """Multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        trees = [tree.moved(scale, shift) for tree in self._trees]
+        return Mesh(scale * self.vertices + shift, self.triangles, self.parts, trees)
 
     @cached_property
     def corners(self) -> Points:
@@ -43,8 +50,8 @@ class Mesh(Solid):
         return self.parts or (np.arange(len(self.triangles)),)
 
     @cached_property
-    def _trees(self) -> list[TriangleTree]:
-        return [TriangleTree.of(self.corners[part]) for part in self._numbers]
+    def _trees(self) -> Sequence[TriangleTree]:
+        return self.known_trees or [TriangleTree.of(self.corners[part]) for part in self._numbers]
 
     def extent(self) -> tuple[Points, Points]:
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))

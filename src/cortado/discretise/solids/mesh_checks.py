@@ -59,15 +59,18 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str) -> FoundMesh:
         )
     edges.check(vertices, what)
     mesh = Mesh(vertices, triangles)
-    parts, notes = _solid_parts(mesh, bodies(edges, vertices, triangles), what)
-    return FoundMesh(Mesh(vertices, triangles, parts), notes, count - len(triangles))
-
-
-def _solid_parts(mesh: Mesh, labels: Numbers, what: str) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """The parts of a closed mesh whose bodies have labels (k,), and notes about it; raises `InputError` where it is
-    inside out."""
-    size = np.ptp(mesh.corners, axis=(0, 1)).max()
     tree = TriangleTree.of(mesh.corners)
+    parts, notes = _solid_parts(mesh, tree, bodies(edges, vertices, triangles), what)
+    known = () if parts else (tree,)
+    return FoundMesh(Mesh(vertices, triangles, parts, known), notes, count - len(triangles))
+
+
+def _solid_parts(
+    mesh: Mesh, tree: TriangleTree, labels: Numbers, what: str
+) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
+    """The parts of a closed mesh, with the tree of its triangles, whose bodies have labels (k,), and notes about it;
+    raises `InputError` where it is inside out."""
+    size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
     by_area = np.argsort(-mesh.areas(), kind="stable")
@@ -78,7 +81,7 @@ def _solid_parts(mesh: Mesh, labels: Numbers, what: str) -> tuple[tuple[Numbers,
     if wrong.any():
         raise InputError(_inside_out(wrong, labels, labels[some], what, mesh.corners[some[np.argmax(wrong)]]))
     notes = []
-    parts, crossing, filled = parts_of(mesh, labels, crossings, some, beside)
+    parts, crossing, filled = parts_of(mesh, tree, labels, crossings, some, beside)
     if crossing is not None:
         notes.append(
             f"{what} crosses itself, for example at {place_in_file(mesh.corners[crossing].mean(axis=0))}: what it goes "

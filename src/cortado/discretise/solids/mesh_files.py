@@ -1,7 +1,6 @@
 """Files of triangles: STL, OBJ, PLY and glTF, as trimesh reads them; and meshes as solids out of them."""
 
 import warnings
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,7 @@ def read_mesh(
         container: lower and upper corner, each (3,) [m], of the box around the container of the fluid, if there is one.
     """
     found = mesh_in_file(path)
-    mesh = replace(found.mesh, vertices=scale * found.mesh.vertices)
+    mesh = found.mesh.moved(scale, np.zeros(3))
     notes, what = found.notes, repr(path)
     if support is None:
         check_unit(mesh, what, scale, spacing, container)

@@ -8,13 +8,14 @@ from cortado.discretise.solids.triangle_tree import Numbers, TriangleTree
 
 
 def parts_of(
-    mesh: Mesh, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
+    mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
     """The triangles of each part, none if the mesh is one part that does not cross itself; a triangle at which a body
     crosses itself, and one of a body inside another, if there are such.
 
     Args:
         mesh: closed.
+        tree: of its triangles.
         labels: (k,) the body of each triangle.
         crossings: (m, 2) pairs of triangles that cross.
         some: (s,) triangles, of each body at least one with an area.
@@ -22,7 +23,8 @@ def parts_of(
     """
     count = int(labels.max()) + 1
     bodies = [np.flatnonzero(labels == body) for body in range(count)]
-    around = np.array([TriangleTree.of(mesh.corners[body]).windings(beside) for body in bodies])
+    trees = [tree] if count == 1 else [TriangleTree.of(mesh.corners[body]) for body in bodies]
+    around = np.array([one.windings(beside) for one in trees])
     seen = labels[some]
     owners = _owners(np.array([_volume(mesh.corners[body]) for body in bodies]), around, seen)
     own = owners[labels[crossings]]

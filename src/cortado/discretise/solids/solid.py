@@ -16,6 +16,11 @@ Which = NDArray[np.bool_]
 class Solid(ABC):
     """A closed body in d dimensions."""
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether all of it is in the box around it."""
+        return True
+
     @abstractmethod
     def extent(self) -> tuple[Points, Points]:
         """The box around it: lower and upper, each (d,) [m]."""
@@ -62,6 +67,10 @@ class Placed(Solid):
     turn: Points
     """(d, d) the rotation matrix"""
 
+    @property
+    def is_bounded(self) -> bool:
+        return self.solid.is_bounded
+
     def extent(self) -> tuple[Points, Points]:
         lower, upper = self.solid.extent()
         middle, half = self.turn @ (0.5 * (lower + upper)), np.abs(self.turn) @ (0.5 * (upper - lower))
@@ -71,7 +80,13 @@ class Placed(Solid):
         return self.solid.distance((points - self.position) @ self.turn)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        return self.solid.distance_up_to((points - self.position) @ self.turn, reach)
+        if not self.solid.is_bounded:
+            return self.solid.distance_up_to((points - self.position) @ self.turn, reach)
+        lower, upper = self.extent()
+        near = ((points > lower - reach) & (points < upper + reach)).all(axis=1)
+        found = np.full(len(points), np.inf)
+        found[near] = self.solid.distance_up_to((points[near] - self.position) @ self.turn, reach)
+        return found
 
     def nearest(self, points: Points) -> Points:
         return self.position + self.solid.nearest((points - self.position) @ self.turn) @ self.turn.T
@@ -89,6 +104,10 @@ class Union(Solid):
     """Several solids as one; they may overlap."""
 
     solids: Sequence[Solid]
+
+    @property
+    def is_bounded(self) -> bool:
+        return all(solid.is_bounded for solid in self.solids)
 
     def extent(self) -> tuple[Points, Points]:
         ends = np.array([solid.extent() for solid in self.solids])
@@ -224,6 +243,10 @@ class HalfSpace(Solid):
     upper: Points
     """(d,) [m]"""
 
+    @property
+    def is_bounded(self) -> bool:
+        return False
+
     def extent(self) -> tuple[Points, Points]:
         return self.lower, self.upper
 
@@ -248,6 +271,10 @@ class Hollow(Solid):
     """All of space but a shape: a tank with walls of any thickness."""
 
     cavity: Solid
+
+    @property
+    def is_bounded(self) -> bool:
+        return False
 
     def extent(self) -> tuple[Points, Points]:
         return self.cavity.extent()

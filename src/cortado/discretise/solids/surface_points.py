@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,8 @@ Near = Callable[[Points, float], Which]
 FINE = 3
 """Points of a surface along a spacing, among which those that stay are chosen."""
 CELLS = (3, 4)
-"""Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine."""
+"""Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine; the last
+of them is even."""
 APART, LEAST_APART = 0.78, 0.65
 """In spacings: points are chosen wherever none is nearer than the first; then they are moved, none nearer to another
 than the second."""
@@ -132,24 +132,11 @@ def _near(solid: Solid, fine: float, reach: float) -> Points:
     def is_near(points: Points, furthest: float) -> Which:
         return np.asarray(np.abs(solid.distance_up_to(points, furthest)) < furthest)
 
-    found = [points[is_near(points, reach)] for points in _lattice(lower, upper, reach, fine, is_near)]
+    found = [points[is_near(points, reach)] for points in lattice_about(lower, upper, reach, fine, is_near)]
     return np.concatenate([np.zeros((0, len(lower))), *found])
 
 
-def lattice_about(feet: Points, reach: float, fine: float, tree: Any) -> Iterator[Points]:
-    """Points (n, d) of a lattice, ``fine`` [m] apart, of which those no further than ``reach`` [m] from feet (m, d)
-    [m], of which there is a tree, are all; in parts."""
-    if not len(feet):
-        return
-
-    def is_near(points: Points, furthest: float) -> Which:
-        found = tree.query(points, distance_upper_bound=furthest, workers=usable_cores())[0]
-        return np.isfinite(found)
-
-    yield from _lattice(feet.min(axis=0), feet.max(axis=0), reach, fine, is_near)
-
-
-def _lattice(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
+def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
     """Points (n, d) of a lattice, ``fine`` [m] apart, of which those no further than ``reach`` [m] from what is near
     are all, in parts: of cells of the box between two corners and as far around it, and of parts of those, all whose
     middles are near enough."""
@@ -161,8 +148,13 @@ def _lattice(lower: Points, upper: Points, reach: float, fine: float, is_near: N
         size /= parts
     cells = cells[is_near(cells, reach + 0.5 * size * np.sqrt(dimension))]
     chunk = max(MOST // last**dimension, 1)
+    half = _divided(np.zeros((1, dimension)), 1.0, last) > 0.0
+    halves = half @ 2 ** np.arange(dimension)[::-1]  # the half of a cell along each axis in which each part of it is
     for start in range(0, len(cells), chunk):
-        yield _divided(cells[start : start + chunk], size, last) + fine * np.array(OFF_FACES[:dimension])
+        some = cells[start : start + chunk]
+        near = is_near(_divided(some, size, 2), reach + 0.25 * size * np.sqrt(dimension))
+        which = near.reshape(len(some), -1)[:, halves].ravel()
+        yield _divided(some, size, last)[which] + fine * np.array(OFF_FACES[:dimension])
 
 
 def _divided(cells: Points, size: float, parts: int) -> Points:

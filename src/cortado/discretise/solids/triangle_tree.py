@@ -54,6 +54,11 @@ class TriangleTree:
             boxes.append(np.hstack([lower, upper]))
         return cls(ordered, order, starts.astype(np.int32), np.concatenate([np.zeros((1, 6)), *boxes[::-1]]))
 
+    def moved(self, scale: float, shift: Points) -> "TriangleTree":
+        """Of the same triangles, multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        corners, boxes = scale * self.corners + shift, scale * self.boxes + np.tile(shift, 2)
+        return TriangleTree(corners, self.order, self.starts, boxes)
+
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
         """(n, 3) the nearest points of the triangles [m], and (n,) how far away they are [m], for points (n, 3) [m];
         the points themselves and ``reach`` [m] where nothing is nearer than that."""
@@ -77,8 +82,10 @@ class TriangleTree:
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
         self.ask("find_crossings", self.corners[:, 0], **given, places=places, others=others)  # how many there are
+        if not counts.any():
+            return np.zeros((0, 2), dtype=np.int64)
         places = np.append(0, np.cumsum(counts)).astype(np.int32)
-        others = np.zeros(max(places[-1], 1), dtype=np.int32)
+        others = np.zeros(places[-1], dtype=np.int32)
         self.ask("find_crossings", self.corners[:, 0], **given, places=places, others=others)  # and which
         pairs = np.column_stack([np.repeat(np.arange(count), counts), others[: places[-1]]])
         return np.sort(self.order[pairs], axis=1)

@@ -91,7 +91,7 @@ class ExposedSurface:
         parts, first_row = [], 0.5 * self.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
-            feet = self._feet_of(found.points) - found.points
+            feet = self._feet_of(found.points, *self._tree.query(found.points)) - found.points
             found_depths = np.minimum(np.linalg.norm(feet, axis=1) / self.spacing, depth / self.spacing + TOLERANCE)
             depths, which = np.unique(np.round(found_depths, DIGITS), return_inverse=True)
             seen = np.array([planes.weight(first_row + self.spacing * one) for one in depths])[which]
@@ -115,28 +115,43 @@ class ExposedSurface:
     def _at(self, depth: float) -> Points:
         """(n, d) [m] fine points at a depth."""
         fine, found = self.spacing / FINE, []
-        for points in lattice_about(self.feet, depth + 0.5 * fine, fine, self._tree):
-            near = self._tree.query(points, distance_upper_bound=depth + fine)[0]
-            points = points[np.isfinite(near) & (near > depth - fine)]
-            points = points[self.room.distance(points, fine) > 0.0]
-            feet = self._feet_of(points)
+        if not len(self.feet):
+            return self.feet
+
+        def is_near(points: Points, furthest: float) -> NDArray[np.bool_]:
+            beyond = furthest - depth - 0.5 * fine
+            away = self._tree.query(points, distance_upper_bound=furthest)[0]
+            near = np.isfinite(away) & (away > depth - fine - beyond)
+            near[near] = self.room.distance(points[near], beyond) > -beyond
+            return near
+
+        lower, upper = self.feet.min(axis=0), self.feet.max(axis=0)
+        for points in lattice_about(lower, upper, depth + 0.5 * fine, fine, is_near):
+            away, nearest = self._tree.query(points, distance_upper_bound=depth + fine)
+            beneath = np.isfinite(away) & (away > depth - fine)
+            beneath[beneath] = self.room.distance(points[beneath], fine) > 0.0
+            points = points[beneath]
+            feet = self._feet_of(points, away[beneath], nearest[beneath])
             down = points - feet
             distances = np.linalg.norm(down, axis=1)
             band = np.abs(distances - depth) < 0.5 * fine
             found.append(feet[band] + (depth / distances[band, None]) * down[band])
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
-    def _feet_of(self, points: Points) -> Points:
-        """(n, d) [m] the point of the surface that is nearest to each of the points (n, d) [m] beneath it: on a solid,
-        or where two of them meet."""
-        fine, (reach, nearest) = self.spacing / FINE, self._tree.query(points)
+    def _feet_of(self, points: Points, reach: Points, nearest: NDArray[np.int64]) -> Points:
+        """(n, d) [m] the point of the surface that is nearest to each of the points (n, d) [m] beneath it, on a solid
+        or where two of them meet; ``nearest`` (n,) is the nearest of the fine points, ``reach`` (n,) [m] away."""
+        fine = self.spacing / FINE
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
         for solid in self.solids:
-            near = np.flatnonzero(np.abs(solid.distance_up_to(points, furthest)) < np.minimum(best, reach + fine))
+            within, near = np.minimum(best, reach + fine), np.arange(len(points))
+            if len(self.solids) > 1:
+                near = near[np.abs(solid.distance_up_to(points, furthest)) < within]
             feet = solid.nearest(points[near])
             up, distances = feet - points[near], np.linalg.norm(feet - points[near], axis=1)
             free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.room, self.spacing)
+            free &= distances < within[near]
             near = near[free]
             found[near], best[near] = feet[free], distances[free]
         between = np.flatnonzero(np.isinf(best))

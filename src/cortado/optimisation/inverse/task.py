@@ -93,9 +93,9 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, k
         parameter = known[name]
         if not parameter.present(scene):
             raise SceneError(None, field, Words("given"), f"left out, as the scene {parameter.absent}")
-        if name == "gravity" and "tilt" in values:
-            wanted = "left out, as the tilt says where it points"
-            raise SceneError(None, field, Words("given"), wanted)
+        for view, other in known.views.items():
+            if name == other and view in values:
+                raise SceneError(None, field, Words("given"), f"left out, as {view} is given in its place")
         if isinstance(array, str):
             found[name] = array
             continue

@@ -42,6 +42,8 @@ class Known(Mapping[str, Parameter]):
         """Names of those that may have a row for each step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
         """Names of what steps depend on and has the components of a vector."""
+        self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
+        """Names of other ways to write parameters, with those of these parameters."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
         """How these change while a scene runs."""
 

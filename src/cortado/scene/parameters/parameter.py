@@ -95,6 +95,8 @@ class Parameter:
     """Of a parameter over time: when within a step its row is taken from a schedule; 0 is the start, 1 the end."""
     grows: bool = False
     """Whether one over time is 0 where a run begins, so that a steady change of it grows."""
+    in_place_of: str | None = None
+    """Of another way to write a parameter: that one."""
     course: Changing | None = None
     """How one over time, of a force of one's own, changes where it is not given."""
 

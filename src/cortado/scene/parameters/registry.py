@@ -97,6 +97,7 @@ PARAMETERS = (
         lambda s: np.zeros(s.scene.dimension - 1),
         components=lambda dimension, phases: dimension - 1,
         role=Role.VIEW,
+        in_place_of="gravity",
         change=lambda source, value: np.degrees(1.0),
         present=lambda scene: any(scene.forces.gravity),
         absent="has no gravity to lean",

@@ -42,6 +42,10 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
     """Whether there is such a parameter, and a scene has it; raises `InputError`."""
     if name not in known or known[name].role is Role.CLOCK:
+        owner = str(name).rpartition(".")[0]
+        if owner in (solid.name for solid in scene.solid if not solid.moves):
+            wanted = 'only those whose motion is "path" or "free" have parameters'
+            raise InputError(f"{what} {name!r} is unknown, as the solid {owner!r} is at rest: {wanted}.")
         present = [p.name for p in known.values() if p.present(scene) and p.role is not Role.CLOCK]
         raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(present)} in this scene.")
     parameter = known[name]
