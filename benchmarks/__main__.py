@@ -76,5 +76,31 @@ def environments(
     return partial(bench_environments, task, scenes, size, steps, device, precision, json)
 
 
+@command(app, answers=True)
+def pictures(
+    particles: tuple[int, ...] = (8000, 100_000),
+    lines: int = 1080,
+    repeats: int = 5,
+    device: str = "cpu",
+    json: Flag = False,
+) -> Work:
+    """Time pictures of a broken dam, and compare those of a GPU with what the CPU draws.
+
+    Args:
+        particles: Numbers of fluid particles, about; one measurement for each.
+        lines: Rows of pixels; a picture is 16 : 9.
+        repeats: The median of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of text.
+    """
+    require_at_least(1, len(particles), "the number of --particles")
+    require_at_least(8, min(particles), "--particles")
+    require_at_least(64, lines, "--lines")
+    require_at_least(1, repeats, "--repeats")
+    from benchmarks.bench.pictures import bench_pictures
+
+    return partial(bench_pictures, particles, lines, repeats, device, json)
+
+
 if __name__ == "__main__":
     main(program=BENCH)

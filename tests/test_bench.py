@@ -14,6 +14,7 @@ from benchmarks.bench.dam_break import ESTIMATED, measure_dam_break, with_floors
 from benchmarks.bench.environment import OtherProcesses
 from benchmarks.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
 from benchmarks.bench.passes import AGAIN, PassTimer
+from benchmarks.bench.pictures import bench_pictures
 from benchmarks.bench.run import bench_dam_break
 from benchmarks.bench.scene import ITERATIONS, dam_break
 from benchmarks.bench.text import as_text
@@ -213,3 +214,11 @@ def test_bench_speaks_json_and_words(benchmarks_command):
 def test_wrong_arguments_are_refused(benchmarks_command, arguments, words):
     code, out, err = benchmarks_command(*arguments)
     assert (code, out) == (2, "") and words in err and err.count("\n") == 1
+
+
+def test_pictures_are_timed():
+    found = json.loads(bench_pictures([216], 64, 1, "cpu", as_json=True))
+    (row,) = found["sizes"]
+    assert found["lines"] == 64 and 50 < row["particles"] < 216 * 1.5 and row["s"] > 0.0
+    assert {"trace", "illuminate", "find_levels"} <= row["ms_of_kernels"].keys()
+    assert f"{row['particles']} particles: " in bench_pictures([216], 64, 1, "cpu", as_json=False)

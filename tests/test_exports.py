@@ -119,7 +119,6 @@ def test_usd_has_all_of_it_over_time(tmp_path):
 
 def test_usd_has_a_surface_that_encloses_the_fluid_and_solids_in_motion(tmp_path):
     usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
-    pytest.importorskip("pysplashsurf")
     stage = usd.Stage.Open(str(trajectory().export(tmp_path, to="usd")))
     surface = geometry.Mesh.Get(stage, "/run/surface")
     for code in range(3):

@@ -8,6 +8,7 @@ from cortado import Problem, Simulation, gradients, losses
 from cortado.device.launching import sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.particles.cells import CellSort, Grid
+from cortado.pictures.painter import painter
 from cortado.scene.motions import told
 from scenes import HONEY, plane, plane_of_three, scene, splash, thrown, two_layers
 from test_neighbours import CLOUDS, check_same, lists
@@ -296,3 +297,26 @@ def test_the_order_of_cells_is_that_of_the_cpu(members, particles, spread):
     for order, starts in found:
         np.testing.assert_array_equal(order, found[0][0])
         np.testing.assert_array_equal(starts, found[0][1])
+
+
+PICTURES = {
+    "a box": scene(),
+    "a cup": scene(container={"shape": "cylinder", "base": [0.2, 0.0, 0.2], "radius": 0.3, "height": 0.6}),
+    "spheres": scene(picture={"surface": "spheres"}),
+    "solids": scene(
+        solid=[
+            {"name": "pillar", "shape": "box", "lower": [0.25, 0.0, 0.1], "upper": [0.35, 0.4, 0.2]},
+            {"name": "ball", "shape": "sphere", "centre": [0.1, 0.3, 0.1], "radius": 0.08, "transparency": 0.7},
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("made", PICTURES.values(), ids=PICTURES)
+def test_a_picture_is_that_of_the_cpu(made):
+    positions = Simulation(made).positions
+    positions = positions + 0.005 * np.random.default_rng(0).standard_normal(positions.shape)
+    colours = np.tile((0.1, 0.3, 0.6), (len(positions), 1))
+    one, other = (painter(made, positions[None], device).image(positions, colours) for device in ("cpu", "cuda:0"))
+    assert one.std() > 0.02
+    assert np.mean((one - other) ** 2) < 1e-5  # 50 dB

@@ -90,6 +90,9 @@ def test_the_curve_of_srgb():
     assert np.array_equal(to_srgb(from_srgb(every)), every)
     assert to_srgb(np.full((1, 1, 3), 0.5))[0, 0, 0] == 188
     assert from_srgb(np.array([10, 188], np.uint8)) == pytest.approx([0.0030353, 0.5028865], rel=1e-5)
+    light = np.random.default_rng(0).random((40, 50, 3)) ** 3
+    curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    np.testing.assert_array_equal(to_srgb(light), np.rint(255.0 * curved))
     assert to_srgb([[[-1.0, 0.0, 2.0]]]).tolist() == [[[0, 0, 255]]]
 
 

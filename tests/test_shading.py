@@ -1,7 +1,7 @@
 """Shaded pictures: what they show, that they show it whatever the order of particles, and that they change nothing."""
 
 import json
-import os
+import threading
 
 import numpy as np
 import pytest
@@ -10,22 +10,26 @@ import warp as wp
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
+from cortado.device.bands import BandLauncher
 from cortado.device.launching import launch
+from cortado.device.threads import WARP
 from cortado.discretise.shapes import corners
-from cortado.errors import ComputationError, CortadoWarning, InputError, SceneError
+from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.srgb import to_srgb
 from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
+from cortado.pictures.environment import environment_of
 from cortado.pictures.film import film, lacking
 from cortado.pictures.labels import labelled, side_by_side
 from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.scenery import State, sceneries, scenery
-from cortado.pictures.shadow import floor_shadow
+from cortado.pictures.scenery import State, scenery
+from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.surface import spheres
 from cortado.pictures.trace import find_contrast
+from cortado.pictures.wetting import particles_of, wetting
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
 
@@ -80,6 +84,13 @@ def test_27_particles_are_seen(surface, shape):
     assert image.shape == (64, 96, 3) and image.min() >= 0.0 and image.max() <= 1.0
     blue = (image[..., 2] > 1.3 * image[..., 0]).mean()
     assert 0.01 < blue < 0.65
+
+
+@pytest.mark.parametrize("surface", ["liquid", "spheres"])
+def test_a_scene_without_fluid_is_empty(surface):
+    scene = scene_of(picture={"surface": surface})
+    image = painter(scene, FILLED).image(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert not (image[..., 2] > 1.3 * image[..., 0]).any() and 0.02 < image.std() < 0.2
 
 
 def test_what_is_above_is_above_and_what_is_right_is_right():
@@ -171,13 +182,23 @@ def test_the_camera_goes_where_the_scene_says():
     assert columns.max() < 52  # the fluid is on the left of x = 0.3
 
 
+CPU = BandLauncher(wp.get_device("cpu"))
+
+
+def wet_of(stage, positions):
+    """(m, 3) [m] where particles and their images are."""
+    particles = particles_of(stage, positions, np.ones_like(positions), CPU)
+    return wetting(stage, environment_of(stage), particles, CPU).places.numpy()
+
+
 def test_fluid_goes_on_beyond_the_walls_that_it_touches():
     stage = Stage.of(scene_of(), FILLED)
     touching, inside = np.array([[0.05, 0.25, 0.2]]), np.array([[0.3, 0.25, 0.2]])
-    wet, of = stage.wetting(stage.placed(touching))
-    np.testing.assert_allclose(wet, stage.placed(np.array([[0.05, 0.25, 0.2], [-0.05, 0.25, 0.2]])), atol=1e-12)
-    assert of.tolist() == [0, 0]
-    assert len(stage.wetting(stage.placed(inside))[0]) == 1
+    wet = wet_of(stage, touching)
+    np.testing.assert_allclose(wet, stage.placed(np.array([[0.05, 0.25, 0.2], [-0.05, 0.25, 0.2]])), atol=1e-6)
+    assert len(wet_of(stage, inside)) == 1
+    corner = wet_of(stage, np.array([[0.05, 0.05, 0.35]]))
+    assert len(np.unique(corner.round(6), axis=0)) == len(corner) == 8
 
 
 @pytest.mark.parametrize(("lid", "x", "cut"), [(True, 0.2, True), (False, 0.2, True), (False, 0.5, False)])
@@ -189,7 +210,9 @@ def test_fluid_is_cut_at_the_wall_of_a_cup_unless_some_came_over_its_rim(lid, x,
 def test_fluid_casts_a_shadow_on_the_floor():
     stage = Stage.of(scene_of(), FILLED)
     x, c = first_state(scene_of())
-    light, corner, cell = floor_shadow(stage, stage.placed(x), c)
+    shadow = FloorShadow(stage, CPU)
+    shadow.of_fluid(particles_of(stage, x, c, CPU))
+    light, corner, cell = shadow.light.numpy(), shadow.corner, shadow.cell
     assert light.shape[2] == 3 and light.max() <= 1.0 and 0.1 < light.min() < 0.7
     i, j = np.rint((stage.placed(x).mean(axis=0) - corner)[[0, 2]] / cell).astype(int)
     assert light[i, j].max() < 0.95 and light[0, 0].min() > 0.999
@@ -213,7 +236,7 @@ def test_contrast_is_found_between_neighbours_alone():
     wanted[:, :-1] |= across
     wanted[1:] |= down
     wanted[:-1] |= down
-    found = wp.zeros(35, dtype=wp.bool, device="cpu")
+    found = wp.zeros(35, dtype=wp.int32, device="cpu")
     pixels = wp.array(image.reshape(-1, 3), dtype=wp.vec3, device="cpu")
     launch(find_contrast, 35, "cpu", first=0, columns=7, image=pixels, contrast=0.8, found=found)
     np.testing.assert_array_equal(found.numpy().reshape(5, 7), wanted)
@@ -222,8 +245,6 @@ def test_contrast_is_found_between_neighbours_alone():
 
 class _Shades:
     """A painter of states that are pictures."""
-
-    at_once = 1
 
     def image(self, picture, _):
         return picture
@@ -243,29 +264,6 @@ def test_a_page_shows_its_states_side_by_side():
     assert list(page.images([1, 2])) == [(1, 10), (2, 20)]
 
 
-def test_processes_draw_what_one_draws():
-    positions, colours = first_state(scene_of(fluids=2))
-    states = [State(positions + (0.0, 0.02 * k, 0.0), colours) for k in range(5)]
-    stage = Stage.of(scene_of(fluids=2), positions)
-    for one, other in zip(sceneries(stage, states, 1), sceneries(stage, states, 2), strict=True):
-        assert len(one.surface.triangles) == len(other.surface.triangles)  # whose order differs from call to call
-        found, wanted = (np.sort(each.surface.points, axis=0) for each in (one, other))
-        np.testing.assert_allclose(found, wanted, atol=1e-6)
-        np.testing.assert_array_equal(one.shadow[0], other.shadow[0])
-
-
-def _killed(*_):
-    os.abort()
-
-
-def test_a_process_that_is_killed_is_a_sentence(monkeypatch):
-    positions, colours = first_state(scene_of())
-    stage = Stage.of(scene_of(), positions)
-    monkeypatch.setattr("cortado.pictures.scenery.scenery", _killed)
-    with pytest.raises(ComputationError, match="CORTADO_CORES"):
-        list(sceneries(stage, [State(positions, colours)], 2))
-
-
 def test_a_lattice_in_a_round_cup_reaches_its_glass():
     cup = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5}
     for radius in (0.5, 0.437, 0.4):
@@ -274,7 +272,7 @@ def test_a_lattice_in_a_round_cup_reaches_its_glass():
             container={**cup, "radius": radius, "height": 0.8},
         )
         positions, colours = first_state(scene)
-        off = scenery(Stage.of(scene, positions), State(positions, colours)).surface.points
+        off = scenery(Stage.of(scene, positions), State(positions, colours), CPU).surface.mesh.points.numpy()
         level = off[np.abs(off[:, 1] + 0.2) < 0.1]  # halfway up the fluid
         turn = np.arctan2(level[:, 2], level[:, 0])
         reached = [np.hypot(*level[np.abs(turn - at) < 0.1][:, ::2].T).max() for at in np.linspace(-3.0, 3.0, 31)]
@@ -290,6 +288,31 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
         frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
         assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 34, "yuv420p")
     assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
+
+
+def test_a_picture_is_drawn_while_the_one_before_is_used():
+    """Also where the caller holds what the painter needs; what it raises comes when its picture is due."""
+    begun, free = [], threading.Event()
+
+    def images():
+        for k in range(3):
+            with WARP:
+                begun.append(k)
+            if len(begun) == 2:
+                free.set()
+            yield np.full((2, 2, 3), k)
+        raise InputError("nothing more")
+
+    drawn_ahead = shading_film._ahead(images())
+    assert next(drawn_ahead)[0, 0, 0] == 0 and free.wait(10.0)
+    with WARP:
+        assert [next(drawn_ahead)[0, 0, 0] for _ in range(2)] == [1, 2]
+        with pytest.raises(InputError, match="nothing more"):
+            next(drawn_ahead)
+    with WARP:
+        left = shading_film._ahead(images())
+        next(left)
+        left.close()  # does not wait for ever
 
 
 def shown_in(path):
@@ -345,18 +368,9 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
     assert lacking(scene_of()) is None
     monkeypatch.setattr(shading_film, "find_spec", lambda name: None)
     advice = r"pip install 'cortado-sph\[pictures\]'\."
-    with pytest.raises(
-        AssertionError, match="Shaded pictures need PyAV and pysplashsurf, which are not installed: " + advice
-    ):
+    with pytest.raises(AssertionError, match="Shaded pictures need PyAV, which is not installed: " + advice):
         raise AssertionError(lacking(scene_of()))
-    assert (
-        lacking(scene_of(2))
-        == "Shaded pictures need PyAV, which is not installed: pip install 'cortado-sph[pictures]'."
-    )
-    assert lacking(scene_of(2, picture={"film_frames": 0})) is None
-    monkeypatch.setitem(__import__("sys").modules, "pysplashsurf", None)
-    with pytest.raises(InputError, match="Shaded pictures need pysplashsurf, which is not installed: " + advice):
-        drawn(scene_of())
+    assert lacking(scene_of(picture={"film_frames": 0})) is None
 
 
 def test_words_and_panels():

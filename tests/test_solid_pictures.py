@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
+from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.pictures.mirrored import mirrored
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.particle_sets import particles
 from cortado.pictures.scene_view import container_outline, outline, scene_view
-from cortado.pictures.shadow import NODES, REACH
+from cortado.pictures.shadow import NODES, REACH, FloorShadow
 from cortado.pictures.shown_solids import shown_solids
 from cortado.pictures.solid_lines import solid_outline
 from cortado.pictures.solid_mesh import FAR, SolidMesh
@@ -56,23 +58,6 @@ def lattice(lower, upper, spacing=0.05):
 def drawn(scene, positions):
     positions = np.asarray(positions, dtype=float)
     return painter(scene, positions).image(positions, colours_of(scene, None, len(positions)))
-
-
-@pytest.fixture
-def one_surface(monkeypatch):
-    """The same particles have the same surface, which otherwise differs by round-off each time that it is found: the
-    library that finds it shares sums among threads."""
-    from cortado.pictures import scenery
-
-    found, find = {}, scenery.liquid
-
-    def liquid(positions, colours, spacing):
-        key = (positions.tobytes(), colours.tobytes(), spacing)
-        if key not in found:
-            found[key] = find(positions, colours, spacing)
-        return found[key]
-
-    monkeypatch.setattr(scenery, "liquid", liquid)
 
 
 def pixel_of(scene, positions, place):
@@ -163,7 +148,6 @@ def test_light_goes_no_further_than_to_a_solid(monkeypatch, tank):
     np.testing.assert_allclose(light[0], light[1], atol=0.015 if tank else 0.004)
 
 
-@pytest.mark.usefixtures("one_surface")
 @pytest.mark.parametrize(("dimension", "place"), [(2, (0.0, -9.0, 0.0)), (3, (0.0, -9.0, 0.0)), (3, (0.0, 0.0, -0.7))])
 def test_a_solid_that_is_not_seen_changes_no_bit(dimension, place):
     """Far below a closed container, or behind it: what draws solids draws the rest as it is drawn without any."""
@@ -270,18 +254,24 @@ def test_without_a_container_solids_are_in_the_picture(dimension):
         assert stage.upper[1] - stage.lower[1] >= 1.0 and stage.upper[0] - stage.lower[0] >= 1.95
 
 
+def shadow_of(stage, solids):
+    """(nodes, nodes, 3) the light that solids leave on the floor."""
+    shadow = FloorShadow(stage, BandLauncher(wp.get_device("cpu")))
+    SolidSurfaces(stage, "cpu").cast(shadow, solids)
+    return shadow.light.numpy()
+
+
 def test_solids_cast_a_shadow_on_the_floor():
     stage = Stage.of(scene_of(3, BALL), COLUMN[3])
-    surfaces = SolidSurfaces(stage, "cpu")
-    light = surfaces.shadow(stage.solids)
+    light = shadow_of(stage, stage.solids)
     assert 0.1 < light.min() < 0.5 and light[0, 0].min() == 1.0
     (ball,) = stage.solids
-    moved = surfaces.shadow([ball.moved(ball.position - (0.2, 0.0, 0.0), ball.turn)])
+    moved = shadow_of(stage, [ball.moved(ball.position - (0.2, 0.0, 0.0), ball.turn)])
     places = [np.array(np.nonzero(one[..., 0] < 0.6)).mean(axis=1) for one in (light, moved)]
     cell = 2.0 * REACH * stage.size / (NODES - 1)
     np.testing.assert_allclose((places[0] - places[1]) * cell, [0.2, 0.0], atol=cell)
     clear = Stage.of(scene_of(3, {**BALL, "transparency": 1.0}), COLUMN[3])
-    assert SolidSurfaces(clear, "cpu").shadow(clear.solids).min() == 1.0
+    assert shadow_of(clear, clear.solids).min() == 1.0
 
 
 def test_a_solid_lies_in_the_shadow_of_another():
@@ -303,7 +293,6 @@ def test_a_solid_comes_again_with_every_period():
     assert len(shown_solids(scene)) == 2
 
 
-@pytest.mark.usefixtures("one_surface")
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_solids_are_drawn_in_their_poses_from_one_place(dimension):
     """Of a solid that moves, without a container: where it will be is in the picture from the start."""

@@ -23,15 +23,15 @@ class BandLauncher:
     thread ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
-        self._device, self._compiled = device, set[Any]()
+        self.device, self._compiled = device, set[Any]()
 
     def __call__(self, kernel: wp.Kernel, count: int, **arguments: Any) -> None:
-        cores = min(usable_cores(), MOST_CORES) if self._device.is_cpu else 1
+        cores = min(usable_cores(), MOST_CORES) if self.device.is_cpu else 1
         bands = BANDS * cores if cores > 1 and count > LEAST_SHARED else 1
         bounds = [count * band // bands for band in range(bands + 1)]
 
         def work(band: int) -> None:
-            launch(kernel, bounds[band + 1] - bounds[band], self._device, first=bounds[band], **arguments)
+            launch(kernel, bounds[band + 1] - bounds[band], self.device, first=bounds[band], **arguments)
 
         begin = 0
         if kernel not in self._compiled:

@@ -1,13 +1,20 @@
 """Linear light and what files and screens hold: eight bits of sRGB (IEC 61966-2-1)."""
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
 
+ROWS = 32
+"""Of a picture that are converted at a time, whose numbers stay near the processor."""
 MOST_LIGHT = 2.0
 """Of a picture that somebody gives: more is taken for values of a file, up to 255; noise may leave 0 to 1."""
+STEPS = 1 << 14
+"""Equal parts of the light from 0 to 1, short against what one of 256 values stands for."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
@@ -28,14 +35,34 @@ def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
     Raises:
         InputError: another shape, or values that are not finite.
     """
-    linear = as_numbers("The image", image)
-    if linear.ndim != 3 or linear.shape[2] != 3 or not linear.size:
-        raise InputError(f"The image has shape {linear.shape}, but must be (rows, columns, 3).")
-    if not np.isfinite(linear).all():
+    light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
+    if light.ndim != 3 or light.shape[2] != 3 or not light.size:
+        raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
+    found = np.empty(light.shape, dtype=np.uint8)
+    for row in range(0, len(light), ROWS):
+        found[row : row + ROWS] = _values(light[row : row + ROWS])
+    return found
+
+
+def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
+    if not np.isfinite(light).all():
         raise InputError("The image has values that are not finite; look where it was computed.")
-    linear = np.clip(linear, 0.0, 1.0)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * curved).astype(np.uint8)
+    light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
+    bounds, values = _steps(light.dtype)
+    found = values[(light.dtype.type(STEPS) * light).astype(np.uint16)]
+    found += light >= bounds[found]  # at most one value begins within a step
+    return found
+
+
+@cache
+def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """(256,) the least light for which each next value is the nearest, and (STEPS + 1,) the value where a step
+    begins."""
+    middles = (np.arange(1, 257) - 0.5) / 255.0
+    exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
+    rounded = exact.astype(dtype)
+    bounds = np.where(rounded < exact, np.nextafter(rounded, dtype.type(2.0)), rounded)
+    return bounds, np.searchsorted(bounds, np.arange(STEPS + 1) / STEPS, side="right").astype(np.uint8)
 
 
 def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:

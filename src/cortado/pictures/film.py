@@ -1,10 +1,13 @@
 """Films of shaded pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from cortado.device.threads import WARP
+from cortado.discretise.shapes import Points
 from cortado.files.animation import moving_picture
 from cortado.files.progress import track
 from cortado.pictures.notebook import with_video
@@ -38,8 +41,6 @@ def lacking(scene: Scene) -> str | None:
     missing."""
     picture = scene.picture or Picture()
     needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
-    if scene.dimension == 3 and picture.surface == "liquid":
-        needed["pysplashsurf"] = "pysplashsurf"
     missing = [name for module, name in needed.items() if find_spec(module) is None]
     if not missing:
         return None
@@ -55,7 +56,24 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            for image, time in zip(page.images(shown[there:]), pace.times[there:], strict=True):
+            for image, time in zip(_ahead(page.images(shown[there:])), pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()
     return Film(path, pace)
+
+
+def _ahead(images: Iterator[Points]) -> Iterator[Points]:
+    """The same images, each of which is drawn while the one before is used."""
+    painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
+    try:
+        coming = painter.submit(next, images, None)
+        while True:
+            with WARP.lent():  # the painter needs it
+                image = coming.result()
+            if image is None:
+                return
+            coming = painter.submit(next, images, None)
+            yield image
+    finally:
+        with WARP.lent():
+            painter.shutdown()

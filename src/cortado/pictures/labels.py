@@ -30,8 +30,11 @@ def written(image: Points, texts: Sequence[Text], size: int) -> Points:
     mask = Image.new("L", image.shape[1::-1])
     for place, text, anchor in texts:
         ImageDraw.Draw(mask).text(place, text, fill=255, font=_font(size), anchor=anchor)
-    cover = (np.asarray(mask) / 255.0)[..., None]
-    return image * (1.0 - cover) + INK * cover
+    left, upper, right, lower = mask.getbbox() or (0, 0, 0, 0)
+    found, where = image.copy(), (slice(upper, lower), slice(left, right))
+    cover = (np.asarray(mask)[where] / 255.0)[..., None]
+    found[where] = image[where] * (1.0 - cover) + INK * cover
+    return found
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:

@@ -20,10 +20,6 @@ ENOUGH = 1_000_000
 class Painter(Protocol):
     """Draws states of one scene."""
 
-    @property
-    def at_once(self) -> int:
-        """How many states `images` works on at a time."""
-
     def image(self, *state: Any) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
 
@@ -36,11 +32,11 @@ def painter(
 ) -> PlanePainter | SpacePainter:
     """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays;
     ``poses``: the same scene with its solids where they will be, for them to be in the picture, too."""
-    count, particles = np.shape(positions)[-2], np.asarray(positions).reshape(-1, scene.dimension)
+    particles = np.asarray(positions).reshape(-1, scene.dimension)
     particles = particles[:: max(len(particles) // ENOUGH, 1)]
     if scene.dimension == 2:
         return PlanePainter(PlaneStage.of(scene, *extent_of(particles), poses))
-    return SpacePainter(Stage.of(scene, particles, poses), count, device)
+    return SpacePainter(Stage.of(scene, particles, poses), device)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:

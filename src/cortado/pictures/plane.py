@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import starmap
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,6 @@ class PlanePainter:
     """Draws states of one scene: `image` and `images`."""
 
     stage: PlaneStage
-    at_once: ClassVar[int] = 1
 
     def image(self, *state: Any) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""

@@ -1,31 +1,24 @@
-"""What rays meet: the surface of a fluid and its shadow, of one state, or of many in several processes."""
+"""What rays meet: the surface of the fluid of one state, and the shadow on the floor, on the device that draws them."""
 
-import os
-import signal
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from itertools import islice
-from multiprocessing import get_context
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 
-from cortado.device.cores import usable_cores
+from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import Points
-from cortado.errors import ComputationError
-from cortado.pictures.shadow import floor_shadow
+from cortado.pictures.device_surface import DeviceSurface
+from cortado.pictures.environment import environment_of
+from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.particles import Particles
+from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.stage import Stage
-from cortado.pictures.surface import Surface, liquid, spheres
+from cortado.pictures.surface import spheres
+from cortado.pictures.wetting import particles_of, wetting
 from cortado.scene.camera_paths import View
 from cortado.scene.scene import Scene
-
-LARGE = 20_000
-"""Particles from which on a surface takes longer than to hand it from one process to another."""
-FEWEST, MOST = 4, 16
-"""Processes: with fewer cores one does all, on all of them."""
 
 
 class State(NamedTuple):
@@ -47,59 +40,34 @@ class Scenery:
 
     stage: Stage
     """With solids and the camera where they are."""
-    surface: Surface
-    shadow: tuple[Points, Points, float]
-    """As `floor_shadow` returns it."""
+    environment: Any
+    """`Environment`"""
+    surface: DeviceSurface
+    shadow: FloorShadow
 
 
-def scenery(home: Stage, state: State) -> Scenery:
+def scenery(home: Stage, state: State, launch: BandLauncher) -> Scenery:
     """That of a state in 3-D."""
-    stage, colours = home.at(state.pose, state.view), np.asarray(state.colours, dtype=np.float64)
-    placed = stage.placed(np.asarray(state.positions, dtype=np.float64))
+    stage = home.at(state.pose, state.view)
+    s, shadow = environment_of(stage), FloorShadow(stage, launch)
+    s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
+    particles = particles_of(stage, state.positions, state.colours, launch)
+    shadow.of_fluid(particles)
+    return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
+
+
+def _surface(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> DeviceSurface:
+    if not len(particles):
+        return _nothing(stage, launch.device)
     if stage.picture.surface == "liquid":
-        wet, of = stage.wetting(placed)
-        surface = liquid(wet, colours[of], stage.spacing)
-    else:
-        surface = spheres(placed, colours, stage.spacing)
-    return Scenery(stage, surface, floor_shadow(stage, placed, colours))
+        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch)
+        softened = partial(found.softened, launch=launch)
+        return DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
+    balls = spheres(particles.places.numpy(), particles.colours.numpy(), stage.spacing)
+    return DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
 
 
-def sceneries(stage: Stage, states: Iterable[State], processes: int) -> Iterator[Scenery]:
-    """The scenery of each state in their order. Several processes work on the states that come next; they are started
-    anew, so that a script that draws films needs ``if __name__ == "__main__"``.
-
-    Raises:
-        ComputationError: one of the processes was stopped.
-    """
-    if processes == 1:
-        yield from (scenery(stage, state) for state in states)
-        return
-    left = iter(states)
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_worker)
-    try:
-        begun: deque[Future[Scenery]] = deque(
-            pool.submit(scenery, stage, state) for state in islice(left, 2 * processes)
-        )
-        while begun:
-            found = begun.popleft().result()
-            begun.extend(pool.submit(scenery, stage, state) for state in islice(left, 1))
-            yield found
-    except BrokenProcessPool as problem:
-        raise ComputationError(
-            "A process that computes surfaces for pictures was stopped, by the system perhaps for want of memory: "
-            "set the environment variable CORTADO_CORES to 1, and one process does all."
-        ) from problem
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def processes_for(particles: int) -> int:
-    """How many processes compute the sceneries of so many particles."""
-    cores = min(usable_cores(), MOST)
-    return cores if particles >= LARGE and cores >= FEWEST else 1
-
-
-def _worker() -> None:
-    """Each on a core of its own; the first process alone hears Ctrl-C and stops the others."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["RAYON_NUM_THREADS"] = os.environ["CORTADO_CORES"] = "1"
+def _nothing(stage: Stage, device: Any) -> DeviceSurface:
+    """A triangle that is too small and too far below the floor to be seen: meshes need one."""
+    places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
+    return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))

@@ -1,90 +1,184 @@
-"""The shadow that fluid casts on the floor: soft, and in the colour of the fluid."""
+"""The shadow that fluid and solids cast on the floor: soft, and in the colour of the fluid."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 
+from cortado.device.bands import BandLauncher
+from cortado.device.launching import launch as launch_once
 from cortado.discretise.shapes import Points
+from cortado.pictures.particles import Particles
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage
 
+MODULE = wp.get_module("cortado_shadow")
 NODES = 320
 """Along either side of the floor that may lie in shadow."""
 ABOVE = 1e-3
 """In sizes of what is shown: a side of a solid that is no higher lies on the floor."""
 REACH = 1.5
 """Half the width of that part of the floor, in sizes of what is shown."""
+KEY, AROUND = 0.022, 0.05
+"""How soft the shadows of the lamp and of the sky are, in sizes of what is shown."""
+CLOSE = 0.15
+"""How far above the floor the sky's shadow ends, about, in sizes of what is shown."""
+SKY = 0.32
+"""The part of the light that comes from the sky."""
 
 
-def floor_shadow(stage: Stage, positions: Points, colours: Points) -> tuple[Points, Points, float]:
-    """The part of the light that reaches the floor, (nodes, nodes, 3), by x and z; where its first node is, (3,) [m];
-    and how far nodes are apart [m].
+@wp.kernel(module=MODULE, enable_backward=False)
+def cast(
+    places: wp.array(dtype=wp.vec3),
+    colours: wp.array(dtype=wp.vec3),
+    volumes: wp.array(dtype=wp.float32),
+    corner: wp.vec3,
+    cell: wp.float32,
+    slope: wp.vec2,
+    fading: wp.float32,
+    thickness: wp.array2d(dtype=wp.vec4),
+):
+    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
+    and its thickness; the less the higher it is, by ``fading`` [1/m]."""
+    i = wp.tid()
+    height = places[i][1] - corner[1]
+    x = (places[i][0] - height * slope[0] - corner[0]) / cell
+    z = (places[i][2] - height * slope[1] - corner[2]) / cell
+    u = int(wp.floor(x))
+    v = int(wp.floor(z))
+    if u >= 0 and v >= 0 and u + 1 < thickness.shape[0] and v + 1 < thickness.shape[1]:
+        c = colours[i]
+        above = volumes[i] * wp.exp(-fading * height) / (cell * cell) * wp.vec4(c[0], c[1], c[2], 1.0)
+        for n in range(4):
+            m = n & 1
+            k = n >> 1
+            a = 1.0 - wp.abs(x - float(u + m))
+            b = 1.0 - wp.abs(z - float(v + k))
+            wp.atomic_add(thickness, u + m, v + k, a * b * above)
 
-    ``positions`` (n, 3) [m] are in the frame of the picture, ``colours`` (n, 3) linear.
-    """
-    corner, cell = _nodes(stage)
-    height = positions[:, 1:2] - stage.lower[1]
-    cast = positions[:, ::2] - height * stage.sun[::2] / stage.sun[1]
-    volume = stage.spacing**3
-    near, least = np.exp(-height[:, 0] / (0.15 * stage.size)), 0.8 * stage.spacing
-    key = _thickness(cast, colours, corner, cell, volume, max(0.022 * stage.size, least))
-    around = _thickness(positions[:, ::2], colours, corner, cell, volume * near, max(0.05 * stage.size, least))
-    light = 1.0 - stage.picture.sun_and_sky.shadow * _hidden(stage, *key) - 0.32 * _hidden(stage, *around)
-    return light, corner, cell
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def blur(
+    first: wp.int32,
+    across: wp.int32,
+    weights: wp.array(dtype=wp.float32),
+    sharp: wp.array2d(dtype=wp.vec4),
+    found: wp.array2d(dtype=wp.vec4),
+):
+    """Along one axis, or ``across``, along the other."""
+    n = first + wp.tid()
+    i = n / sharp.shape[1]
+    j = n % sharp.shape[1]
+    total = wp.vec4(0.0)
+    for k in range(1 - weights.shape[0], weights.shape[0]):
+        u = i + wp.where(across > 0, 0, k)
+        v = j + wp.where(across > 0, k, 0)
+        if u >= 0 and v >= 0 and u < sharp.shape[0] and v < sharp.shape[1]:
+            total += weights[wp.abs(k)] * sharp[u, v]
+    found[i, j] = total
 
 
-def solid_shadow(stage: Stage, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> Points:
-    """(nodes, nodes, 3) the part of the light that solids leave on the floor; as `floor_shadow`."""
-    corner, cell = _nodes(stage)
-    light = np.ones((NODES, NODES, 3))
-    for shown, mesh in solids:
+@wp.func
+def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
+    """The part of the light that something of a thickness keeps off, of its own colour less than of others."""
+    reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
+    colour = wp.vec3(above[0], above[1], above[2])
+    hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
+    return reached * (wp.vec3(opacity - 0.35 * tinted) - 0.65 * tinted * hue)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def darken(
+    first: wp.int32,
+    key: wp.array2d(dtype=wp.vec4),
+    around: wp.array2d(dtype=wp.vec4),
+    strength: wp.vec2,
+    layer: wp.float32,
+    opacity: wp.float32,
+    tinted: wp.float32,
+    light: wp.array2d(dtype=wp.vec3),
+):
+    """What the lamp's light and the sky's leave, of so much ``strength`` each."""
+    n = first + wp.tid()
+    i = n / light.shape[1]
+    j = n % light.shape[1]
+    left = wp.vec3(1.0) - strength[0] * kept_off(key[i, j], layer, opacity, tinted)
+    light[i, j] = wp.min(light[i, j], left - strength[1] * kept_off(around[i, j], layer, opacity, tinted))
+
+
+@dataclass(frozen=True)
+class Caster:
+    """What casts a shadow, in many small parts."""
+
+    parts: Particles
+    """In the frame of the picture."""
+    to_lamp: wp.array
+    """(n,) the volumes of the parts [m3], as the lamp sees them"""
+    to_sky: wp.array
+    """(n,) as the sky does"""
+    opacity: float = 1.0
+    tinted: float = 0.0
+    """How much more light of its own colour comes through, from 0 to 1."""
+
+
+class FloorShadow:
+    """The part of the light that reaches the floor."""
+
+    def __init__(self, stage: Stage, launch: BandLauncher):
+        middle = 0.5 * (stage.lower + stage.upper)
+        self._stage, self._launch, self._device = stage, launch, launch.device
+        self.corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
+        """(3,) [m] where the first node is"""
+        self.cell = 2.0 * REACH * stage.size / (NODES - 1)
+        """How far nodes are apart [m]."""
+        self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
+        """(nodes, nodes) by x and z"""
+
+    def of_fluid(self, particles: Particles) -> None:
+        """Add that of particles, in the frame of the picture."""
+        stage = self._stage
+        volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
+        caster = Caster(particles, volumes, volumes, tinted=0.4 * stage.transparency)
+        self._add(caster, 0.8 * stage.spacing, stage.spacing)
+
+    def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
+        """Add that of a solid."""
+        stage = self._stage
         a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
         middle = (a + b + c) / 3.0
         casts = middle[:, 1] > stage.lower[1] + ABOVE * stage.size
         if stage.cuts_solids:
             casts &= ((middle >= stage.lower) & (middle <= stage.upper))[:, ::2].all(axis=1)
         middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
-        height, colours = middle[:, 1:2] - stage.lower[1], np.tile(shown.colour, (len(middle), 1))
-        cast = middle[:, ::2] - height * stage.sun[::2] / stage.sun[1]
-        thick, flat = 3.0 * stage.spacing, np.abs(area[:, 1]) * np.exp(-height[:, 0] / (0.15 * stage.size))
-        towards = np.abs(area @ stage.sun) / stage.sun[1]
-        key = _thickness(cast, colours, corner, cell, thick * towards, 0.022 * stage.size)
-        around = _thickness(middle[:, ::2], colours, corner, cell, thick * flat, 0.05 * stage.size)
-        hidden = [1.0 - np.exp(-thickness / (0.75 * stage.spacing)) for thickness, _ in (key, around)]
-        kept_off = (1.0 - shown.transparency) * (stage.picture.sun_and_sky.shadow * hidden[0] + 0.32 * hidden[1])
-        light = np.minimum(light, 1.0 - kept_off[..., None])
-    return light
+        volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
+        parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
+        to_lamp, to_sky = (self._array(one) for one in volumes)
+        self._add(Caster(parts, to_lamp, to_sky, opacity=1.0 - shown.transparency), 0.0, stage.spacing)
 
+    def _add(self, caster: Caster, least: float, layer: float) -> None:
+        stage = self._stage
+        slope = wp.vec2(*(stage.sun[::2] / stage.sun[1]))
+        key = self._thickness(caster, caster.to_lamp, slope, 0.0, max(KEY * stage.size, least))
+        fading = 1.0 / (CLOSE * stage.size)
+        around = self._thickness(caster, caster.to_sky, wp.vec2(0.0, 0.0), fading, max(AROUND * stage.size, least))
+        strength = wp.vec2(stage.picture.sun_and_sky.shadow, SKY)
+        how = {"strength": strength, "layer": layer, "opacity": caster.opacity, "tinted": caster.tinted}
+        self._launch(darken, NODES * NODES, key=key, around=around, **how, light=self.light)
 
-def _nodes(stage: Stage) -> tuple[Points, float]:
-    """Where the first node is, (3,) [m], and how far nodes are apart [m]."""
-    middle = 0.5 * (stage.lower + stage.upper)
-    corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
-    return corner, 2.0 * REACH * stage.size / (NODES - 1)
+    def _thickness(self, caster: Caster, volumes: wp.array, slope: Any, fading: float, soft: float) -> wp.array:
+        """(nodes, nodes) of vec4, as `cast` adds it up, blurred by ``soft`` [m]."""
+        sharp = wp.zeros((NODES, NODES), dtype=wp.vec4, device=self._device)
+        where = {"corner": wp.vec3(*self.corner), "cell": self.cell, "slope": slope, "fading": fading}
+        given = {"places": caster.parts.places, "colours": caster.parts.colours, "volumes": volumes}
+        launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
+        sigma = soft / self.cell
+        bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
+        weights, other = self._array(bell / (2.0 * bell.sum() - 1.0)), wp.empty_like(sharp)
+        self._launch(blur, NODES * NODES, across=0, weights=weights, sharp=sharp, found=other)
+        self._launch(blur, NODES * NODES, across=1, weights=weights, sharp=other, found=sharp)
+        return sharp
 
-
-def _thickness(
-    places: Points, colours: Points, corner: Points, cell: float, volume: Points | float, blur: float
-) -> tuple[Points, Points]:
-    """How thick the fluid is above every node, (nodes, nodes) [m], and its mean colour (nodes, nodes, 3)."""
-    from scipy.ndimage import gaussian_filter
-
-    at = np.rint((places - corner[[0, 2]]) / cell).astype(int)
-    on = ((at >= 0) & (at < NODES)).all(axis=1)
-    flat, weights = at[on, 0] * NODES + at[on, 1], np.broadcast_to(volume, len(places))[on] / cell**2
-
-    def spread(values: Points) -> Points:
-        total = np.bincount(flat, weights * values, minlength=NODES * NODES).reshape(NODES, NODES)
-        return gaussian_filter(total, blur / cell)
-
-    total = spread(np.ones(len(flat)))
-    tinted = np.stack([spread(colours[on, k]) for k in range(3)], axis=-1)
-    return total, tinted / np.maximum(total, 1e-12)[..., None]
-
-
-def _hidden(stage: Stage, thickness: Points, colour: Points) -> Points:
-    """(nodes, nodes, 3) the part of the light that fluid of a thickness keeps off."""
-    reached = 1.0 - np.exp(-thickness / (0.75 * stage.spacing))
-    hue = colour / np.maximum(colour.max(axis=-1, keepdims=True), 1e-6)
-    return reached[..., None] * (1.0 - 0.4 * stage.transparency * (0.35 + 0.65 * hue))
+    def _array(self, values: Points) -> wp.array:
+        return wp.array(values.astype(np.float32), dtype=wp.float32, device=self._device)

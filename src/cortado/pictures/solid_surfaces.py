@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lit_surface import LitSurface
-from cortado.pictures.shadow import solid_shadow
+from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage
@@ -37,39 +36,48 @@ class SolidSurfaces:
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
-    def shadow(self, solids: Sequence[ShownSolid]) -> Points:
-        """As `solid_shadow` returns it; ``solids``: those of the stage, in poses."""
-        return solid_shadow(self._stage, [(one, mesh) for one, mesh in self._placed(solids) if not one.is_tank])
+    def cast(self, shadow: FloorShadow, solids: Sequence[ShownSolid]) -> None:
+        """Add their shadows; ``solids``: those of the stage, in poses."""
+        for one, mesh in self._placed(solids):
+            if not one.is_tank:
+                shadow.of_solid(one, mesh)
 
-    def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
-        """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of; ``solids``: those
-        of the stage, in poses."""
-        found, surfaces, lit = Solids(), list[tuple[DeviceSurface, SolidMesh]](), [LitSurface(), LitSurface()]
+    def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
+        """`Solids`, and their surfaces, which must be kept and lit; ``solids``: those of the stage, in poses."""
+        found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         opaque, clear = ([pair for pair in placed if _is_clear(pair[0]) == kind] for kind in (False, True))
         if opaque:
-            surfaces.append(self._surface(opaque))
-            lit[0] = surfaces[-1][0].lit
+            surfaces.append(self._surface(_joined(opaque), opaque))
+            lit[0] = surfaces[-1].lit
             found.opaque = lit[0].mesh
         if clear:
-            surfaces.append(self._surface(clear))
-            lit[1] = surfaces[-1][0].lit
+            mesh = _joined(clear)
+            surfaces.append(self._surface(mesh, clear))
+            lit[1] = surfaces[-1].lit
             found.clear = lit[1].mesh
             found.has_tank = int(any(one.is_tank for one, _ in clear))
-            left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in clear]
+            left = [np.tile(_left(one), (len(own.triangles), 1)) for one, own in clear]
             lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
-            lit[1].from_edges = wp.array(surfaces[-1][1].from_edges, dtype=wp.mat33, device=self._device)
+            lit[1].from_edges = wp.array(mesh.from_edges, dtype=wp.mat33, device=self._device)
         found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
         return found, surfaces
 
     def _placed(self, solids: Sequence[ShownSolid]) -> list[Placed]:
         return [(one, self._own[one.name].moved(one.turn, one.position)) for one in solids]
 
-    def _surface(self, solids: Sequence[Placed]) -> tuple[DeviceSurface, SolidMesh]:
-        """Several as one."""
-        mesh = SolidMesh.joined([one for _, one in solids])
+    def _surface(self, mesh: SolidMesh, solids: Sequence[Placed]) -> DeviceSurface:
+        """That of several, whose mesh it is."""
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
-        return DeviceSurface.of(mesh.points, mesh.triangles, mesh.normals, colours, self._device), mesh
+
+        def softened(light: wp.array) -> wp.array:
+            return wp.array(mesh.smoothed(light.numpy()), dtype=wp.vec3, device=self._device)
+
+        return DeviceSurface.on(self._device, mesh.points, mesh.triangles, mesh.normals, colours, softened)
+
+
+def _joined(solids: Sequence[Placed]) -> SolidMesh:
+    return SolidMesh.joined([mesh for _, mesh in solids])
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:

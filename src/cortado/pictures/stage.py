@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
-from cortado.pictures.mirrored import mirrored
 from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
 from cortado.scene.camera_paths import View
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
@@ -23,9 +22,6 @@ AIR = 0.1
 """Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
-TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = 0.8, 1.1, 1.5
-"""In spacings: fluid that is nearer to a flat wall, to a solid and to a round wall touches it. A cubic lattice in a
-round cup ends up to one and a half spacings from its wall."""
 AZIMUTH = 24.0
 """Of the camera, to the right of the direction towards the viewer [degrees]."""
 
@@ -162,36 +158,6 @@ class Stage:
     def up_axis(self) -> int:
         """Which axis of the scene is upright."""
         return int(np.abs(self.frame[1]).argmax())
-
-    def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
-        """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
-        shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
-        of = np.arange(len(points))
-        if self.solids:
-            behind, of_those = mirrored(points, self.solids, TOUCHING_SOLID * self.spacing, self.spacing)
-            points, of = np.concatenate([points, behind]), np.concatenate([of, of_those])
-        if not self.cuts:
-            return points, of
-        own, box = points @ self.glass_frame.T, isinstance(self.container, BoxContainer)
-        if not box:
-            more, shown = self._behind_round_wall(own)
-            own, of = np.concatenate([own, more]), np.concatenate([of, of[shown]])
-        for axis, place in ((k, end[k]) for k in range(3) for end in self.room if box or k == 1):
-            if np.isfinite(place):
-                near = np.abs(own[:, axis] - place) < TOUCHING * self.spacing
-                behind = own[near]
-                behind[:, axis] = 2.0 * place - behind[:, axis]
-                own, of = np.concatenate([own, behind]), np.concatenate([of, of[near]])
-        return own @ self.glass_frame, of
-
-    def _behind_round_wall(self, own: Points) -> tuple[Points, np.ndarray]:
-        """Points one and two spacings further out than those (n, 3) that touch the wall, and which they show."""
-        lower, upper = self.glass_ends
-        off = (own - 0.5 * (lower + upper)) * (1.0, 0.0, 1.0)
-        away = np.linalg.norm(off, axis=1)
-        near = np.flatnonzero(np.abs(0.5 * (upper - lower)[0] - away) < TOUCHING_ROUND * self.spacing)
-        step = self.spacing * off[near] / np.maximum(away[near], 1e-30)[:, None]
-        return np.concatenate([own[near] + step, own[near] + 2.0 * step]), np.tile(near, 2)
 
     @property
     def glass_frame(self) -> Points:

@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
+import warp as wp
 
+from cortado.device.bands import BandLauncher
 from cortado.device.cores import usable_cores
+from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
-from cortado.errors import ComputationError, InputError
-
-MISSING = "Shaded pictures need pysplashsurf, which is not installed: pip install 'cortado-sph[pictures]'."
-FINE, COARSE = 30_000, 60_000
-"""Particles up to which cells are a third of a spacing wide, and two fifths; half a spacing beyond."""
+from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.particles import Particles
 
 NEIGHBOURS = 24
 """Particles that a point of the surface has its colour from."""
@@ -34,41 +35,13 @@ class Surface:
     """(p, 3) linear, from 0 to 1"""
 
 
-def liquid(positions: Points, colours: Points, spacing: float) -> Surface:
-    """The surface of what particles (n, 3) [m] with colours (n, 3) fill: a level of their density, smoothed by weights
-    that keep thin sheets (Löschner et al. 2023), in the colours of the nearest particles.
-
-    Raises:
-        InputError: pysplashsurf is missing.
-    """
-    try:
-        import pysplashsurf
-    except ModuleNotFoundError as problem:
-        raise InputError(MISSING) from problem
-    n = len(positions)
-    order = np.lexsort(positions.T)  # so that sums are those of the same fluid, whatever the order of its particles
-    with_data, _ = pysplashsurf.reconstruction_pipeline(
-        np.ascontiguousarray(positions[order], dtype=np.float32),
-        particle_radius=0.5 * spacing,
-        smoothing_length=3.0,
-        cube_size=0.65 if n <= FINE else 0.8 if n <= COARSE else 1.0,
-        iso_surface_threshold=0.6,
-        mesh_cleanup=True,
-        mesh_smoothing_iters=25,
-        mesh_smoothing_weights=True,
-        compute_normals=True,
-        normals_smoothing_iters=10,
-    )
-    mesh, found = with_data.mesh, with_data.point_attributes
-    if not len(mesh.triangles):
-        raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
-    points = np.asarray(mesh.vertices)
-    return Surface(
-        points=points,
-        triangles=np.asarray(mesh.triangles).astype(np.int32),
-        normals=np.asarray(found["normals"]),
-        colours=nearest_colours(points, positions[order], colours[order], spacing),
-    )
+def liquid(positions: Points, colours: Points, spacing: float, device: Any = "cpu") -> Surface:
+    """The surface of what particles (n, 3) [m] with colours (n, 3) fill; see `liquid_surface`."""
+    launch = BandLauncher(wp.get_device(device))
+    with WARP:
+        found = liquid_surface(Particles.on(launch.device, positions, colours), spacing, launch)
+        corners = found.triangles.numpy().reshape(-1, 3)
+        return Surface(found.points.numpy(), corners, found.normals.numpy(), found.colours.numpy())
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:

@@ -182,17 +182,20 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         surface: LitSurface,
         shadow: wp.array2d(dtype=wp.vec3),
         pixels: wp.array(dtype=wp.int32),
-        offset: wp.vec2,
+        offsets: wp.array(dtype=wp.vec2),
         image: wp.array(dtype=wp.vec3),
     ):
-        """The light of some pixels, through a point of each; ``offset``: where in the pixel, from -0.5 to 0.5."""
-        i = first + wp.tid()
-        pixel = pixels[i]
-        a = 2.0 * (wp.float32(pixel % eye.columns) + 0.5 + offset[0]) / wp.float32(eye.columns) - 1.0
-        b = 1.0 - 2.0 * (wp.float32(pixel / eye.columns) + 0.5 + offset[1]) / wp.float32(eye.rows)
-        d = wp.normalize(eye.forward + a * eye.right + b * eye.up)
+        """The light of some pixels, the mean of that through points of each; ``offsets``: where in the pixel, from -0.5
+        to 0.5."""
+        pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
-        image[i] = seen(s, shadow, surface, eye.position, d, spread)
+        light = wp.vec3(0.0)
+        for k in range(offsets.shape[0]):
+            a = 2.0 * (wp.float32(pixel % eye.columns) + 0.5 + offsets[k][0]) / wp.float32(eye.columns) - 1.0
+            b = 1.0 - 2.0 * (wp.float32(pixel / eye.columns) + 0.5 + offsets[k][1]) / wp.float32(eye.rows)
+            d = wp.normalize(eye.forward + a * eye.right + b * eye.up)
+            light += seen(s, shadow, surface, eye.position, d, spread)
+        image[pixel] = light / wp.float32(offsets.shape[0])
 
     return trace
 
@@ -203,9 +206,10 @@ def find_contrast(
     columns: wp.int32,
     image: wp.array(dtype=wp.vec3),
     contrast: wp.float32,
-    found: wp.array(dtype=wp.bool),
+    found: wp.array(dtype=wp.int32),
 ):
-    """Whether a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it."""
+    """1 where a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it, and
+    0 elsewhere."""
     i = first + wp.tid()
     column = i % columns
     greatest = wp.float32(0.0)
@@ -217,4 +221,4 @@ def find_contrast(
         greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - columns])))
     if i < image.shape[0] - columns:
         greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + columns])))
-    found[i] = greatest > contrast
+    found[i] = wp.where(greatest > contrast, 1, 0)

@@ -53,8 +53,8 @@ class Picturing:
 
         Raises:
             SceneError: settings that do not fit.
-            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D; or what ``colour`` names was not
-                recorded in the frame, or is the age, which one frame does not tell.
+            InputError: what ``colour`` names was not recorded in the frame, or is the age, which one frame does not
+                tell.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")

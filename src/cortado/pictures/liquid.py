@@ -1,0 +1,128 @@
+"""The surface of a fluid, found on the device where its particles are."""
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError
+from cortado.pictures.level_blocks import level_blocks
+from cortado.pictures.near_particles import NearParticles, near_particles, sum_near
+from cortado.pictures.particles import MODULE, Particles
+from cortado.pictures.surface_net import net_of, normals_of, smoothed, triangles_of
+
+REACH = 3.0
+"""Of the bumps of particles, in spacings."""
+REACH_OF_COLOURS = 2.25
+"""Of what colours come from."""
+ROUNDS, ROUNDS_OF_LIGHT = 36, 9
+"""Of smoothing: of the surface, and of the light on it, which comes from few directions."""
+CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
+"""Up to how many particles cubes have which width, in spacings."""
+MOST_CELLS = 1 << 26
+"""One spacing wide, in which particles are looked for."""
+FULL = wp.constant(wp.float32(2.84))
+"""Sum of the bumps of others near a particle from which on it is not in a thin sheet."""
+
+
+@dataclass(frozen=True)
+class LiquidSurface:
+    """Triangles on a device, outside on the side from which their corners run counter-clockwise."""
+
+    points: wp.array
+    """(p,) of vec3 [m]"""
+    triangles: wp.array
+    """(3 t,) numbers of points"""
+    normals: wp.array
+    """(p,) of vec3, unit vectors outwards"""
+    colours: wp.array
+    """(p,) of vec3, linear, from 0 to 1"""
+    neighbours: wp.array
+    """(p,) the points beside each, as `smoothed` takes them"""
+
+    def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
+        """The light at its points (p,) of vec3 without the steps that few directions leave."""
+        everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
+        return smoothed(light, self.neighbours, everywhere, ROUNDS_OF_LIGHT, launch)
+
+
+@wp.func
+def crowd(s: NearParticles, j: wp.int32):
+    """How many others are near a particle, by its volume, times that, and the volume itself."""
+    return s.volumes[j] * wp.vec2(1.0 / s.volumes[j] - 1.0, 1.0)
+
+
+@wp.func
+def tint(s: NearParticles, j: wp.int32):
+    c = s.colours[j]
+    return wp.vec4(c[0], c[1], c[2], 1.0)
+
+
+crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, wp.vec4)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_weights(
+    first: wp.int32,
+    s: NearParticles,
+    reach: wp.float32,
+    points: wp.array(dtype=wp.vec3),
+    weights: wp.array(dtype=wp.float32),
+):
+    """How much each corner is smoothed: little where few particles are (Löschner et al. 2023)."""
+    v = first + wp.tid()
+    near = crowd_near(s, points[v], reach)
+    x = wp.min(near[0] / wp.max(near[1], 1.0e-9) / FULL, 1.0)
+    weights[v] = x * x * x * (x * (6.0 * x - 15.0) + 10.0)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_colours(
+    first: wp.int32,
+    s: NearParticles,
+    reach: wp.float32,
+    points: wp.array(dtype=wp.vec3),
+    colours: wp.array(dtype=wp.vec3),
+):
+    v = first + wp.tid()
+    near = tint_near(s, points[v], reach)
+    if near[3] <= 1.0e-6:
+        near = tint_near(s, points[v], 2.0 * reach)
+    colours[v] = wp.vec3(near[0], near[1], near[2]) / wp.max(near[3], 1.0e-9)
+
+
+def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -> LiquidSurface:
+    """The surface of what particles fill: a level of their density, smoothed by weights that keep thin sheets (Löschner
+    et al. 2023), in the colours of the nearest particles.
+
+    Raises:
+        ComputationError: there is none.
+    """
+    device, reach, ends = launch.device, REACH * spacing, _shown(particles, spacing, launch)
+    cube = next(width for most, width in CUBE_WIDTHS if len(particles) <= most) * spacing
+    s = near_particles(particles, ends, spacing, reach, launch)
+    b, blocks = level_blocks(s, ends, cube, reach, launch)
+    net = net_of(b, blocks, launch)
+    points, count = net.points, len(net.points)
+    if not count:
+        raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
+    weights, colours = wp.empty(count, dtype=wp.float32, device=device), wp.empty_like(points)
+    launch(find_weights, count, s=s, reach=reach, points=points, weights=weights)
+    points = smoothed(points, net.neighbours, weights, ROUNDS, launch)
+    launch(find_colours, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours)
+    return LiquidSurface(
+        points, triangles_of(net, points, launch), normals_of(net, points, launch), colours, net.neighbours
+    )
+
+
+def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:
+    """The ends of all particles, or of those around the middle one, where some are very far away."""
+    lower, upper = particles.ends(launch)
+    if np.prod((upper - lower) / spacing + 1.0) <= MOST_CELLS:
+        return lower, upper
+    middle = np.quantile(particles.places.numpy(), 0.5, axis=0, method="nearest")
+    reach = 0.5 * MOST_CELLS ** (1.0 / 3.0) * spacing
+    return np.maximum(lower, middle - reach), np.minimum(upper, middle + reach)

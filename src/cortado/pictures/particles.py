@@ -1,0 +1,73 @@
+"""Particles on the device that draws them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError
+from cortado.words import counted
+
+MODULE = wp.get_module("cortado_liquid")
+MODULE.options["max_unroll"] = 2  # compiles in half the time
+PARTS = 4096
+"""Of particles, of each of which the ends are found."""
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Places and colours."""
+
+    places: wp.array
+    """(n,) of vec3 [m]"""
+    colours: wp.array
+    """(n,) of vec3, linear"""
+
+    @classmethod
+    def on(cls, device: Any, places: Points, colours: Points) -> "Particles":
+        """Those of arrays of NumPy, (n, 3) each; raises `ComputationError` for places that are not finite."""
+        astray = len(places) - int(np.isfinite(places).all(axis=1).sum())
+        if astray:
+            raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
+        return cls(
+            *(wp.array(np.asarray(one, dtype=np.float32), dtype=wp.vec3, device=device) for one in (places, colours))
+        )
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def and_images(self, places: Points, of: np.ndarray) -> "Particles":
+        """With others behind them, at places (m, 3) [m], each in the colour of one, (m,)."""
+        colours = self.colours.numpy()
+        both = np.concatenate([self.places.numpy(), places]), np.concatenate([colours, colours[of]])
+        return Particles.on(self.places.device, *both)
+
+    def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
+        """Lower and upper ends, (3,) each [m]."""
+        count, device = min(PARTS, len(self)), self.places.device
+        lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
+        launch(find_ends, count, places=self.places, lower=lower, upper=upper)
+        return lower.numpy().astype(np.float64).min(axis=0), upper.numpy().astype(np.float64).max(axis=0)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_ends(
+    first: wp.int32,
+    places: wp.array(dtype=wp.vec3),
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+):
+    """Those of every so many."""
+    part = first + wp.tid()
+    low = places[part]
+    high = places[part]
+    i = part
+    while i < places.shape[0]:
+        low = wp.min(low, places[i])
+        high = wp.max(high, places[i])
+        i += lower.shape[0]
+    lower[part] = low
+    upper[part] = high

@@ -1,0 +1,293 @@
+"""The surface where a level is reached, as a net with one corner in each cube that it passes (Gibson 1998).
+
+Corners in cubes side by side are neighbours, so that each has at most six, and the net has a quadrilateral across each
+side of a cube whose ends are on either side of the surface.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.pictures.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_of, level_at, node_of, place_of
+from cortado.pictures.marked import last_of
+from cortado.pictures.particles import MODULE
+
+ROUNDS_OF_NORMALS = 15
+"""Of smoothing."""
+Neighbours = wp.types.vector(6, wp.int32)
+"""Those in the cubes below and above along each axis; -1 where there is none."""
+
+
+@wp.struct
+class Cubes:
+    """Those of the blocks that the surface may pass, and which corners of the net are in them."""
+
+    b: Blocks
+    blocks: wp.array(dtype=wp.int32)
+    """(blocks that the surface may pass,)"""
+    corners: wp.array(dtype=wp.int32)
+    """(cubes + 1,) how many corners come before that of each cube"""
+    sides: wp.array(dtype=wp.int32)
+    """(cubes + 1,) how many quadrilaterals come before those across the sides from the lowest node of each cube"""
+
+
+@wp.func
+def signs_of(b: Blocks, node: wp.vec3i):
+    """Of which of its eight nodes of a cube are within the fluid: bit ``x + 2 y + 4 z``."""
+    signs = wp.int32(0)
+    for n in range(8):
+        if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:
+            signs = signs | (1 << n)
+    return signs
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def count_corners(
+    first: wp.int32,
+    b: Blocks,
+    blocks: wp.array(dtype=wp.int32),
+    signs: wp.array(dtype=wp.int32),
+    corners: wp.array(dtype=wp.int32),
+    sides: wp.array(dtype=wp.int32),
+):
+    n = first + wp.tid()
+    found = signs_of(b, node_of(block_at(b, blocks[n / CUBES]), n % CUBES))
+    signs[n] = found
+    corners[n] = wp.where(found > 0 and found < 255, 1, 0)
+    low = found & 1
+    sides[n] = ((found >> 1) & 1 ^ low) + ((found >> 2) & 1 ^ low) + ((found >> 4) & 1 ^ low)
+
+
+@wp.func
+def corner_in(cubes: Cubes, node: wp.vec3i):
+    """The number of the corner in a cube; -1 where there is none."""
+    entry = entry_of(cubes.b, node)
+    if entry < 0:
+        return -1
+    number = cubes.corners[entry]
+    return wp.where(cubes.corners[entry + 1] > number, number, -1)
+
+
+@wp.func
+def along(axis: wp.int32):
+    return wp.vec3i(wp.where(axis == 0, 1, 0), wp.where(axis == 1, 1, 0), wp.where(axis == 2, 1, 0))
+
+
+@wp.func
+def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
+    """Whether the surface passes between two nodes of a cube."""
+    return ((signs >> m) ^ (signs >> n)) & 1 == 1
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def place_corners(
+    first: wp.int32,
+    cubes: Cubes,
+    signs: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    own_signs: wp.array(dtype=wp.int32),
+    neighbours: wp.array(dtype=Neighbours),
+):
+    """In the middle of where the surface passes the sides of each cube."""
+    n = first + wp.tid()
+    v = cubes.corners[n]
+    if cubes.corners[n + 1] == v:
+        return
+    node = node_of(block_at(cubes.b, cubes.blocks[n / CUBES]), n % CUBES)
+    found = signs[n]
+    place = wp.vec3(0.0)
+    count = wp.float32(0.0)
+    for axis in range(3):
+        step = 1 << axis
+        way = along(axis)
+        for corner in range(8):
+            if corner & step == 0 and differ(found, corner, corner + step):
+                end = node + wp.vec3i(corner & 1, (corner >> 1) & 1, corner >> 2)
+                low = level_at(cubes.b, end)
+                part = (LEVEL - low) / (level_at(cubes.b, end + way) - low)
+                place += wp.vec3(float(end[0]), float(end[1]), float(end[2]))
+                place[axis] += part
+                count += 1.0
+    place = place / count
+    points[v] = place_of(cubes.b, place[0], place[1], place[2])
+    own_signs[v] = found
+    beside = Neighbours()
+    for axis in range(3):
+        # a face is passed if its four nodes differ
+        face = wp.where(axis == 0, 0x55, wp.where(axis == 1, 0x33, 0x0F))
+        lower = found & face
+        upper = (found >> (1 << axis)) & face
+        beside[2 * axis] = -1
+        beside[2 * axis + 1] = -1
+        if lower != 0 and lower != face:
+            beside[2 * axis] = corner_in(cubes, node - along(axis))
+        if upper != 0 and upper != face:
+            beside[2 * axis + 1] = corner_in(cubes, node + along(axis))
+    neighbours[v] = beside
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def list_triangles(
+    first: wp.int32,
+    cubes: Cubes,
+    signs: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array(dtype=wp.int32),
+):
+    """Two for each quadrilateral, cut along its shorter diagonal."""
+    n = first + wp.tid()
+    side = cubes.sides[n]
+    if cubes.sides[n + 1] == side:
+        return
+    node = node_of(block_at(cubes.b, cubes.blocks[n / CUBES]), n % CUBES)
+    for axis in range(3):
+        if differ(signs[n], 0, 1 << axis):
+            u = along((axis + 1) % 3)
+            w = along((axis + 2) % 3)
+            outwards = signs[n] & 1 == 1
+            p = corner_in(cubes, node - u - w)
+            q = corner_in(cubes, node - wp.where(outwards, w, u))
+            r = corner_in(cubes, node)
+            s = corner_in(cubes, node - wp.where(outwards, u, w))
+            if wp.min(wp.min(p, q), wp.min(r, s)) < 0:  # none there
+                p, q, r, s = 0, 0, 0, 0
+            t = 6 * side
+            other = wp.length_sq(points[p] - points[r]) > wp.length_sq(points[q] - points[s])
+            triangles[t] = p
+            triangles[t + 1] = q
+            triangles[t + 2] = wp.where(other, s, r)
+            triangles[t + 3] = r
+            triangles[t + 4] = s
+            triangles[t + 5] = wp.where(other, q, p)
+            side += 1
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def smooth(
+    first: wp.int32,
+    neighbours: wp.array(dtype=Neighbours),
+    weights: wp.array(dtype=wp.float32),
+    values: wp.array(dtype=wp.vec3),
+    found: wp.array(dtype=wp.vec3),
+):
+    """Towards the mean of neighbours."""
+    v = first + wp.tid()
+    beside = neighbours[v]
+    total = wp.vec3(0.0)
+    count = wp.float32(0.0)
+    for k in range(6):
+        if beside[k] >= 0:
+            total += values[beside[k]]
+            count += 1.0
+    found[v] = wp.lerp(values[v], total / wp.max(count, 1.0), wp.where(count > 0.0, weights[v], 0.0))
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_normals(
+    first: wp.int32,
+    signs: wp.array(dtype=wp.int32),
+    neighbours: wp.array(dtype=Neighbours),
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+):
+    """The mean of those of the quadrilaterals around each corner, by their areas."""
+    v = first + wp.tid()
+    beside = neighbours[v]
+    total = wp.vec3(0.0)
+    for axis in range(3):
+        a = (axis + 1) % 3
+        b = (axis + 2) % 3
+        for which in range(4):
+            m = which & 1
+            n = which >> 1
+            low = (m << a) | (n << b)
+            if differ(signs[v], low, low | (1 << axis)):
+                p = beside[2 * a + m]
+                q = beside[2 * b + n]
+                if p >= 0 and q >= 0:
+                    across = wp.cross(points[p] - points[v], points[q] - points[v])
+                    outwards = wp.where((signs[v] >> low) & 1 == 1, 1.0, -1.0)
+                    turned = wp.where(m == n, 1.0, -1.0)
+                    total += outwards * turned * across
+    normals[v] = wp.normalize(total)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def smooth_normals(
+    first: wp.int32,
+    neighbours: wp.array(dtype=Neighbours),
+    normals: wp.array(dtype=wp.vec3),
+    found: wp.array(dtype=wp.vec3),
+):
+    v = first + wp.tid()
+    beside = neighbours[v]
+    total = wp.vec3(0.0)
+    for k in range(6):
+        if beside[k] >= 0:
+            total += normals[beside[k]]
+    if wp.length_sq(total) == 0.0:
+        total = normals[v]
+    found[v] = wp.normalize(total)
+
+
+@dataclass(frozen=True)
+class SurfaceNet:
+    """A net on the device."""
+
+    cubes: Any
+    """`Cubes`"""
+    cube_signs: wp.array
+    """(cubes,) of which nodes are within the fluid"""
+    points: wp.array
+    """(corners,) of vec3 [m]"""
+    signs: wp.array
+    """(corners,) those of their cubes"""
+    neighbours: wp.array
+    """(corners,)"""
+    sides: int
+    """How many quadrilaterals there are."""
+
+
+def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
+    """That of the level on `Blocks`; ``blocks``: which of them the surface may pass."""
+    device, count, cubes = launch.device, len(blocks) * CUBES, Cubes()
+    signs = wp.empty(count, dtype=wp.int32, device=device)
+    cubes.b, cubes.blocks = b, blocks
+    cubes.corners, cubes.sides = (wp.zeros(count + 1, dtype=wp.int32, device=device) for _ in range(2))
+    launch(count_corners, count, b=b, blocks=blocks, signs=signs, corners=cubes.corners, sides=cubes.sides)
+    for counts in (cubes.corners, cubes.sides):
+        wp.utils.array_scan(counts, counts, inclusive=False)
+    corners, sides = last_of(cubes.corners), last_of(cubes.sides)
+    points, own, beside = (wp.empty(corners, dtype=kind, device=device) for kind in (wp.vec3, wp.int32, Neighbours))
+    launch(place_corners, count, cubes=cubes, signs=signs, points=points, own_signs=own, neighbours=beside)
+    return SurfaceNet(cubes, signs, points, own, beside, sides)
+
+
+def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
+    """Values (p,) of vec3, moved towards the means of their neighbours so many times, by weights (p,) from 0 to 1."""
+    found, other = wp.clone(values), wp.empty_like(values)
+    for _ in range(rounds):
+        launch(smooth, len(values), neighbours=neighbours, weights=weights, values=found, found=other)
+        found, other = other, found
+    return found
+
+
+def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
+    """(p,) of vec3, unit vectors outwards, of a net whose corners were moved to points (p,)."""
+    normals, other = wp.empty_like(points), wp.empty_like(points)
+    own = {"signs": net.signs, "neighbours": net.neighbours}
+    launch(find_normals, len(points), **own, points=points, normals=normals)
+    for _ in range(ROUNDS_OF_NORMALS):
+        launch(smooth_normals, len(points), neighbours=net.neighbours, normals=normals, found=other)
+        normals, other = other, normals
+    return normals
+
+
+def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
+    """(3 t,) numbers of the corners of triangles, of a net whose corners were moved to points (p,)."""
+    found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
+    given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
+    launch(list_triangles, len(net.cube_signs), **given, triangles=found)
+    return found

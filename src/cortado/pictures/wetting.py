@@ -1,0 +1,135 @@
+"""Fluid on the device that draws it, with images of particles behind the walls that they touch: a surface around them
+all goes on beyond the walls, at which it is cut."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.pictures.marked import last_of
+from cortado.pictures.mirrored import mirrored
+from cortado.pictures.particles import MODULE, Particles
+from cortado.pictures.stage import Stage
+from cortado.pictures.surroundings import GLASS_BOX, Environment
+
+TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
+"""In spacings: fluid that is nearer to a flat wall, to a solid and to a round wall touches it. A cubic lattice in a
+round cup ends up to one and a half spacings from its wall."""
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def turn(first: wp.int32, frame: wp.mat33, places: wp.array(dtype=wp.vec3)):
+    i = first + wp.tid()
+    places[i] = frame * places[i]
+
+
+def particles_of(stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher) -> Particles:
+    """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3)."""
+    found = Particles.on(launch.device, np.subtract(positions, stage.origin), colours)
+    launch(turn, len(found), frame=wp.mat33(*stage.frame.ravel()), places=found.places)
+    return found
+
+
+@wp.func
+def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
+    """Whether a particle, in the frame of the container, has a first and a second image along an axis, as bits 1 and 2:
+    those behind the lower and the upper wall; along the first axis of a cylinder those behind its round wall."""
+    found = wp.int32(0)
+    if s.glass == wp.static(GLASS_BOX) or axis == 1:
+        if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
+            found = found | 1
+        if wp.abs(q[axis] - s.room_upper[axis]) < TOUCHING * spacing:
+            found = found | 2
+    elif axis == 0:
+        off = q - 0.5 * (s.glass_lower + s.glass_upper)
+        radius = 0.5 * (s.glass_upper[0] - s.glass_lower[0])
+        if wp.abs(radius - wp.sqrt(off[0] * off[0] + off[2] * off[2])) < TOUCHING_ROUND * spacing:
+            found = 3
+    return found
+
+
+@wp.func
+def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
+    """From a particle to an image: no way at all to 0, itself, and then to those of `images_along`."""
+    way = wp.vec3(0.0)
+    if which == 0:
+        return way
+    if s.glass == wp.static(GLASS_BOX) or axis == 1:
+        way[axis] = 2.0 * (wp.where(which == 1, s.room_lower[axis], s.room_upper[axis]) - q[axis])
+        return way
+    off = q - 0.5 * (s.glass_lower + s.glass_upper)
+    return float(which) * spacing * wp.normalize(wp.vec3(off[0], 0.0, off[2]))
+
+
+@wp.func
+def has_image(which: wp.int32, images: wp.int32):
+    return which == 0 or (images >> (which - 1)) & 1 == 1
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def count_images(
+    first: wp.int32,
+    s: Environment,
+    spacing: wp.float32,
+    places: wp.array(dtype=wp.vec3),
+    counts: wp.array(dtype=wp.int32),
+):
+    """Of each particle, itself among them."""
+    i = first + wp.tid()
+    q = s.glass_frame * places[i]
+    count = wp.int32(1)
+    for axis in range(3):
+        images = images_along(s, q, axis, spacing)
+        count = count * (1 + (images & 1) + (images >> 1))
+    counts[i] = count
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def list_images(
+    first: wp.int32,
+    s: Environment,
+    spacing: wp.float32,
+    places: wp.array(dtype=wp.vec3),
+    colours: wp.array(dtype=wp.vec3),
+    counts: wp.array(dtype=wp.int32),
+    image_places: wp.array(dtype=wp.vec3),
+    image_colours: wp.array(dtype=wp.vec3),
+):
+    """``counts``: of those up to each particle."""
+    i = first + wp.tid()
+    n = wp.int32(0)
+    if i > 0:
+        n = counts[i - 1]
+    q = s.glass_frame * places[i]
+    along = wp.vec3i(images_along(s, q, 0, spacing), images_along(s, q, 1, spacing), images_along(s, q, 2, spacing))
+    for which in range(27):
+        a = which % 3
+        b = (which / 3) % 3
+        c = which / 9
+        if has_image(a, along[0]) and has_image(b, along[1]) and has_image(c, along[2]):
+            way = image_along(s, q, 0, a, spacing) + image_along(s, q, 1, b, spacing)
+            way += image_along(s, q, 2, c, spacing)
+            image_places[n] = wp.transpose(s.glass_frame) * (q + way)
+            image_colours[n] = colours[i]
+            n += 1
+
+
+def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> Particles:
+    """Particles with their images behind solids and behind the walls of the container, as the `Environment` s has
+    them."""
+    if stage.solids:
+        placed = particles.places.numpy().astype(np.float64)
+        images, of = mirrored(placed, stage.solids, TOUCHING_SOLID * stage.spacing, stage.spacing)
+        particles = particles.and_images(images, of)
+    if not stage.cuts:
+        return particles
+    own, given = {"s": s, "spacing": stage.spacing}, {"places": particles.places, "colours": particles.colours}
+    counts = wp.empty(len(particles), dtype=wp.int32, device=particles.places.device)
+    launch(count_images, len(particles), **own, places=particles.places, counts=counts)
+    wp.utils.array_scan(counts, counts)
+    total = last_of(counts)
+    found = Particles(*(wp.empty(total, dtype=wp.vec3, device=counts.device) for _ in range(2)))
+    filled = {"image_places": found.places, "image_colours": found.colours}
+    launch(list_images, len(particles), **own, **given, counts=counts, **filled)
+    return found

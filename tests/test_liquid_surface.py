@@ -1,0 +1,99 @@
+"""The surface of a fluid: closed, outwards, where its particles are, and the same wherever they are."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from cortado.errors import ComputationError
+from cortado.pictures import liquid as liquid_module
+from cortado.pictures.surface import liquid
+
+SPACING = 0.1
+
+
+def ball(radius=0.6, centre=(0.0, 0.0, 0.0)):
+    """(n, 3) [m] a lattice in a ball."""
+    axis = np.arange(-radius, radius + SPACING, SPACING)
+    lattice = np.stack([one.ravel() for one in np.meshgrid(axis, axis, axis)], axis=1)
+    return lattice[np.linalg.norm(lattice, axis=1) < radius] + centre
+
+
+def surface_of(positions, colours=None):
+    return liquid(positions, np.ones_like(positions) if colours is None else colours, SPACING)
+
+
+def mesh_of(surface):
+    return trimesh.Trimesh(surface.points, surface.triangles, process=False)
+
+
+def test_the_surface_of_a_ball_is_round_and_closed():
+    positions = ball()
+    found = surface_of(positions)
+    mesh, away = mesh_of(found), np.linalg.norm(found.points, axis=1)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == 2
+    volume = len(positions) * SPACING**3
+    assert 0.75 * volume < mesh.volume < volume  # it lies up to half a spacing within the fluid
+    assert np.ptp(away) < 0.5 * SPACING
+    outwards = np.einsum("pk,pk->p", found.normals, found.points / away[:, None])
+    assert outwards.min() > 0.97
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-5)
+    assert np.einsum("tk,tk->t", mesh.face_normals, found.normals[found.triangles[:, 0]]).min() > 0.9
+
+
+def test_every_particle_that_is_alone_is_a_drop():
+    """Whatever corner of a cube or a block it is at."""
+    places = np.random.default_rng(0).uniform(-4.0, 4.0, (40, 3))
+    mesh = mesh_of(surface_of(places))
+    assert mesh.body_count == len(places) and mesh.is_watertight
+    sizes = [part.volume / SPACING**3 for part in mesh.split()]
+    assert min(sizes) > 0.5 and max(sizes) < 3.0
+
+
+@pytest.mark.parametrize("count", [40, 400])
+def test_a_spray_has_no_holes(count):
+    """Each side of a triangle is that of another, the other way round; several sheets may share one."""
+    found = surface_of(np.random.default_rng(1).random((count, 3)))
+    sides = found.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    here, there = (np.sort(one @ [len(found.points), 1]) for one in (sides, sides[:, ::-1]))
+    np.testing.assert_array_equal(here, there)
+
+
+def test_the_lattice_is_fixed_in_space():
+    """Other fluid far away does not change a surface; nor does a shift by so many blocks."""
+    positions = ball(0.4)
+    alone = surface_of(positions)
+    both = surface_of(np.concatenate([positions, ball(0.3, (-1.234, 1.1, 0.3))]))
+    assert cKDTree(both.points).query(alone.points)[0].max() < 1e-5
+    block = 4 * liquid_module.CUBE_WIDTHS[0][1] * SPACING
+    moved = surface_of(positions + 7 * block)
+    np.testing.assert_allclose(moved.points, alone.points + 7 * block, atol=1e-5)
+
+
+def test_the_order_of_particles_changes_nothing():
+    positions = ball(0.4) + 0.02 * np.random.default_rng(0).standard_normal(ball(0.4).shape)
+    one, other = surface_of(positions), surface_of(positions[::-1])
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+    np.testing.assert_array_equal(one.triangles, other.triangles)
+
+
+def test_points_have_the_colours_of_particles_near_them():
+    positions = ball()
+    colours = np.where(positions[:, :1] > 0.01, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    found = surface_of(positions, colours)
+    right, left = found.points[:, 0] > 0.25, found.points[:, 0] < -0.25
+    np.testing.assert_allclose(found.colours[right], np.tile((1.0, 0.0, 0.0), (right.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(found.colours[left], np.tile((0.0, 0.0, 1.0), (left.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(found.colours.sum(axis=1), 1.0, atol=1e-5)
+
+
+def test_what_is_very_far_away_is_left_out():
+    positions = ball(0.3)
+    alone = surface_of(positions)
+    found = surface_of(np.concatenate([positions, [[1e7, 0.0, 0.0], [0.0, -1e9, 0.0]]]))
+    np.testing.assert_allclose(found.points, alone.points, atol=1e-6)
+
+
+def test_positions_that_are_not_numbers_are_a_sentence():
+    with pytest.raises(ComputationError, match="2 particles cannot be drawn, whose positions are not finite"):
+        surface_of(np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]))
