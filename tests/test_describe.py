@@ -16,7 +16,7 @@ from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.scene.stability import stability_limit, stability_limits
-from scenes import plane, two_layers
+from scenes import jet, plane, two_layers
 
 
 @pytest.fixture(autouse=True)
@@ -148,6 +148,17 @@ def test_densities_are_those_of_the_rest_lattice():
     last.set({"positions": at})
     densities = simulation.solver.densities(last, rollout.parameters)
     assert 7 in np.argsort(np.abs(densities - 800.0))[-4:]
+
+
+def test_densities_leave_out_what_waits_in_an_emitter():
+    """A column may wait in the wall of its container, where no fluid could be."""
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4]}
+    simulation = cortado.Simulation(jet(container=room))
+    rollout = simulation.rollout(2)
+    last = rollout.forward(keep=False)
+    rest = simulation.scene.phase[0].rest_density
+    assert simulation.solver.densities(last, rollout.parameters).max() > 1.5 * rest
+    assert RunSummary.of(simulation, rollout, last, 1.0).densities[1] < 1.1 * rest
 
 
 def test_a_run_ends_with_them(capsys):

@@ -112,6 +112,7 @@ def test_a_template_is_a_scene_that_says_how_it_is_run(cortado_command, template
     bodies = [*scene.fluid, *([scene.emitter] if scene.emitter else [])]
     count = sum(len(body.particles(scene.discretisation.spacing)) for body in bodies)
     assert count == pytest.approx(int(told[1].replace(",", "")), rel=0.1), "but for those where solids are"
+    assert ("open at the top" in text) is (getattr(scene.container, "lid", True) is False)
 
 
 def test_there_are_ten_templates_and_the_help_names_them(cortado_command):

@@ -5,10 +5,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
+from cortado.runs.emitted import is_out
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
@@ -74,7 +76,8 @@ class RunSummary:
     turned: bool
     """Whether gravity changed during the run, and potential energies are those of other gravities."""
     densities: tuple[float, float] | None
-    """The least and the greatest at the end [kg/m3]; None of a solver without particles."""
+    """The least and the greatest at the end [kg/m3], of particles that do not wait in an emitter; None of a solver
+    without particles."""
     spilt: int
     """Particles beside or below an open cup at the end."""
     particles: int
@@ -85,7 +88,7 @@ class RunSummary:
         """``last``: the state at the end."""
         solver, taken, found = rollout.solver, rollout.taken, None
         if isinstance(solver, ParticleSolver):
-            densities = solver.densities(last, rollout.parameters)
+            densities = solver.densities(last, rollout.parameters)[_out(simulation, last)]
             found = float(densities.min()), float(densities.max())
         return cls(
             steps=taken,
@@ -150,6 +153,12 @@ class RunSummary:
         if self.spilt:
             text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
         return f"{text}."
+
+
+def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
+    """(n,) whether each particle has left the emitter; one that waits may be within a wall, and is prescribed."""
+    emitted = state["emitted"].numpy() if simulation.scene.emitter else None
+    return is_out(simulation.scene, emitted, len(simulation.positions))
 
 
 def _spilt(simulation: Simulation, state: State) -> int:
