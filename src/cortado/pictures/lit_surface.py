@@ -24,6 +24,8 @@ class LitSurface:
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
     left: wp.array(dtype=wp.vec2)
     """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
+    reflectivity: wp.array(dtype=wp.float32)
+    """(triangles,) of opaque solids: the part of the light that they reflect as a mirror in their colour does"""
     from_edges: wp.array(dtype=wp.mat33)
     """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
 
@@ -64,6 +66,8 @@ class SurfaceHit:
     """On the side that the ray comes from."""
     colour: wp.vec3
     light: wp.vec3
+    reflectivity: wp.float32
+    """Of a solid."""
     face: wp.int32
     u: wp.float32
     v: wp.float32

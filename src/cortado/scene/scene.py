@@ -67,6 +67,7 @@ class Scene(SceneTables):
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         aside["solver"] = unused if getattr(self.solver, "shifting", True) else unused | {"shifting"}
         aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}
+        aside["container"] = {"material", "colour"}
         return json.dumps(self.model_dump(mode="json", exclude=aside, context="colours"), indent=2)
 
     @classmethod

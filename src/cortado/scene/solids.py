@@ -1,6 +1,7 @@
 """Solids, which fluid flows around or is held by: what all have, whatever their shape."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -12,7 +13,7 @@ from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.containers import Container
 from cortado.scene.fields import MISSING, Colour, FieldPath, Length, OneOf, Text, field_error, quantity
-from cortado.scene.materials import FINISHES, Coloured
+from cortado.scene.materials import FINISHES, Coloured, Finish
 from cortado.scene.turns import Rotation, Turning, check_turn, rotation_matrix
 
 
@@ -62,6 +63,14 @@ class SolidTable(Coloured):
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
     """The part of the light that goes through it in pictures, from 0 to 1; if left out that of the material, and
     without one 0, or 1 if fluid is inside."""
+
+    @property
+    def finish(self) -> Finish:
+        """What its surface looks like."""
+        plain = Finish(self.plain, transparency=float(self.side == "inside"))
+        own = plain if self.material is None else FINISHES[self.material]
+        clear = own.transparency if self.transparency is None else self.transparency
+        return replace(own, colour=self.colour or own.colour, transparency=clear)
 
     @property
     def sticks(self) -> bool:
