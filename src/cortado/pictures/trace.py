@@ -47,6 +47,13 @@ def toned(colour: wp.vec3):
     return found
 
 
+@wp.func
+def tinted(colour: wp.vec3, taken: wp.float32):
+    """What is left of white light where fluid of a colour takes away the others, up to the colour itself at 1."""
+    base = wp.vec3(wp.max(colour[0], 0.02), wp.max(colour[1], 0.02), wp.max(colour[2], 0.02))
+    return wp.vec3(wp.pow(base[0], taken), wp.pow(base[1], taken), wp.pow(base[2], taken))
+
+
 @cache
 def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     """The kernel that traces rays, where there are opaque or transparent solids, or none, which takes no time then."""
@@ -80,12 +87,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                 soft = 0.55 * lit + wp.vec3(0.40)
                 found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
                 taken = medium[1] * met.t
-                tint = wp.vec3(
-                    wp.pow(wp.max(c[0], 0.02), taken),
-                    wp.pow(wp.max(c[1], 0.02), taken),
-                    wp.pow(wp.max(c[2], 0.02), taken),
-                )
-                through = wp.cw_mul(through, tint) * left
+                through = wp.cw_mul(through, tinted(c, taken)) * left
                 if met.is_solid:
                     return found + wp.cw_mul(through, shaded_solid(s, met, d, 0.0))
             else:
@@ -120,7 +122,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                 o = p - s.nearest * n
                 inside = True
         if inside:
-            return found + wp.cw_mul(through, wp.cw_mul(c, lit))
+            kept = tinted(c, wp.min(medium[1] * s.size, 1.0))  # it goes on to and fro
+            return found + wp.cw_mul(through, wp.cw_mul(kept, lit))
         return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
 
     @wp.func
