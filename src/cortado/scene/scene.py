@@ -53,7 +53,7 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def to_json(self) -> str:
-        """The scene with all defaults filled in, to be read by `from_json`."""
+        """The scene with all defaults filled in but colours, which materials may have, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
