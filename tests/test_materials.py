@@ -45,6 +45,7 @@ def drawn(scene, shown=True):
     simulation = cortado.Simulation(scene)
     x, fractions = simulation.positions, simulation.parameters().get("mass_fractions")
     colours, keep = colours_of(scene, fractions, len(x)), slice(None if shown else 0)
+    fractions = None if fractions is None else fractions[keep]
     return painter(scene, x).image(*State(x[keep], colours[keep], fractions=fractions))
 
 
