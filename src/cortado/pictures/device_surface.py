@@ -30,7 +30,7 @@ class DeviceSurface:
         """Triangles, (3 t,) numbers of points (p,) of vec3 [m] with normals (p,), outwards, and linear colours (p,)."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
-        found.light = wp.zeros_like(points)
+        found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
         return cls(mesh, found, softened)
 
     @classmethod

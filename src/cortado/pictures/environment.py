@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.pictures.pane import EDGE
 from cortado.pictures.stage import Stage
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 
@@ -30,7 +31,11 @@ def environment_of(stage: Stage) -> Any:
         lower, upper = (np.clip(end, -1e8, 1e8) for end in stage.room)
         s.room_lower, s.room_upper = wp.vec3(*lower), wp.vec3(*upper)
         s.has_room = int(stage.cuts and picture.surface == "liquid")
-        s.panes = wp.mat33(*stage.panes.ravel(), 0.0, 0.0, 0.0)
+        finish = stage.container.finish
+        s.edge_colour = wp.vec3(*(EDGE if finish is None else finish.colour))
+        if finish is not None and not finish.transparency:
+            s.has_walls, s.wall_colour, s.wall_reflectivity = 1, wp.vec3(*finish.colour), finish.reflectivity
+        s.panes = wp.mat33(*(stage.panes * (1 - s.has_walls)).ravel(), 0.0, 0.0, 0.0)
     return s
 
 

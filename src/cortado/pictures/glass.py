@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from cortado.pictures.container_room import between, within_tube
+from cortado.pictures.opaque_walls import opaque_wall
 from cortado.pictures.pane import Passed, pane, rim_of
 from cortado.pictures.solid_hit import clear_layers, meet_solid, shaded_solid
 from cortado.pictures.surroundings import FAR, Environment, open_background
@@ -35,7 +36,9 @@ def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float
             off = wp.min(off, wp.min(q[a] - s.glass_lower[a], s.glass_upper[a] - q[a]))
     n = wp.vec3(0.0)
     n[axis] = 1.0
-    return pane(s, world, wp.transpose(s.glass_frame) * n, rim_of(off, width), s.panes[side, axis], before)
+    return pane(
+        s, world, wp.transpose(s.glass_frame) * n, rim_of(off, width), s.panes[side, axis], s.edge_colour, before
+    )
 
 
 @wp.func
@@ -73,7 +76,15 @@ def tube(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, 
     z = 0.5 * (s.glass_lower[2] + s.glass_upper[2])
     n = wp.normalize(wp.vec3(q[0] - x, 0.0, q[2] - z))
     off = wp.min(q[1] - s.glass_lower[1], s.glass_upper[1] - q[1])
-    return pane(s, world, wp.transpose(s.glass_frame) * n, rim_of(off, width), 1.0, before)
+    return pane(
+        s,
+        world,
+        wp.transpose(s.glass_frame) * n,
+        rim_of(off, width),
+        1.0 - wp.float32(s.has_walls),
+        s.edge_colour,
+        before,
+    )
 
 
 @wp.func
@@ -116,6 +127,8 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
             passed = cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
         if has_clear:
             passed = clear_layers(s, o, d, most, spread, passed)
+        if s.has_walls > 0:
+            passed = opaque_wall(s, o, d, most + 2.0 * s.nearest, passed)
         return passed
 
     @wp.func

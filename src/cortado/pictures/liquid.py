@@ -22,6 +22,8 @@ ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 """Of smoothing: of the surface, and of the light on it, which comes from few directions."""
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
 """Up to how many particles cubes have which width, in spacings."""
+WeightedLook = wp.types.vector(6, wp.float32)
+"""A `Look` times a weight, and the weight."""
 MOST_CELLS = 1 << 26
 """One spacing wide, in which particles are looked for."""
 FULL = wp.constant(wp.float32(2.84))
@@ -40,6 +42,8 @@ class LiquidSurface:
     """(p,) of vec3, unit vectors outwards"""
     colours: wp.array
     """(p,) of vec3, linear, from 0 to 1"""
+    media: wp.array
+    """(p,) of vec2, scattering and absorption [1/m]"""
     neighbours: wp.array
     """(p,) the points beside each, as `smoothed` takes them"""
 
@@ -57,11 +61,11 @@ def crowd(s: NearParticles, j: wp.int32):
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
-    c = s.colours[j]
-    return wp.vec4(c[0], c[1], c[2], 1.0)
+    x = s.looks[j]
+    return WeightedLook(x[0], x[1], x[2], x[3], x[4], 1.0)
 
 
-crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, wp.vec4)
+crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -80,23 +84,26 @@ def find_weights(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_colours(
+def find_looks(
     first: wp.int32,
     s: NearParticles,
     reach: wp.float32,
     points: wp.array(dtype=wp.vec3),
     colours: wp.array(dtype=wp.vec3),
+    media: wp.array(dtype=wp.vec2),
 ):
     v = first + wp.tid()
     near = tint_near(s, points[v], reach)
-    if near[3] <= 1.0e-6:
+    if near[5] <= 1.0e-6:
         near = tint_near(s, points[v], 2.0 * reach)
-    colours[v] = wp.vec3(near[0], near[1], near[2]) / wp.max(near[3], 1.0e-9)
+    weight = wp.max(near[5], 1.0e-9)
+    colours[v] = wp.vec3(near[0], near[1], near[2]) / weight
+    media[v] = wp.vec2(near[3], near[4]) / weight
 
 
 def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -> LiquidSurface:
     """The surface of what particles fill: a level of their density, smoothed by weights that keep thin sheets (Löschner
-    et al. 2023), in the colours of the nearest particles.
+    et al. 2023), that looks like the nearest particles.
 
     Raises:
         ComputationError: there is none.
@@ -110,12 +117,12 @@ def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -
     if not count:
         raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
     weights, colours = wp.empty(count, dtype=wp.float32, device=device), wp.empty_like(points)
+    media = wp.empty(count, dtype=wp.vec2, device=device)
     launch(find_weights, count, s=s, reach=reach, points=points, weights=weights)
     points = smoothed(points, net.neighbours, weights, ROUNDS, launch)
-    launch(find_colours, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours)
-    return LiquidSurface(
-        points, triangles_of(net, points, launch), normals_of(net, points, launch), colours, net.neighbours
-    )
+    launch(find_looks, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours, media=media)
+    triangles, normals = triangles_of(net, points, launch), normals_of(net, points, launch)
+    return LiquidSurface(points, triangles, normals, colours, media, net.neighbours)
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:

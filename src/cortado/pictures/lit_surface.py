@@ -16,14 +16,16 @@ class LitSurface:
     """(points,)"""
     light: wp.array(dtype=wp.vec3)
     """(points,) light that falls on the surface, of which white reflects 1"""
-    scattering: wp.float32
-    """Of a fluid [1/m]."""
+    media: wp.array(dtype=wp.vec2)
+    """(points,) of a fluid: scattering and absorption [1/m]"""
     is_flat: wp.int32
     """Whether its colours are shown as they are, without light and shadow."""
     reach: wp.float32
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
     left: wp.array(dtype=wp.vec2)
     """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
+    reflectivity: wp.array(dtype=wp.float32)
+    """(triangles,) of opaque solids: the part of the light that they reflect as a mirror in their colour does"""
     from_edges: wp.array(dtype=wp.mat33)
     """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
 
@@ -64,6 +66,11 @@ class SurfaceHit:
     """On the side that the ray comes from."""
     colour: wp.vec3
     light: wp.vec3
+    reflectivity: wp.float32
+    """Of a solid."""
+    face: wp.int32
+    u: wp.float32
+    v: wp.float32
 
 
 @wp.func
@@ -80,4 +87,17 @@ def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u
     met.normal = facing(at_corners(surface, surface.normals, face, u, v), flat, d)
     met.colour = at_corners(surface, surface.colours, face, u, v)
     met.light = at_corners(surface, surface.light, face, u, v)
+    met.face = face
+    met.u = u
+    met.v = v
     return met
+
+
+@wp.func
+def medium_at(surface: LitSurface, met: SurfaceHit):
+    """Scattering and absorption [1/m] of the fluid that a ray comes into."""
+    return (
+        met.u * surface.media[surface.corners[3 * met.face]]
+        + met.v * surface.media[surface.corners[3 * met.face + 1]]
+        + (1.0 - met.u - met.v) * surface.media[surface.corners[3 * met.face + 2]]
+    )

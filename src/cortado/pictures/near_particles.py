@@ -11,7 +11,7 @@ import warp as wp
 from cortado.device.bands import BandLauncher
 from cortado.device.precision import FLOAT32
 from cortado.particles.cells import CellSort, Grid
-from cortado.pictures.particles import MODULE, Particles
+from cortado.pictures.particles import MODULE, Look, Particles
 
 
 @wp.struct
@@ -28,8 +28,8 @@ class NearParticles:
     """(cells + 1,) the first particle of each"""
     places: wp.array(dtype=wp.vec3)
     """(n,) [m]"""
-    colours: wp.array(dtype=wp.vec3)
-    """(n,) linear"""
+    looks: wp.array(dtype=Look)
+    """(n,)"""
     volumes: wp.array(dtype=wp.float32)
     """(n,) of each, such that their bumps add up to about 1 within fluid; a particle alone has 1"""
 
@@ -92,13 +92,13 @@ def sort_particles(
     first: wp.int32,
     order: wp.array(dtype=wp.int32),
     given: wp.array(dtype=wp.vec3),
-    given_colours: wp.array(dtype=wp.vec3),
+    given_looks: wp.array(dtype=Look),
     places: wp.array(dtype=wp.vec3),
-    colours: wp.array(dtype=wp.vec3),
+    looks: wp.array(dtype=Look),
 ):
     i = first + wp.tid()
     places[i] = given[order[i]]
-    colours[i] = given_colours[order[i]]
+    looks[i] = given_looks[order[i]]
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -118,9 +118,9 @@ def near_particles(
     sorting(given.places)
     s = NearParticles()
     s.lower, s.spacing, s.shape, s.starts = wp.vec3(*lower), spacing, wp.vec3i(x, y, z), sorting.grid.starts
-    s.places, s.colours = wp.empty_like(given.places), wp.empty_like(given.colours)
+    s.places, s.looks = wp.empty_like(given.places), wp.empty_like(given.looks)
     s.volumes = wp.empty(len(given), dtype=wp.float32, device=device)
-    unsorted = {"given": given.places, "given_colours": given.colours}
-    launch(sort_particles, len(given), order=sorting.order, **unsorted, places=s.places, colours=s.colours)
+    unsorted = {"given": given.places, "given_looks": given.looks}
+    launch(sort_particles, len(given), order=sorting.order, **unsorted, places=s.places, looks=s.looks)
     launch(find_volumes, len(given), s=s, reach=reach, volumes=s.volumes)
     return s

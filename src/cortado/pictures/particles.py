@@ -13,37 +13,46 @@ from cortado.words import counted
 
 MODULE = wp.get_module("cortado_liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
+Look = wp.types.vector(5, wp.float32)
+"""Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
+OPAQUE = (1e6, 0.0)
+"""The medium of what nothing is seen through."""
 PARTS = 4096
 """Of particles, of each of which the ends are found."""
 
 
 @dataclass(frozen=True)
 class Particles:
-    """Places and colours."""
+    """Where they are, and what they look like."""
 
     places: wp.array
     """(n,) of vec3 [m]"""
-    colours: wp.array
-    """(n,) of vec3, linear"""
+    looks: wp.array
+    """(n,) of `Look`"""
 
     @classmethod
-    def on(cls, device: Any, places: Points, colours: Points) -> "Particles":
-        """Those of arrays of NumPy, (n, 3) each; raises `ComputationError` for places that are not finite."""
+    def on(
+        cls, device: Any, places: Points, colours: Points, media: Points | tuple[float, float] = OPAQUE
+    ) -> "Particles":
+        """Those of arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and absorption
+        [1/m]. Raises `ComputationError` for places that are not finite."""
         astray = len(places) - int(np.isfinite(places).all(axis=1).sum())
         if astray:
             raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
+        looks = np.hstack([colours, np.broadcast_to(media, (len(places), 2))]).astype(np.float32)
         return cls(
-            *(wp.array(np.asarray(one, dtype=np.float32), dtype=wp.vec3, device=device) for one in (places, colours))
+            wp.array(np.asarray(places, dtype=np.float32), dtype=wp.vec3, device=device),
+            wp.array(looks, dtype=Look, device=device),
         )
 
     def __len__(self) -> int:
         return len(self.places)
 
     def and_images(self, places: Points, of: np.ndarray) -> "Particles":
-        """With others behind them, at places (m, 3) [m], each in the colour of one, (m,)."""
-        colours = self.colours.numpy()
-        both = np.concatenate([self.places.numpy(), places]), np.concatenate([colours, colours[of]])
-        return Particles.on(self.places.device, *both)
+        """With others behind them, at places (m, 3) [m], each looking like one, (m,)."""
+        looks = np.concatenate([self.looks.numpy(), self.looks.numpy()[of]])
+        both = np.concatenate([self.places.numpy(), places])
+        return Particles.on(self.places.device, both, looks[:, :3], looks[:, 3:])
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
         """Lower and upper ends, (3,) each [m]."""

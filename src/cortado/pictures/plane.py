@@ -33,7 +33,7 @@ class PlanePainter:
 
     def image(self, *state: Any) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
-        positions, colours, pose, _ = State(*state)
+        positions, colours, pose = State(*state)[:3]
         own = self if pose is None else PlanePainter(replace(self.stage, solids=shown_solids(pose)))
         return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
 

@@ -17,6 +17,8 @@ FILLED = 0.80
 """The part of the picture's width or height that the container takes."""
 GLASS = (0.40, 0.50, 0.55)
 """Linear, of the walls of a container."""
+GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
+"""Of the lamp in solids, in those that are dull and in mirrors."""
 SOLID_SHADOW = 0.25
 """How much darker paper is behind a solid."""
 BLUR, DROP, AROUND = 0.022, 0.020, 0.12
@@ -190,7 +192,8 @@ class PlaneStage:
     def _body(self, shown: ShownSolid, distance: Points) -> Layer:
         """A solid that fluid flows around, where it is within the container."""
         cover = self._covered(distance)
-        light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming=0.12)
+        gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
+        light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
         opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
         return opacity, opacity * light
 
@@ -205,7 +208,7 @@ class PlaneStage:
         for axis in range(2):
             if container.periodic[axis]:
                 part = part * (beyond[axis] < 0.0)
-        return self._walls(distance, part, np.array(GLASS))
+        return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
         """Walls, by the distance [m] of pixels from their inner side, outwards; ``part``: of them that is there."""

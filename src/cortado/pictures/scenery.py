@@ -32,6 +32,8 @@ class State(NamedTuple):
     """The scene with its solids where they are; where it has them if left out."""
     view: View | None = None
     """Where the camera is; home if left out."""
+    fractions: Points | None = None
+    """(n, phases) by mass, what particles are made of; with one phase left out"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def scenery(home: Stage, state: State, launch: BandLauncher) -> Scenery:
     stage = home.at(state.pose, state.view)
     s, shadow = environment_of(stage), FloorShadow(stage, launch)
     s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
-    particles = particles_of(stage, state.positions, state.colours, launch)
+    particles = particles_of(stage, state.positions, state.colours, launch, state.fractions)
     shadow.of_fluid(particles)
     return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
 
@@ -62,9 +64,13 @@ def _surface(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -
     if stage.picture.surface == "liquid":
         found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch)
         softened = partial(found.softened, launch=launch)
-        return DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
-    balls = spheres(particles.places.numpy(), particles.colours.numpy(), stage.spacing)
-    return DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
+        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
+        surface.lit.media = found.media
+        return surface
+    balls = spheres(particles.places.numpy(), particles.looks.numpy()[:, :3], stage.spacing)
+    surface = DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
+    surface.lit.media.fill_(wp.vec2(*stage.media[0]))
+    return surface
 
 
 def _nothing(stage: Stage, device: Any) -> DeviceSurface:

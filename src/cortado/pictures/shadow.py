@@ -9,7 +9,7 @@ import warp as wp
 from cortado.device.bands import BandLauncher
 from cortado.device.launching import launch as launch_once
 from cortado.discretise.shapes import Points
-from cortado.pictures.particles import Particles
+from cortado.pictures.particles import Look, Particles
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage
@@ -32,7 +32,7 @@ SKY = 0.32
 @wp.kernel(module=MODULE, enable_backward=False)
 def cast(
     places: wp.array(dtype=wp.vec3),
-    colours: wp.array(dtype=wp.vec3),
+    looks: wp.array(dtype=Look),
     volumes: wp.array(dtype=wp.float32),
     corner: wp.vec3,
     cell: wp.float32,
@@ -49,7 +49,7 @@ def cast(
     u = int(wp.floor(x))
     v = int(wp.floor(z))
     if u >= 0 and v >= 0 and u + 1 < thickness.shape[0] and v + 1 < thickness.shape[1]:
-        c = colours[i]
+        c = looks[i]
         above = volumes[i] * wp.exp(-fading * height) / (cell * cell) * wp.vec4(c[0], c[1], c[2], 1.0)
         for n in range(4):
             m = n & 1
@@ -171,7 +171,7 @@ class FloorShadow:
         """(nodes, nodes) of vec4, as `cast` adds it up, blurred by ``soft`` [m]."""
         sharp = wp.zeros((NODES, NODES), dtype=wp.vec4, device=self._device)
         where = {"corner": wp.vec3(*self.corner), "cell": self.cell, "slope": slope, "fading": fading}
-        given = {"places": caster.parts.places, "colours": caster.parts.colours, "volumes": volumes}
+        given = {"places": caster.parts.places, "looks": caster.parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
         sigma = soft / self.cell
         bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)

@@ -8,6 +8,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
+from cortado.scene.materials import Finish
 from cortado.scene.scene import Scene
 
 
@@ -22,12 +23,19 @@ class ShownSolid:
     """(d,) where its middle is [m]"""
     turn: Points
     """(d, d) rotation matrix"""
-    colour: Points
-    """(3,) linear"""
-    transparency: float
-    """From 0 to 1."""
+    finish: Finish
     is_tank: bool
     """Whether fluid is inside of it."""
+
+    @property
+    def colour(self) -> Points:
+        """(3,) linear"""
+        return np.array(self.finish.colour)
+
+    @property
+    def transparency(self) -> float:
+        """From 0 to 1."""
+        return self.finish.transparency
 
     @property
     def body(self) -> Solid:
@@ -55,9 +63,7 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     for table in scene.solid:
         shape, middle = table.shape_about()
         position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
-        clear = table.transparency if table.transparency is not None else float(is_tank)
-        turn, colour = table.turn(scene.dimension), np.array(table.colour)
-        found.append(ShownSolid(table.name, shape, position, turn, colour, clear, is_tank))
+        found.append(ShownSolid(table.name, shape, position, table.turn(scene.dimension), table.finish, is_tank))
     ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
     if ends is None or not lengths.any():
         return tuple(found)

@@ -4,8 +4,18 @@ import warp as wp
 
 from cortado.pictures.container_room import wall_normal, within_walls
 from cortado.pictures.lit_surface import SurfaceHit, at_surface
-from cortado.pictures.pane import Passed, pane, rim_of
-from cortado.pictures.surroundings import CLEAR, FAR, OPAQUE, Environment, mirrored, schlick, sky
+from cortado.pictures.pane import GLASS_EDGE, Passed, pane, rim_of
+from cortado.pictures.surroundings import (
+    CLEAR,
+    FAR,
+    OPAQUE,
+    Environment,
+    mirrored,
+    open_light,
+    schlick,
+    sky,
+    smooth_step,
+)
 
 LAYERS = 8
 """Surfaces of transparent solids that a ray passes at most."""
@@ -60,10 +70,11 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
         return met
     met = at_surface(s.solids.surfaces[OPAQUE], reached.t, d, reached.face, reached.u, reached.v)
     met.is_solid = True
+    met.reflectivity = s.solids.surfaces[OPAQUE].reflectivity[reached.face]
     if reached.is_cut:
         n = wall_normal(s, o + reached.t * d)
         met.normal = wp.where(wp.dot(n, d) > 0.0, -n, n)
-        met.light = 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(met.normal, s.sun), 0.0)
+        met.light = open_light(s, met.normal)
     return met
 
 
@@ -75,7 +86,10 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
     reflectance = 0.6 * glossy * schlick(0.04, -wp.dot(met.normal, d))
     lit = wp.min(wp.max(met.light[0], wp.max(met.light[1], met.light[2])), 1.0)
-    return (1.0 - reflectance) * wp.cw_mul(met.colour, met.light) + reflectance * lit * seen
+    paint = (1.0 - reflectance) * wp.cw_mul(met.colour, met.light) + reflectance * lit * seen
+    if s.has_floor > 0:
+        seen = wp.lerp(seen, s.floor_colour, smooth_step(0.0, 0.25, -r[1]))
+    return wp.lerp(paint, lit * wp.cw_mul(met.colour, seen), met.reflectivity)
 
 
 @wp.func
@@ -97,7 +111,7 @@ def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, sprea
             met = at_surface(s.solids.surfaces[CLEAR], t, d, hit.face, hit.u, hit.v)
             off = s.solids.surfaces[CLEAR].from_edges[hit.face] * wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
             rim = rim_of(wp.min(off[0], wp.min(off[1], off[2])), wp.max(0.006 * s.size, 1.2 * spread * t))
-            passed = pane(s, d, met.normal, rim, 1.0, passed)
+            passed = pane(s, d, met.normal, rim, 1.0, GLASS_EDGE, passed)
             both = s.solids.surfaces[CLEAR].left[hit.face]
             left = wp.where(hit.sign < 0.0, both[0], both[1])
             passed.light += passed.through * (1.0 - left) * wp.cw_mul(met.colour, met.light)

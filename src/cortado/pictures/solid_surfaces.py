@@ -51,6 +51,8 @@ class SolidSurfaces:
             surfaces.append(self._surface(_joined(opaque), opaque))
             lit[0] = surfaces[-1].lit
             found.opaque = lit[0].mesh
+            mirrors = [np.full(len(own.triangles), one.finish.reflectivity) for one, own in opaque]
+            lit[0].reflectivity = wp.array(np.concatenate(mirrors), dtype=wp.float32, device=self._device)
         if clear:
             mesh = _joined(clear)
             surfaces.append(self._surface(mesh, clear))

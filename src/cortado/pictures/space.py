@@ -58,7 +58,7 @@ class SpacePainter:
     def _rays(self, fluid: Scenery) -> Points:
         stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[DeviceSurface]()
         picture = stage.picture
-        seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
+        seen.lit.reach = 2.0 * self.stage.spacing
         seen.lit.is_flat = int(not picture.shaded)
         if self._solids is not None:
             self._solids.cast(fluid.shadow, stage.solids)
@@ -94,10 +94,6 @@ class SpacePainter:
         in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
         found = [wp.array(one, dtype=wp.vec3, device=self.device) for one in (_directions(around), in_lamp)]
         return found[0], found[1]
-
-    @property
-    def _scattering(self) -> float:
-        return self.stage.scattering if self.stage.picture.surface == "liquid" else 1e3 / self.stage.spacing
 
 
 def _in_tiles(columns: int, rows: int) -> np.ndarray:

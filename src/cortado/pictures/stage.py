@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
+from cortado.pictures.media import media_of
 from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
 from cortado.scene.camera_paths import View
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
@@ -49,7 +50,9 @@ class Stage:
     spacing: float
     """[m]"""
     transparency: float
-    """From 0 to 1."""
+    """Of a tenth of what is shown, filled with fluid: from 0 to 1."""
+    media: Points
+    """(phases, 2) scattering and absorption [1/m], as `media_of`"""
     cuts: bool
     """Whether fluid is shown within the container only."""
     solids: tuple[ShownSolid, ...]
@@ -81,14 +84,12 @@ class Stage:
             eye, look_at = eye + frame @ (picture.look_at - origin) - look_at, frame @ (picture.look_at - origin)
         if picture.camera is not None:
             eye = frame @ (picture.camera - origin)
-        transparency = picture.transparency
-        if transparency is None:
-            transparency = 0.0 if several or picture.colour != "phase" else 0.9
+        media, transparency = media_of(scene, float((high - low).max()))
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
         back = eye - look_at
         seen = eye, look_at, float(np.degrees(np.arctan2(back[0], back[2])))
-        own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, cuts, ())
+        own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, media, cuts, ())
         return own.at(scene, None)
 
     @property
@@ -128,12 +129,6 @@ class Stage:
     def size(self) -> float:
         """The longest side of what is shown [m]."""
         return float((self.upper - self.lower).max())
-
-    @property
-    def scattering(self) -> float:
-        """[1/m]; a layer of particles hides what is behind it where the fluid is opaque."""
-        opaque = 3.0 / self.spacing
-        return min(-np.log(self.transparency) / (0.1 * self.size), opaque) if self.transparency else opaque
 
     @property
     def clearness(self) -> float:

@@ -7,6 +7,7 @@ import warp as wp
 
 from cortado.pictures.container_room import room, wall_normal
 from cortado.pictures.lit_surface import LitSurface, SurfaceHit, at_surface
+from cortado.pictures.opaque_walls import wall_hit
 from cortado.pictures.solid_hit import LAYERS, meet_solid, reach_solid
 from cortado.pictures.surroundings import CLEAR, FAR, Environment
 
@@ -171,6 +172,8 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
         elif hit.result:  # the wall comes first; what colour fluid has there does not matter
             met.t = part[1]
             met.normal = -wall_normal(s, o + part[1] * d)
+            if s.has_walls > 0:
+                met = wall_hit(s, part[1], met.normal)
         if has_clear:
             clear = wp.mesh_query_ray(s.solids.clear, o, d, met.t)
             if met.found and clear.result and clear.sign > 0.0:

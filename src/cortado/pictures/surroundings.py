@@ -83,6 +83,12 @@ class Environment:
     """[m]"""
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
+    edge_colour: wp.vec3
+    """Of the container's edges."""
+    has_walls: wp.int32
+    """Whether the container is opaque: one looks into it from outside, and sees its walls from within."""
+    wall_colour: wp.vec3
+    wall_reflectivity: wp.float32
     solids: Solids
 
 
@@ -112,6 +118,12 @@ def sky(s: Environment, d: wp.vec3):
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
     return base + s.lamp * lamp + s.strip * strip
+
+
+@wp.func
+def open_light(s: Environment, normal: wp.vec3):
+    """The light that falls on what nothing lies in the way of."""
+    return 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(normal, s.sun), 0.0)
 
 
 @wp.func

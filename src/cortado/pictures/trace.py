@@ -3,7 +3,8 @@
 A ray that meets the fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid.
 What is refracted goes on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses
 the part 1 - exp(-scattering L), instead of which it gets the colour of the fluid in the light that falls on it,
-and of what remains fluid takes away the colours that it does not have.
+and of what remains the part colour^(absorption L) is left, by Beer and Lambert's law. Fluid is all the way what it is
+where a ray comes into it.
 """
 
 from functools import cache
@@ -12,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.pictures.glass import glass_functions
-from cortado.pictures.lit_surface import LitSurface
+from cortado.pictures.lit_surface import LitSurface, SurfaceHit, medium_at
 from cortado.pictures.solid_hit import meet_solid, reach_solid, shaded_solid
 from cortado.pictures.surface_hit import surface_functions
 from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, shading_module, sky
@@ -20,8 +21,6 @@ from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, s
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index, of water."""
-TINT = wp.constant(wp.float32(2.6))
-"""How much sooner light takes the colour of the fluid than it is scattered."""
 
 
 @wp.struct
@@ -48,6 +47,13 @@ def toned(colour: wp.vec3):
     return found
 
 
+@wp.func
+def tinted(colour: wp.vec3, taken: wp.float32):
+    """What is left of white light where fluid of a colour takes away the others, up to the colour itself at 1."""
+    base = wp.vec3(wp.max(colour[0], 0.02), wp.max(colour[1], 0.02), wp.max(colour[2], 0.02))
+    return wp.vec3(wp.pow(base[0], taken), wp.pow(base[1], taken), wp.pow(base[2], taken))
+
+
 @cache
 def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     """The kernel that traces rays, where there are opaque or transparent solids, or none, which takes no time then."""
@@ -62,8 +68,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         surface: LitSurface,
         start: wp.vec3,
         direction: wp.vec3,
-        colour: wp.vec3,
-        light: wp.vec3,
+        entered: SurfaceHit,
         spread: wp.float32,
     ):
         """Light that comes out of the fluid against a ray that was refracted into it."""
@@ -71,22 +76,18 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         through = wp.vec3(1.0)
         o = start
         d = direction
-        c = colour
-        lit = light
+        c = entered.colour
+        lit = entered.light
+        medium = medium_at(surface, entered)
         inside = wp.bool(True)
         for _ in range(SEGMENTS):
             if inside:
                 met = leave(s, surface, o, d)
-                left = wp.exp(-surface.scattering * met.t)
+                left = wp.exp(-medium[0] * met.t)
                 soft = 0.55 * lit + wp.vec3(0.40)
                 found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
-                taken = surface.scattering * met.t * TINT
-                tint = wp.vec3(
-                    wp.pow(wp.max(c[0], 0.02), taken),
-                    wp.pow(wp.max(c[1], 0.02), taken),
-                    wp.pow(wp.max(c[2], 0.02), taken),
-                )
-                through = wp.cw_mul(through, tint) * left
+                taken = medium[1] * met.t
+                through = wp.cw_mul(through, tinted(c, taken)) * left
                 if met.is_solid:
                     return found + wp.cw_mul(through, shaded_solid(s, met, d, 0.0))
             else:
@@ -115,12 +116,14 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                 through = through * (1.0 - reflectance)
                 c = met.colour
                 lit = met.light
+                medium = medium_at(surface, met)
                 sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
                 d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
                 o = p - s.nearest * n
                 inside = True
         if inside:
-            return found + wp.cw_mul(through, wp.cw_mul(c, lit))
+            kept = tinted(c, wp.min(medium[1] * s.size, 1.0))  # it goes on to and fro
+            return found + wp.cw_mul(through, wp.cw_mul(kept, lit))
         return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
 
     @wp.func
@@ -170,7 +173,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
             reflected = background(s, shadow, start, r, spread)
         sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
         refracted = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
-        body = within(s, shadow, surface, p - s.nearest * n, refracted, met.colour, met.light, spread)
+        body = within(s, shadow, surface, p - s.nearest * n, refracted, met, spread)
         passed = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
         return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
 

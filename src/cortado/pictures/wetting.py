@@ -7,9 +7,10 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
+from cortado.discretise.shapes import Points
 from cortado.pictures.marked import last_of
 from cortado.pictures.mirrored import mirrored
-from cortado.pictures.particles import MODULE, Particles
+from cortado.pictures.particles import MODULE, Look, Particles
 from cortado.pictures.stage import Stage
 from cortado.pictures.surroundings import GLASS_BOX, Environment
 
@@ -24,9 +25,13 @@ def turn(first: wp.int32, frame: wp.mat33, places: wp.array(dtype=wp.vec3)):
     places[i] = frame * places[i]
 
 
-def particles_of(stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher) -> Particles:
-    """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3)."""
-    found = Particles.on(launch.device, np.subtract(positions, stage.origin), colours)
+def particles_of(
+    stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
+) -> Particles:
+    """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3) and mass fractions (n, phases), even
+    ones if left out."""
+    media = stage.media.mean(axis=0) if fractions is None else np.clip(fractions, 0.0, 1.0) @ stage.media
+    found = Particles.on(launch.device, np.subtract(positions, stage.origin), colours, media)
     launch(turn, len(found), frame=wp.mat33(*stage.frame.ravel()), places=found.places)
     return found
 
@@ -91,10 +96,10 @@ def list_images(
     s: Environment,
     spacing: wp.float32,
     places: wp.array(dtype=wp.vec3),
-    colours: wp.array(dtype=wp.vec3),
+    looks: wp.array(dtype=Look),
     counts: wp.array(dtype=wp.int32),
     image_places: wp.array(dtype=wp.vec3),
-    image_colours: wp.array(dtype=wp.vec3),
+    image_looks: wp.array(dtype=Look),
 ):
     """``counts``: of those up to each particle."""
     i = first + wp.tid()
@@ -111,7 +116,7 @@ def list_images(
             way = image_along(s, q, 0, a, spacing) + image_along(s, q, 1, b, spacing)
             way += image_along(s, q, 2, c, spacing)
             image_places[n] = wp.transpose(s.glass_frame) * (q + way)
-            image_colours[n] = colours[i]
+            image_looks[n] = looks[i]
             n += 1
 
 
@@ -124,12 +129,12 @@ def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) ->
         particles = particles.and_images(images, of)
     if not stage.cuts:
         return particles
-    own, given = {"s": s, "spacing": stage.spacing}, {"places": particles.places, "colours": particles.colours}
+    own, given = {"s": s, "spacing": stage.spacing}, {"places": particles.places, "looks": particles.looks}
     counts = wp.empty(len(particles), dtype=wp.int32, device=particles.places.device)
     launch(count_images, len(particles), **own, places=particles.places, counts=counts)
     wp.utils.array_scan(counts, counts)
     total = last_of(counts)
-    found = Particles(*(wp.empty(total, dtype=wp.vec3, device=counts.device) for _ in range(2)))
-    filled = {"image_places": found.places, "image_colours": found.colours}
+    found = Particles(*(wp.empty(total, dtype=one, device=counts.device) for one in (wp.vec3, Look)))
+    filled = {"image_places": found.places, "image_looks": found.looks}
     launch(list_images, len(particles), **own, **given, counts=counts, **filled)
     return found

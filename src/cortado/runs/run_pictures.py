@@ -75,7 +75,8 @@ def run_page(
         if picture.camera_path is not None and isinstance(draws, SpacePainter):
             home = draws.stage.home_around if picture.camera_path.goes_around else draws.stage.home
             view = picture.camera_path.view(home, _moment(scene, trajectory, motions, k))
-        return State(frame.positions[shown], colours[shown], pose, view)
+        fractions = None if frame.mass_fractions is None else frame.mass_fractions[shown]
+        return State(frame.positions[shown], colours[shown], pose, view, fractions)
 
     composed = alone if scale is None else partial(_beside, scale)
     return Page(draws, [state], composed, _fingerprint(scene, trajectory))

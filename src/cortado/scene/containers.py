@@ -15,8 +15,9 @@ from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
 from cortado.discretise.walls.short_box import ShortBox
 from cortado.errors import Words
-from cortado.scene.fields import FieldPath, Flag, Length, Vector, field_error, quantity
+from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.scene.materials import FINISHES, Finish
 from cortado.scene.tables import Table
 
 
@@ -27,6 +28,15 @@ class Container(Table):
     def sticks(self) -> bool:
         """Whether its walls have no slip."""
         return getattr(self, "slip", "free") == "no"
+
+    @property
+    def finish(self) -> Finish | None:
+        """What its walls look like; None if the scene says nothing of it."""
+        material, colour = getattr(self, "material", None), getattr(self, "colour", None)
+        if material is None:
+            return None if colour is None else Finish(colour)
+        own = FINISHES[material]
+        return own if colour is None else replace(own, colour=colour)
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
@@ -103,6 +113,11 @@ class BoxContainer(Container):
     """(d,) Whether what leaves on one side of an axis comes back on the other."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
+    material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
+    """What it looks like in pictures; clear glass if left out."""
+    colour: Colour | None = None
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. Without a material the walls are
+    painted in it, and not clear."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -153,6 +168,11 @@ class CylinderContainer(Container):
     """Whether it is closed on top; without a lid, fluid may be above the rim."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
+    material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
+    """What it looks like in pictures; clear glass if left out."""
+    colour: Colour | None = None
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. Without a material the walls are
+    painted in it, and not clear."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         refuse_plane(dimension, path, '"box" or "none"')

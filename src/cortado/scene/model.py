@@ -10,8 +10,9 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
-from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
+from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.filled_shapes import AnyFluid
+from cortado.scene.materials import LIQUIDS, Coloured
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.package_tables import AnyForces
 from cortado.scene.parameters.registry import PARAMETERS
@@ -50,8 +51,11 @@ class DiscretisationTable(Table):
         return self.support * self.spacing
 
 
-class Phase(Table):
-    """A material."""
+class Phase(Coloured):
+    """A fluid."""
+
+    materials: ClassVar = LIQUIDS
+    plain: ClassVar = (0.1, 0.3, 0.8)
 
     name: Text
     """What bodies of fluid call it."""
@@ -61,8 +65,12 @@ class Phase(Table):
     """Dynamic viscosity [Pa s]."""
     rheology: AnyRheology | None = None
     """How the viscosity depends on the shear rate; not at all if left out."""
-    colour: Colour = (0.1, 0.3, 0.8)
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5."""
+    material: Annotated[str, OneOf(tuple(LIQUIDS))] | None = None
+    """What it looks like in pictures: its colour, and how far one sees into it. Nothing that is computed depends on
+    it."""
+    colour: Colour | None = None
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5. That of
+    the material if left out, or [0.1, 0.3, 0.8] without one."""
 
 
 class FixedForces(Table):

@@ -53,20 +53,22 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def to_json(self) -> str:
-        """The scene with all defaults filled in, to be read by `from_json`."""
+        """The scene with all defaults filled in but colours, which materials may have, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]] or [[solid]], a jitter of 0, the
-        form of a surface tension that is not there, how a time step is chosen that is fixed, and a shifting that is
-        off."""
+        """What results depend on: not [picture], [[sensor]] and materials, nor an empty [[force]] or [[solid]], a
+        jitter of 0, the form of a surface tension that is not there, how a time step is chosen that is fixed, and a
+        shifting that is off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid") if not getattr(self, name)}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
         aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         aside["solver"] = unused if getattr(self.solver, "shifting", True) else unused | {"shifting"}
-        return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
+        aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}
+        aside["container"] = {"material", "colour"}
+        return json.dumps(self.model_dump(mode="json", exclude=aside, context="colours"), indent=2)
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":

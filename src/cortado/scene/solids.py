@@ -1,8 +1,9 @@
 """Solids, which fluid flows around or is held by: what all have, whatever their shape."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,16 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.containers import Container
-from cortado.scene.fields import MISSING, Colour, FieldPath, Length, Text, field_error, quantity
-from cortado.scene.tables import Table
+from cortado.scene.fields import MISSING, Colour, FieldPath, Length, OneOf, Text, field_error, quantity
+from cortado.scene.materials import FINISHES, Coloured, Finish
 from cortado.scene.turns import Rotation, Turning, check_turn, rotation_matrix
 
 
-class SolidTable(Table):
+class SolidTable(Coloured):
     """What fluid cannot enter."""
+
+    materials: ClassVar = FINISHES
+    plain: ClassVar = (0.55, 0.55, 0.58)
 
     name: Text
     """What others call it."""
@@ -51,10 +55,22 @@ class SolidTable(Table):
     """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and solid; "free": it does not."""
-    colour: Colour = (0.55, 0.55, 0.58)
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light."""
+    material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
+    """What it looks like in pictures: its colour, how clear it is, and how much it is a mirror."""
+    colour: Colour | None = None
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. That of the material if left
+    out, or [0.55, 0.55, 0.58] without one."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """The part of the light that goes through it in pictures, from 0 to 1; if left out 0, or 1 if fluid is inside."""
+    """The part of the light that goes through it in pictures, from 0 to 1; if left out that of the material, and
+    without one 0, or 1 if fluid is inside."""
+
+    @property
+    def finish(self) -> Finish:
+        """What its surface looks like."""
+        plain = Finish(self.plain, transparency=float(self.side == "inside"))
+        own = plain if self.material is None else FINISHES[self.material]
+        clear = own.transparency if self.transparency is None else self.transparency
+        return replace(own, colour=self.colour or own.colour, transparency=clear)
 
     @property
     def sticks(self) -> bool:

@@ -96,4 +96,5 @@ def _state(made: Setup, run: Run, step: int) -> State:
     colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
     emitted = state.state["emitted"].numpy() if "emitted" in state.state.names else None
     out = is_out(made.task.scene, emitted, len(colours))
-    return State(state.positions[out], colours[out])
+    fractions = None if state.mass_fractions is None else state.mass_fractions[out]
+    return State(state.positions[out], colours[out], fractions=fractions)
