@@ -116,7 +116,7 @@ def test_searches_can_be_compared_too(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["one"], "RUN is missing"),
+        (["one"], "RUN|DATA.csv is missing"),
         (["one", "absent"], "There is no run in "),
         (["one", "."], "There is no run in "),
         (["scene.toml", "one"], "There is no run in "),

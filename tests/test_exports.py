@@ -15,7 +15,7 @@ from cortado.runs.exports import by_vtk
 from cortado.runs.exports.by_usd import time_codes
 from cortado.runs.exports.export import FORMATS
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.solid_motion import SolidMotion
+from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
 from full_disk import largest_file
 
@@ -74,7 +74,7 @@ def trajectory():
         diagnostics={"converged": np.ones(1000, dtype=bool)},
         mass_fractions=fractions,
         quantities={"density": np.full(positions.shape[:2], 950.0, np.float32)},
-        solids={"my rotor": motion},
+        solids=SolidMotions({"my rotor": motion}),
         scene=scene(),
     )
 
@@ -272,7 +272,7 @@ def test_a_dataset_has_names_and_units(tmp_path):
     assert rotor["solid_velocity"].isnull().all() and rotor["solid_rotation"].attrs["units"] == "rad"
     motion = trajectory().solids["my rotor"]
     raft = replace(motion, velocities=motion.positions + 1.0, angular_velocities=motion.rotations)
-    both = replace(trajectory(), solids={"raft": raft, "my rotor": motion}).to_xarray()["solid_velocity"]
+    both = replace(trajectory(), solids=SolidMotions({"raft": raft, "my rotor": motion})).to_xarray()["solid_velocity"]
     np.testing.assert_array_equal(both.sel(solid="raft"), motion.positions + 1.0)
     assert both.sel(solid="my rotor").isnull().all()
     found.to_netcdf(tmp_path / "run.nc")

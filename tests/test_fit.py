@@ -292,7 +292,7 @@ TIMES = [0.0, 0.01, 0.02, 0.03]
         ),
         (lambda s: measured.Experiment(s, {}), "observations is empty"),
         (lambda s: cortado.fit([], {"viscosity": 1.0}), "experiments is empty"),
-        (lambda s: cortado.fit("experiment", {"viscosity": 1.0}), "must be made of"),
+        (lambda s: cortado.fit("experiment", {"viscosity": 1.0}), "must be a cortado.measured.Experiment, or a list"),
     ],
 )
 def test_a_mistake_is_a_sentence(make, words, simulation):

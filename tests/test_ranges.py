@@ -109,7 +109,8 @@ class Weighed:
 class Seen(Weighed):
     """A linear loss of quantities that are sums over neighbours too."""
 
-    def __init__(self, simulation, names=("vorticity", "wall_force")):
+    def __init__(self, simulation):
+        names = ["vorticity", "wall_force", *(f"{solid.name}.load" for solid in simulation.scene.solid)]
         random, first = np.random.default_rng(9), {name: simulation.quantity(name) for name in names}
         self.weights = {name: random.standard_normal(array.shape) for name, array in first.items()}
 

@@ -80,7 +80,7 @@ def test_the_site_is_made_after_what_it_needs_is_installed(monkeypatch, capsys):
 @pytest.mark.parametrize("arguments", [[], ["walk"]])
 def test_an_unknown_task_is_told(arguments):
     done = subprocess.run([sys.executable, "-m", "tasks", *arguments], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, demo, lint" in done.stderr
+    assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, test-all, demo, lint" in done.stderr
 
 
 @pytest.mark.parametrize("newer", ["pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"])

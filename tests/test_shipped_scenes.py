@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortado.cli.commands.new import new_scene
+from cortado.cli.commands.new import new_scene, templates
 from cortado.errors import CortadoWarning
 from cortado.optimisation.inverse.task import load_task
 from cortado.rollout.parameter_checks import unstable_sentence
@@ -30,9 +30,9 @@ def test_no_scene_is_warned_of(path):
     loaded(path)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_no_new_scene_is_warned_of(tmp_path, dimension):
-    new_scene(tmp_path / "scene.toml", dimension)
+@pytest.mark.parametrize(("template", "dimension"), [("dam", 2), ("dam", 3), *((one, None) for one in templates()[1:])])
+def test_no_new_scene_is_warned_of(tmp_path, template, dimension):
+    new_scene(tmp_path / "scene.toml", template, dimension)
     loaded(tmp_path / "scene.toml")
 
 

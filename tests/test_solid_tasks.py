@@ -66,5 +66,5 @@ def test_a_task_searches_a_path_by_its_knots(tmp_path):
 def test_a_task_offers_what_its_solids_have(tmp_path):
     file = tmp_path / "task.toml"
     file.write_text(TASK.replace("rotor.turn", "rotor.turning"))
-    with pytest.raises(SceneError, match=r"'rotor\.turning' is unknown, but must be one of .*, rotor\.turn\."):
+    with pytest.raises(SceneError, match=r"'rotor\.turning' is unknown, but must be one of .*, rotor\.turn, "):
         load_task(file)

@@ -35,7 +35,7 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
         plain = min(-np.log(transparency) / (SPAN * size), plain)
     media = [(one.scattering, one.absorption) if one else (plain, TINT * plain) for one in liquids]
     through = [
-        float(np.exp(-SPAN * size * one.scattering) * np.mean(np.power(phase.colour, SPAN * size * one.absorption)))
+        float(np.exp(-SPAN * size * one.scattering) * np.mean(np.array(phase.colour) ** (SPAN * size * one.absorption)))
         if one
         else transparency
         for one, phase in zip(liquids, scene.phase, strict=True)
