@@ -26,6 +26,7 @@ SPACINGS = {
     "long_dam_break": 0.05,
     "match_image": 0.061,
     "match_image_fractions": 0.1,
+    "materials": 0.02,
     "pour": 0.007,
     "recover_gravity": 0.25,
     "recover_gravity_small": 0.25,
