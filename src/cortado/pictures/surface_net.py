@@ -164,6 +164,18 @@ def list_triangles(
             side += 1
 
 
+@wp.func
+def sum_beside(beside: Neighbours, values: wp.array(dtype=wp.vec3)):
+    """The sum of values of the neighbours of a corner, and how many it has."""
+    total = wp.vec3(0.0)
+    count = wp.float32(0.0)
+    for k in range(6):
+        if beside[k] >= 0:
+            total += values[beside[k]]
+            count += 1.0
+    return total, count
+
+
 @wp.kernel(module=MODULE, enable_backward=False)
 def smooth(
     first: wp.int32,
@@ -174,13 +186,7 @@ def smooth(
 ):
     """Towards the mean of neighbours."""
     v = first + wp.tid()
-    beside = neighbours[v]
-    total = wp.vec3(0.0)
-    count = wp.float32(0.0)
-    for k in range(6):
-        if beside[k] >= 0:
-            total += values[beside[k]]
-            count += 1.0
+    total, count = sum_beside(neighbours[v], values)
     found[v] = wp.lerp(values[v], total / wp.max(count, 1.0), wp.where(count > 0.0, weights[v], 0.0))
 
 
@@ -222,11 +228,7 @@ def smooth_normals(
     found: wp.array(dtype=wp.vec3),
 ):
     v = first + wp.tid()
-    beside = neighbours[v]
-    total = wp.vec3(0.0)
-    for k in range(6):
-        if beside[k] >= 0:
-            total += normals[beside[k]]
+    total, _count = sum_beside(neighbours[v], normals)
     if wp.length_sq(total) == 0.0:
         total = normals[v]
     found[v] = wp.normalize(total)
