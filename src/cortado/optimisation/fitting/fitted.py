@@ -9,11 +9,14 @@ import numpy as np
 from cortado.arrays import as_one_number
 from cortado.errors import InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.least_squares import LeastSquares, Part, Weighting
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
+from cortado.optimisation.fitting.search import search
 from cortado.scene.parameters.values import UNITS
 
 ALIKE = 0.9
 """Two numbers whose estimates are correlated by more are not told apart."""
+NEARLY = 0.01
+"""In squared standard errors: a point of a profile ends where a step lowers the sum of squares by less."""
 OF_VIEWS = {
     "translation": "m",
     "rotation": "rad",
@@ -90,9 +93,11 @@ class Fit:
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
+    at: Linearised | None = field(default=None, repr=False)
+    """The end of the search, with the Jacobian that the bars come from; neither is pickled."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "problem": None}
+        return {**self.__dict__, "problem": None, "at": None}
 
     @property
     def values(self) -> dict[str, Any]:
@@ -152,7 +157,7 @@ class Fit:
         """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
         parabola of a linear model, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
         `InputError`."""
-        if label not in self.labels or self.problem is None:
+        if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
         V = self.coordinate_covariance
@@ -162,8 +167,9 @@ class Fit:
         for shift in shifts:
             begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
             begun[k] = self.u[k] + shift
-            ended, _ = self.problem.solve(begun, weights, 2, fixed=[k])
-            squares = self.problem.sum_of_squares(self.problem.residuals(ended), weights)
+            at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
+            ended = search(self.problem, at, weights, 2, NEARLY / self.sum_of_squares, fixed=[k])
+            squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.step.gain
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])

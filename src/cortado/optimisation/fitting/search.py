@@ -1,0 +1,143 @@
+"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs correct."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+
+NEAR = 1e-6
+"""A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
+GREATEST_LOGARITHM = 1.0
+"""Of one step: a positive number changes by a factor of e at most."""
+LEAST_DAMPING = 0.01
+"""After a step that led up, relative to the Hessian's diagonal; ten times as much after each further one."""
+
+NEARBY = 9.0
+"""In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
+ONE_BAR = 1.0
+"""In squared standard errors: a step by tangents that is shorter leads to the end, to some hundredths of one."""
+MOST_JACOBIANS = 4
+"""By tangents."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of Gauss and Newton, within bounds."""
+
+    shift: np.ndarray
+    """(free,) of the coordinates."""
+    gain: float
+    """By how much it lowers the sum of squares of the linear model."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """Where a search ended."""
+
+    at: Linearised
+    """The last point that was run; its Jacobian is an estimate."""
+    step: Step
+    """The next one, which was not taken."""
+    converged: bool
+
+
+def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
+    """Where the sum of squares is least, by a search that ends near, tangents there and their last step; and whether
+    they were near enough."""
+    for _ in range(MOST_JACOBIANS):
+        enough = NEARBY / problem.sum_of_squares(at.residuals, weights)
+        found = search(problem, at, weights, trials, enough)
+        try:
+            at = problem.linearised(np.clip(found.at.u + found.step.shift, *problem.coordinates.bounds))
+        except DivergedError:
+            at = problem.linearised(found.at.u)
+        last = next_step(problem, at, weights)
+        if last.gain <= ONE_BAR or not found.converged:
+            break
+    residuals = [r + J @ last.shift for r, J in zip(at.residuals, at.jacobians, strict=True)]
+    return Linearised(at.u + last.shift, residuals, at.jacobians), last.gain <= ONE_BAR
+
+
+def search(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    trials: int,
+    enough: float,
+    fixed: Sequence[int] = (),
+) -> Searched:
+    """Lower the sum of the squared residuals, from a point whose Jacobian may be an estimate, until a step is predicted
+    to lower it by a share of at most ``enough``, with the coordinates of some numbers ``fixed``.
+
+    After each trial point, which takes one forward run, the Jacobian is corrected by what the residuals did (Broyden
+    1965). A trial point that is no lower, or where the run diverges, has it estimated anew, and then steps are damped
+    (Levenberg 1944, Marquardt 1963).
+    """
+    fresh, damping, lowest = True, 0.0, problem.sum_of_squares(at.residuals, weights)
+    for _ in range(trials):
+        step = next_step(problem, at, weights, damping, fixed)
+        if step.gain <= enough * lowest or np.abs(step.shift).max() <= NEAR * (NEAR + np.abs(at.u).max()):
+            return Searched(at, step, True)
+        point = np.clip(at.u + step.shift, *problem.coordinates.bounds)
+        try:
+            residuals = problem.residuals(point)
+            squares = problem.sum_of_squares(residuals, weights)
+        except DivergedError:
+            squares = np.inf
+        if squares < lowest:
+            at, lowest, fresh = corrected(problem, at, weights, point, residuals), squares, False
+            damping = damping / 10.0 if damping > LEAST_DAMPING else 0.0
+        elif not fresh:
+            at, fresh = problem.estimated(at.u), True
+        else:
+            damping = max(10.0 * damping, LEAST_DAMPING)
+    return Searched(at, next_step(problem, at, weights, 0.0, fixed), False)
+
+
+def next_step(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    damping: float = 0.0,
+    fixed: Sequence[int] = (),
+) -> Step:
+    """That minimises the sum of squares of the linear model, within the bounds."""
+    from scipy.optimize import lsq_linear
+
+    free = np.setdiff1d(np.arange(len(at.u)), fixed)
+    if not len(free):
+        return Step(np.zeros(len(at.u)), 0.0)
+    J, r = problem.stacked(at, weights)
+    reduced: Any = np.linalg.qr(np.column_stack([J[:, free], r]), mode="r")
+    R, q = reduced[:, :-1], reduced[:, -1]
+    damped = np.vstack([R, np.diag(np.sqrt(damping) * np.linalg.norm(R, axis=0))])
+    reach = np.where(problem.coordinates.logarithmic[problem.coordinates.free], GREATEST_LOGARITHM, np.inf)
+    lower, upper = problem.coordinates.bounds
+    ends = np.maximum(lower - at.u, -reach)[free], np.minimum(upper - at.u, reach)[free]
+    shift = np.zeros(len(at.u))
+    shift[free] = lsq_linear(damped, np.append(-q, np.zeros(len(free))), ends, method="bvls").x
+    return Step(shift, float((q**2).sum() - ((R @ shift[free] + q) ** 2).sum()))
+
+
+def corrected(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    u: np.ndarray,
+    residuals: list[np.ndarray],
+) -> Linearised:
+    """At another point, with the Jacobian that is nearest to the old one of those that lead from the old residuals to
+    the new ones: Broyden's update, in the metric of the Hessian, which knows no units of coordinates."""
+    J, _ = problem.stacked(at, weights)
+    shift = u - at.u
+    along = J.T @ (J @ shift)
+    along = along / max(float(shift @ along), 1e-300)
+    jacobians = [
+        J + (new - old - J @ shift)[..., None] * along
+        for J, old, new in zip(at.jacobians, at.residuals, residuals, strict=True)
+    ]
+    return Linearised(u, residuals, jacobians)
