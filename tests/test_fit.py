@@ -1,5 +1,7 @@
 """Fits of measured experiments: error bars that hold the truth, tangents that are right, and mistakes in sentences."""
 
+from html import escape
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -235,6 +237,32 @@ def test_bars_of_fits_hold_the_truth_where_counted_ones_do_not(shaken):
     assert 0.2 < np.mean((off / bars) ** 2) < 3.0
     assert np.mean((off / counted) ** 2) > 4.0
     assert all(one.intervals()["viscosity"][0] < TRUE < one.intervals()["viscosity"][1] for one in fits)
+
+
+def test_a_fit_in_float32_is_that_in_float64(shaken):
+    tracers = shaken.observations["tracers"]
+    times, first = tracers.times, shaken.simulation.positions[::3]
+    single = cortado.Simulation(SCENE, precision="float32")
+    noisy = with_shake(shaken, 0).observations["tracers"].measured
+    tracks = measured.Tracks(single, first, times, noisy.reshape(len(times), -1, 2))
+    both = [
+        cortado.fit(one, {"viscosity": 1.5})
+        for one in (measured.Experiment(single, {"tracers": tracks}), shaken.measured_again({"tracers": noisy}))
+    ]
+    off = both[0].values["viscosity"] - both[1].values["viscosity"]
+    assert abs(off) < 0.1 * both[1].standard_errors["viscosity"]
+    assert both[0].standard_errors["viscosity"] == pytest.approx(both[1].standard_errors["viscosity"], rel=0.01)
+    assert both[0].converged
+
+
+def test_a_notebook_shows_numbers_with_bars_and_doubts(shaken):
+    found = cortado.fit(
+        with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
+    )
+    page = found._repr_html_()
+    assert "Pa s" in page and "±" in page and "data:image/png;base64," in page
+    assert escape(found.doubts[0]) in page and page.count("<tr>") == 2
+    assert repr(found).startswith("Fit(viscosity ") and "±" in repr(found)
 
 
 def test_two_experiments_tell_more_than_one(shaken):

@@ -67,6 +67,24 @@ class Profile:
     """(points,) the same of a model that is linear, from which the intervals come."""
 
 
+@dataclass(frozen=True)
+class FittedNumber:
+    """One of the numbers that were searched."""
+
+    label: str
+    start: float
+    value: float
+    error: float
+    """Standard error."""
+    lower: float
+    upper: float
+
+    @property
+    def words(self) -> str:
+        """Such as "viscosity 2.63 ± 0.05 Pa s"."""
+        return f"{self.label.replace('_', ' ')} {with_error(self.value, self.error)}{_unit(self.label)}"
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters that were fitted to experiments, with their error bars."""
@@ -174,22 +192,41 @@ class Fit:
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
-    def lines(self, confidence: float = 0.95) -> list[str]:
-        """One for each number: its value, its standard error, and its interval."""
+    def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
+        """Those that were searched, with the intervals of `intervals`."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
-        numbers, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        values, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        each = zip(self.labels, self.coordinates.at_start[free], values, errors, lower, upper, strict=True)
+        return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
+
+    def lines(self, confidence: float = 0.95) -> list[str]:
+        """One for each number: its value, its standard error, and its interval."""
         return [
-            f"{label.replace('_', ' ')} {with_error(value, error)}{_unit(label)} "
-            f"({100 * confidence:g} % between {a:.4g} and {b:.4g})"
-            for label, value, error, a, b in zip(self.labels, numbers, errors, lower, upper, strict=True)
+            f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
+            for one in self.numbers(confidence)
         ]
 
+    def __repr__(self) -> str:
+        ended = "" if self.converged else "; not converged"
+        return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
+
+    def _repr_html_(self) -> str:
+        """With a table of the numbers, what is doubted, and residuals over time."""
+        from cortado.optimisation.fitting.fit_page import fit_page
+
+        return fit_page(self)
+
     def __str__(self) -> str:
-        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})" for a, b, c in self.not_told_apart]
+        return "\n".join([*self.lines(), *self.cautions])
+
+    @property
+    def cautions(self) -> list[str]:
+        """Sentences: what is not told apart, whether it ended too early, and the doubts."""
+        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
-        return "\n".join([*self.lines(), *apart, *ended, *self.doubts])
+        return [*apart, *ended, *self.doubts]
 
 
 def with_error(value: float, error: float) -> str:
