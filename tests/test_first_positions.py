@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-import cortado
-
 jax = pytest.importorskip("jax", reason="JAX is not installed", exc_type=ImportError)
 
 
