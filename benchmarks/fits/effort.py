@@ -12,7 +12,7 @@ import cortado
 from cortado import measured
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
-from cortado.optimisation.fitting.search import next_step, search
+from cortado.optimisation.fitting.search import next_point, search
 
 from .cases import STEPS, TIME_STEP, video
 
@@ -93,7 +93,7 @@ class Searches:
         at = traced.estimated(coordinates.start)
         for _ in range(10):
             found = search(traced, at, self.weights, 1, 0.0)
-            traced.note(np.clip(found.at.u + found.step.shift, *coordinates.bounds))  # known without a run
+            traced.note(found.next)  # known without a run
             at = found.at
         return traced.reached
 
@@ -167,7 +167,7 @@ def _pairs(coordinates: Coordinates) -> list[tuple[np.ndarray, np.ndarray]]:
 def minimise(problem: LeastSquares, u: np.ndarray, weights: Sequence[Weighting]) -> np.ndarray:
     """The least sum of squares, by Gauss and Newton with tangents at every point."""
     for _ in range(6):
-        u = u + next_step(problem, problem.linearised(u), weights).shift
+        u, _ = next_point(problem, problem.linearised(u), weights)
     return u
 
 

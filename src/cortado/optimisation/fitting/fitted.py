@@ -187,7 +187,7 @@ class Fit:
             begun[k] = self.u[k] + shift
             at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
             ended = search(self.problem, at, weights, 2, NEARLY / self.sum_of_squares, fixed=[k])
-            squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.step.gain
+            squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.gain
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])

@@ -18,20 +18,12 @@ LEAST_DAMPING = 0.01
 
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
+ENOUGH = 0.01
+"""The same of the end: a tenth of a standard error."""
 ONE_BAR = 1.0
-"""In squared standard errors: a step by tangents that is shorter leads to the end, to some hundredths of one."""
+"""The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
 MOST_JACOBIANS = 4
 """By tangents."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of Gauss and Newton, within bounds."""
-
-    shift: np.ndarray
-    """(free,) of the coordinates."""
-    gain: float
-    """By how much it lowers the sum of squares of the linear model."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +32,30 @@ class Searched:
 
     at: Linearised
     """The last point that was run; its Jacobian is an estimate."""
-    step: Step
-    """The next one, which was not taken."""
+    next: np.ndarray
+    """(free,) where the next step leads, which was not run."""
+    gain: float
+    """By how much that lowers the sum of squares of the linear model."""
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
-    """Where the sum of squares is least, by a search that ends near, tangents there and their last step; and whether
-    they were near enough."""
+    """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found: a search
+    up to where its estimate of the Jacobian serves, tangents, and a search from there with these."""
     for _ in range(MOST_JACOBIANS):
-        enough = NEARBY / problem.sum_of_squares(at.residuals, weights)
-        found = search(problem, at, weights, trials, enough)
+        squares = problem.sum_of_squares(at.residuals, weights)
+        found = search(problem, at, weights, trials, NEARBY / squares)
         try:
-            at = problem.linearised(np.clip(found.at.u + found.step.shift, *problem.coordinates.bounds))
+            exact = problem.linearised(found.next)
         except DivergedError:
-            at = problem.linearised(found.at.u)
-        last = next_step(problem, at, weights)
-        if last.gain <= ONE_BAR or not found.converged:
+            exact = problem.linearised(found.at.u)
+        found = search(problem, exact, weights, trials, ENOUGH / squares)
+        at, (J, _) = found.at, problem.stacked(exact, weights)
+        is_near = bool(((J @ (found.next - exact.u)) ** 2).sum() <= ONE_BAR)
+        if is_near or not found.converged:
             break
-    residuals = [r + J @ last.shift for r, J in zip(at.residuals, at.jacobians, strict=True)]
-    return Linearised(at.u + last.shift, residuals, at.jacobians), last.gain <= ONE_BAR
+    residuals = [r + J @ (found.next - at.u) for r, J in zip(at.residuals, at.jacobians, strict=True)]
+    return Linearised(found.next, residuals, exact.jacobians), found.converged and is_near
 
 
 def search(
@@ -79,10 +75,9 @@ def search(
     """
     fresh, damping, lowest = True, 0.0, problem.sum_of_squares(at.residuals, weights)
     for _ in range(trials):
-        step = next_step(problem, at, weights, damping, fixed)
-        if step.gain <= enough * lowest or np.abs(step.shift).max() <= NEAR * (NEAR + np.abs(at.u).max()):
-            return Searched(at, step, True)
-        point = np.clip(at.u + step.shift, *problem.coordinates.bounds)
+        point, gain = next_point(problem, at, weights, damping, fixed)
+        if gain <= enough * lowest or np.abs(point - at.u).max() <= NEAR * (NEAR + np.abs(at.u).max()):
+            return Searched(at, point, gain, True)
         try:
             residuals = problem.residuals(point)
             squares = problem.sum_of_squares(residuals, weights)
@@ -95,22 +90,22 @@ def search(
             at, fresh = problem.estimated(at.u), True
         else:
             damping = max(10.0 * damping, LEAST_DAMPING)
-    return Searched(at, next_step(problem, at, weights, 0.0, fixed), False)
+    return Searched(at, *next_point(problem, at, weights, 0.0, fixed), False)
 
 
-def next_step(
+def next_point(
     problem: LeastSquares,
     at: Linearised,
     weights: Sequence[Weighting],
     damping: float = 0.0,
     fixed: Sequence[int] = (),
-) -> Step:
-    """That minimises the sum of squares of the linear model, within the bounds."""
+) -> tuple[np.ndarray, float]:
+    """Where the sum of squares of the linear model is least, within the bounds, and by how much it is lower there."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
     if not len(free):
-        return Step(np.zeros(len(at.u)), 0.0)
+        return at.u, 0.0
     J, r = problem.stacked(at, weights)
     reduced: Any = np.linalg.qr(np.column_stack([J[:, free], r]), mode="r")
     R, q = reduced[:, :-1], reduced[:, -1]
@@ -118,9 +113,10 @@ def next_step(
     reach = np.where(problem.coordinates.logarithmic[problem.coordinates.free], GREATEST_LOGARITHM, np.inf)
     lower, upper = problem.coordinates.bounds
     ends = np.maximum(lower - at.u, -reach)[free], np.minimum(upper - at.u, reach)[free]
-    shift = np.zeros(len(at.u))
-    shift[free] = lsq_linear(damped, np.append(-q, np.zeros(len(free))), ends, method="bvls").x
-    return Step(shift, float((q**2).sum() - ((R @ shift[free] + q) ** 2).sum()))
+    shift = lsq_linear(damped, np.append(-q, np.zeros(len(free))), ends, method="bvls").x
+    point = at.u.copy()
+    point[free] = np.clip(at.u[free] + shift, lower[free], upper[free])
+    return point, float((q**2).sum() - ((R @ shift + q) ** 2).sum())
 
 
 def corrected(
