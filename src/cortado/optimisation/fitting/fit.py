@@ -32,9 +32,10 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, and say how certain they are.
 
-    Each residual is what a simulation predicts less what was measured; the Jacobian comes from forward-mode tangents,
-    one run for each number that is searched. The first fit takes residuals as they are. Their scatter and correlation
-    then weight the second one, from whose residuals the error bars come (see `cortado.optimisation.fitting.noise`).
+    Each residual is what a simulation predicts less what was measured. The search estimates the Jacobian by a forward
+    run for each number; at its end forward-mode tangents give it. The first fit takes residuals as they are. Their
+    scatter and correlation then weight the second one, from whose residuals the error bars come (see
+    `cortado.optimisation.fitting.noise`).
 
     Args:
         experiments: one `measured.Experiment`, or several that have these parameters in common.

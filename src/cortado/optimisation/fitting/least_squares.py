@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.errors import DivergedError
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.noise import whitened
@@ -92,7 +93,10 @@ class LeastSquares:
         _, upper = self.coordinates.bounds
         for k in np.flatnonzero(positive):
             change = DIFFERENCE if u[k] + DIFFERENCE <= upper[k] else -DIFFERENCE
-            moved = self.residuals(u + change * np.eye(len(u))[k])
+            try:
+                moved = self.residuals(u + change * np.eye(len(u))[k])
+            except DivergedError:  # hard by a point that does not
+                return self.linearised(u)
             for J, before, after in zip(at.jacobians, at.residuals, moved, strict=True):
                 J[..., k] = (after - before) / change
         return at
