@@ -65,7 +65,7 @@ def test_it_ends_a_tenth_of_a_bar_from_the_least(off, wrong):
     J, _ = made.stacked(at, WEIGHTS)
     bars = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     assert found and (np.abs(at.u - the_least(made)) <= 0.1 * bars).all()
-    assert spent == (9, 4) if (off, wrong) == (1.3, 0.0) else spent <= (40, 12)
+    assert spent == (9, 4) if (off, wrong) == (1.3, 0.0) else spent <= (50, 12)
     assert at.residuals[0] == pytest.approx(made.residuals(at.u)[0], abs=0.03 * SIZE)
 
 

@@ -13,8 +13,11 @@ NEAR = 1e-6
 """A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
 GREATEST_LOGARITHM = 1.0
 """Of one step: a positive number changes by a factor of e at most."""
-LEAST_DAMPING = 0.01
-"""After a step that led up, relative to the Hessian's diagonal; ten times as much after each further one."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-4
+"""Relative to the Hessian's diagonal."""
+POOR, GOOD = 0.25, 0.75
+"""Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
+gains more, half as much."""
 
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
@@ -75,21 +78,25 @@ def search(
     """
     fresh, damping, lowest = True, 0.0, problem.sum_of_squares(at.residuals, weights)
     for _ in range(trials):
-        point, gain = next_point(problem, at, weights, damping, fixed)
+        point, gain = next_point(problem, at, weights, 0.0, fixed)
         if gain <= enough * lowest or np.abs(point - at.u).max() <= NEAR * (NEAR + np.abs(at.u).max()):
             return Searched(at, point, gain, True)
+        if damping:
+            point, gain = next_point(problem, at, weights, damping, fixed)
         try:
             residuals = problem.residuals(point)
             squares = problem.sum_of_squares(residuals, weights)
         except DivergedError:
             squares = np.inf
-        if squares < lowest:
+        share = (lowest - squares) / gain
+        if share > 0.0:
             at, lowest, fresh = corrected(problem, at, weights, point, residuals), squares, False
-            damping = damping / 10.0 if damping > LEAST_DAMPING else 0.0
         elif not fresh:
             at, fresh = problem.estimated(at.u), True
-        else:
-            damping = max(10.0 * damping, LEAST_DAMPING)
+        if share < POOR:
+            damping = max(10.0 * damping, FIRST_DAMPING)
+        elif share > GOOD:
+            damping = damping / 2.0 if damping > LEAST_DAMPING else 0.0
     return Searched(at, *next_point(problem, at, weights, 0.0, fixed), False)
 
 
