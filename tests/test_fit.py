@@ -1,5 +1,6 @@
 """Fits of measured experiments: error bars that hold the truth, tangents that are right, and mistakes in sentences."""
 
+import pickle
 from html import escape
 
 import numpy as np
@@ -276,6 +277,20 @@ def test_two_experiments_tell_more_than_one(shaken):
 def test_a_profile_of_small_noise_is_a_parabola(shaken):
     found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).profile("viscosity", points=3)
     assert found.deviance == pytest.approx(found.expected, rel=0.1, abs=0.05)
+
+
+def test_the_posterior_is_that_of_the_bars(shaken):
+    bounds = {"gravity": ([-5.0, -9.81], [5.0, -9.81])}
+    found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.5, -9.81]}, bounds)
+    assert found.log_posterior(found.u) == pytest.approx(0.0, abs=0.01)
+    V = found.coordinate_covariance
+    for away in np.linalg.cholesky(V).T * 2.0:
+        assert found.log_posterior(found.u + away) == pytest.approx(-2.0, rel=0.1)
+    assert found.log_posterior([0.0, 6.0]) == -np.inf == found.log_posterior([np.nan, 0.0])
+    with pytest.raises(InputError, match=r"u has shape \(1,\), but must be \(2,\)"):
+        found.log_posterior([0.0])
+    with pytest.raises(InputError, match="was pickled, but must have its experiments"):
+        pickle.loads(pickle.dumps(found)).log_posterior(found.u)
 
 
 def test_a_wrong_model_is_doubted(shaken):

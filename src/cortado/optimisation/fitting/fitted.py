@@ -192,6 +192,18 @@ class Fit:
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
+    def log_posterior(self, u: Any) -> float:
+        """The logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it takes a
+        forward run.
+
+        The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
+        where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
+        `Fit.coordinates.values` makes parameters of coordinates. Raises `InputError`.
+        """
+        from cortado.optimisation.fitting.posterior import log_posterior
+
+        return log_posterior(self, u)
+
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
         """Those that were searched, with the intervals of `intervals`."""
         ends = self.intervals(confidence)
