@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 import cortado
 from cortado import measured
+from cortado.errors import DivergedError
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
 from cortado.optimisation.fitting.search import next_point, search
@@ -104,7 +105,10 @@ class Searches:
 
         def value_and_gradient(u: np.ndarray) -> tuple[float, np.ndarray]:
             reached.append(((len(reached) + 1) * costs.gradient, u.copy()))
-            loss, gradient = self.problem.value_and_gradient(coordinates.values(u))
+            try:
+                loss, gradient = self.problem.value_and_gradient(coordinates.values(u))
+            except DivergedError:  # far off: the line search comes back
+                return 1e9, np.zeros(len(u))
             slope = np.concatenate([gradient[name] for name in coordinates.names])[free] * coordinates.slopes(u)
             return self.factor * loss, self.factor * slope
 
@@ -119,7 +123,10 @@ class Searches:
         """Until the estimate was within 0.1 standard errors, and the sum of squares within 1e-6 of the least."""
 
         def squares(u: np.ndarray) -> float:
-            return problem.sum_of_squares(problem.residuals(u), self.weights)
+            try:
+                return problem.sum_of_squares(problem.residuals(u), self.weights)
+            except DivergedError:
+                return np.inf
 
         near = (cost for cost, u in reached if (np.abs(u - best) <= 0.1 * error).all())
         last = (cost for cost, u in reached if squares(u) <= squares(best) * (1.0 + 1e-6))
