@@ -41,9 +41,8 @@ class Traced(LeastSquares):
         self.costs, self.reached = costs, list[Reached]()
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        found = super().residuals(u)
-        self.note(u)
-        return found
+        self.note(u)  # a trial point is known before it is run
+        return super().residuals(u)
 
     def note(self, u: np.ndarray) -> None:
         """That this is where the search is now."""
@@ -89,13 +88,9 @@ class Searches:
         return Coordinates.of(start, self.true, {name: (lower[name], upper[name]) for name in self.true})
 
     def ours(self, coordinates: Coordinates, costs: Costs) -> list[Reached]:
-        """By our search alone, without the tangents at its end, and one trial point at a time."""
+        """By our search alone, without the tangents at its end."""
         traced = Traced(self.experiment, coordinates, costs)
-        at = traced.estimated(coordinates.start)
-        for _ in range(10):
-            found = search(traced, at, self.weights, 1, 0.0)
-            traced.note(found.next)  # known without a run
-            at = found.at
+        traced.note(search(traced, traced.estimated(coordinates.start), self.weights, 12, 0.0).next)
         return traced.reached
 
     def by_lbfgs(self, coordinates: Coordinates, costs: Costs) -> list[Reached]:
