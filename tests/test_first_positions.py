@@ -1,31 +1,141 @@
-"""The two inverse problems of JAX-SPH: the first positions of a cube of fluid from its last ones, in JAX."""
+"""First positions that are given as a parameter are judged as points of a file are; limits of stability are told once
+each."""
+
+import warnings
 
 import numpy as np
 import pytest
 
-jax = pytest.importorskip("jax", reason="JAX is not installed", exc_type=ImportError)
+from cortado import CortadoWarning, InputError, Problem, Simulation, losses, optimise, optimisers
+from scenes import plane, scene
+
+STEPS = 2
+PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "theirs"), [([0.5, 0.5], [0.8, 0.8], 0.008), ([0.5, 0.3], [0.8, 0.6], 0.023)]
-)
-def test_first_positions_are_found_from_last_ones(lower, upper, theirs):
-    """After 7 iterations nearer than JAX-SPH's notebook after 15; the second cube hits the floor on the way. Steps are
-    four times as long as in docs/layers.md, to be quick."""
-    import cortado.jax
+def problem_of(made, **options):
+    simulation = Simulation(made, precision="float64", **options)
+    return Problem(simulation, STEPS, losses.CentreOfMass(np.zeros(made.dimension))), simulation.positions
 
-    box = cortado.load_scene("docs/figures/falling_cube.toml")
-    box = box.replaced(f"fluid.0.lower={lower}", f"fluid.0.upper={upper}", "solver.time_step=0.02")
-    guess = cortado.Simulation(box.replaced("fluid.0.lower=[0.075, 0.475]", "fluid.0.upper=[0.375, 0.775]"))
-    true = cortado.Simulation(box)
-    last = true.run(25).positions[-1]
-    assert (last[:, 1].min() < 0.05) == (lower[1] < 0.5)
-    distance = cortado.jax.value(cortado.Problem(guess, 25, cortado.losses.FinalPositions(last)))
-    slope = jax.jit(jax.value_and_grad(lambda x: distance({"initial_positions": x})))
-    positions = jax.numpy.asarray(guess.positions, dtype="float32")
-    begun = np.sqrt(np.mean((positions - true.positions) ** 2))
-    for _ in range(7):
-        value, gradient = slope(positions)
-        positions -= 0.25 * len(positions) * gradient
-    assert np.sqrt(value / 2.0) < theirs
-    assert np.sqrt(np.mean((positions - true.positions) ** 2)) < 0.2 * begun
+
+def squeezed(positions, factor):
+    middle = positions.mean(axis=0)
+    return middle + factor * (positions - middle)
+
+
+def told(work):
+    """The warnings of some work, in words."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        work()
+    return [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
+
+
+@pytest.mark.parametrize("make", [plane, scene])
+@pytest.mark.parametrize("apart", [0.0, 1e-9])
+def test_two_particles_at_one_place_are_refused(make, apart):
+    problem, x = problem_of(make())
+    x = x.copy()
+    x[9] = x[2] + apart
+    words = (
+        r"^parameter initial_positions has particles 2 and 9 at one place, \(.*\) m, but must have them about a spacing"
+    )
+    for work in (problem.value, problem.value_and_gradient, lambda v: problem.simulation.run(1, v)):
+        with pytest.raises(InputError, match=words):
+            work({"initial_positions": x})
+    problem.value({"initial_positions": problem.simulation.positions})
+
+
+def test_two_particles_at_one_place_across_a_period_are_refused():
+    problem, x = problem_of(plane(container=PERIODIC))
+    x = x.copy()
+    x[9] = x[2] + [2.0 * 0.4, 0.0]
+    with pytest.raises(InputError, match="particles 2 and 9 at one place"):
+        problem.value({"initial_positions": x})
+
+
+@pytest.mark.parametrize("make", [plane, scene])
+def test_a_lattice_that_would_burst_is_refused(make):
+    problem, x = problem_of(make())
+    with pytest.raises(
+        InputError, match=r"^Particles at initial_positions have 1\.\d+ times the rest density .* compressed"
+    ):
+        problem.value({"initial_positions": squeezed(x, 0.9)})
+
+
+def test_a_lattice_that_is_squeezed_a_little_is_warned_of_once():
+    problem, x = problem_of(plane())
+
+    def search():
+        for factor in (0.97, 0.965, 0.96):
+            problem.value({"initial_positions": squeezed(x, factor)})
+
+    (sentence,) = told(search)
+    assert sentence.startswith("particles at initial_positions are compressed by ") and "fly apart" in sentence
+
+
+def test_particles_nearer_than_half_a_spacing_are_warned_of():
+    problem, x = problem_of(plane())
+    x = x.copy()
+    x[0] = x[1] + [-0.3 * 0.05, 0.0]
+    (sentence,) = told(lambda: problem.value({"initial_positions": x}))
+    assert "only 0.3 spacings apart" in sentence
+
+
+def test_positions_that_move_little_by_little_are_judged_where_they_come_to():
+    """Though no step of them is long."""
+    problem, x = problem_of(plane())
+    for factor in np.arange(1.0, 0.96, -0.004):
+        problem.value({"initial_positions": squeezed(x, factor)})
+    with pytest.raises(InputError, match="compressed"):
+        for factor in np.arange(0.96, 0.85, -0.004):
+            problem.value({"initial_positions": squeezed(x, factor)})
+
+
+def test_each_scene_of_a_batch_is_judged():
+    problem, x = problem_of(plane(), batch=3)
+    with pytest.raises(InputError, match=r"^In scene 1 of the batch, Particles at initial_positions have"):
+        problem.value({"initial_positions": np.stack([x, squeezed(x, 0.9), x])})
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+def test_a_disturbed_lattice_is_no_mistake(noise):
+    problem, x = problem_of(plane())
+    disturbed = np.clip(x + noise * 0.05 * np.random.default_rng(3).standard_normal(x.shape), 0.01, None)
+    assert told(lambda: problem.value({"initial_positions": disturbed})) == []
+
+
+def test_a_search_refuses_steps_that_crowd_particles():
+    problem, x = problem_of(plane())
+    together = Problem(problem.simulation, 1, losses.FinalPositions(squeezed(x, 0.7)))
+    with pytest.warns(CortadoWarning, match="compressed"):
+        found = optimise(together, {"initial_positions": x}, optimisers.GradientDescent(2.0), 20)
+    assert found.refused > 0 and found.loss < together.value({"initial_positions": x})
+
+
+def test_a_line_search_leaves_crowded_trials_aside():
+    problem, x = problem_of(plane())
+    together = Problem(problem.simulation, 1, losses.FinalPositions(squeezed(x, 0.7)))
+    found = optimise(together, {"initial_positions": x}, optimisers.LineSearch(scale=0.05), 2)
+    assert found.loss < together.value({"initial_positions": x})
+
+
+# ---- limits of stability -----------------------------------------------------------------------------------------
+
+
+def test_each_limit_of_stability_is_told_once():
+    problem, _ = problem_of(plane())
+
+    def search():
+        for values in (
+            {"viscosity": 200.0},
+            {"viscosity": 300.0},
+            {"viscosity": 300.0, "gravity": [0.0, -50.0]},
+            {"gravity": [0.0, -2000.0]},
+            {"gravity": [0.0, -3000.0]},
+        ):
+            problem._space.checked(values)
+
+    sentences = told(search)
+    assert len(sentences) == 2
+    assert "comes from viscosity" in sentences[0] and "comes from viscosity" not in sentences[1]

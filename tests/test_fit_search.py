@@ -69,6 +69,13 @@ def test_it_ends_a_tenth_of_a_bar_from_the_least(off, wrong):
     assert at.residuals[0] == pytest.approx(made.residuals(at.u)[0], abs=0.03 * SIZE)
 
 
+def test_without_residuals_it_stays():
+    made = problem(TRUE)
+    made = LeastSquares([Decay(Decay(None).predicted(TRUE)["gauge"])], made.coordinates)
+    at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
+    assert found and at.u == pytest.approx(made.coordinates.start, abs=1e-12)
+
+
 def test_bounds_are_kept():
     bounds = {"rate": (0.5, 1.2)}
     made = problem({"size": 1.0, "rate": 1.0, "level": 0.0}, bounds)

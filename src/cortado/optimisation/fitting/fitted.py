@@ -10,7 +10,7 @@ from cortado.arrays import as_one_number
 from cortado.errors import InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
-from cortado.optimisation.fitting.search import search
+from cortado.optimisation.fitting.search import TINY, search
 from cortado.scene.parameters.values import UNITS
 
 ALIKE = 0.9
@@ -186,7 +186,7 @@ class Fit:
             begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
             begun[k] = self.u[k] + shift
             at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
-            ended = search(self.problem, at, weights, 2, NEARLY / self.sum_of_squares, fixed=[k])
+            ended = search(self.problem, at, weights, 2, NEARLY / max(self.sum_of_squares, TINY), fixed=[k])
             squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.gain
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])

@@ -27,6 +27,8 @@ ONE_BAR = 1.0
 """The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
 MOST_JACOBIANS = 4
 """By tangents."""
+TINY = 1e-300
+"""In the place of 0 below a fraction."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], t
     """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found: a search
     up to where its estimate of the Jacobian serves, tangents, and a search from there with these."""
     for _ in range(MOST_JACOBIANS):
-        squares = problem.sum_of_squares(at.residuals, weights)
+        squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, NEARBY / squares)
         try:
             exact = problem.linearised(found.next)
@@ -88,7 +90,7 @@ def search(
             squares = problem.sum_of_squares(residuals, weights)
         except DivergedError:
             squares = np.inf
-        share = (lowest - squares) / gain
+        share = (lowest - squares) / max(gain, TINY)
         if share > 0.0:
             at, lowest, fresh = corrected(problem, at, weights, point, residuals), squares, False
         elif not fresh:
@@ -138,7 +140,7 @@ def corrected(
     J, _ = problem.stacked(at, weights)
     shift = u - at.u
     along = J.T @ (J @ shift)
-    along = along / max(float(shift @ along), 1e-300)
+    along = along / max(float(shift @ along), TINY)
     jacobians = [
         J + (new - old - J @ shift)[..., None] * along
         for J, old, new in zip(at.jacobians, at.residuals, residuals, strict=True)
