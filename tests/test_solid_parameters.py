@@ -1,4 +1,5 @@
-"""Where solids are, as parameters: reverse and forward mode of all four, in each solver and with each force."""
+"""Where solids are and how large, as parameters: reverse and forward mode of all five, in each solver and with each
+force."""
 
 import warnings
 
@@ -109,6 +110,7 @@ def point_of(scene, steps=STEPS, seed=0):
             "rotation": (begun, 1.0),
             "displacement": (drift + 1e-5 * random.normal(size=drift.shape), 1e-3),
             "turn": (turned + 1e-4 * random.normal(size=turned.shape), 0.01),
+            "scale": (np.array(1.04 + 0.02 * seed), 0.1),
         }
         point |= {f"{solid.name}.{name}": value for name, (value, _) in own.items()}
         along |= {f"{solid.name}.{name}": size * random.normal(size=value.shape) for name, (value, size) in own.items()}
@@ -132,7 +134,7 @@ def check(problem, point, along):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_all_four_have_derivatives(name):
+def test_all_five_have_derivatives(name):
     scene = SCENES[name]()
     check(problem_of(scene), *point_of(scene))
 
@@ -208,6 +210,7 @@ def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
 
     whole = simulation.run(STEPS, point)
     first = simulation.run(2, some(point, slice(2)))
+    point, along = ({n: v for n, v in values.items() if n != "rotor.scale"} for values in (point, along))  # in states
     rest = simulation.run(STEPS - 2, some(point, slice(2, None)), state=first.last_state)
     np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
     np.testing.assert_array_equal(rest.solids["rotor"].rotations, whole.solids["rotor"].rotations[2:])

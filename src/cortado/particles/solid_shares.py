@@ -36,6 +36,8 @@ ALL_WALLS = -(2**31)
 """In the place of the number of a solid: those of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g."""
+WHOLE = ("force", "torque", "growth")
+"""What others than particles give."""
 SUM = """\
 def {name}(
     i: int, x: _vectors, at: _seen, constants: _pair, solid: int, middle: _vector, back: _matrix, slide: _vector,
@@ -88,7 +90,7 @@ class SolidShares:
         self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
         self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
         self._whole = [
-            {name: wp.zeros(layout.members, dtype=kinds[name], device=device) for name in NAMES[:2]} for _ in solids
+            {name: wp.zeros(layout.members, dtype=kinds[name], device=device) for name in WHOLE} for _ in solids
         ]
         """What was given by others than particles."""
 
@@ -124,10 +126,10 @@ class SolidShares:
         self._forget(solid)
         return found
 
-    def add_whole(self, solid: int, force: wp.array, torque: wp.array) -> None:
-        """(members,) f and t of one solid, which others than particles give."""
-        for given, own in zip((force, torque), self._whole[solid].values(), strict=True):
-            add(given, own)
+    def add_whole(self, solid: int, *given: wp.array) -> None:
+        """(members,) f, t, and g where there is one, which others than particles give to one solid."""
+        for one, own in zip(given, self._whole[solid].values(), strict=False):
+            add(one, own)
 
     def clear(self) -> None:
         """Forget what was given."""

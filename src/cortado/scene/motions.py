@@ -210,6 +210,7 @@ def _scale(solid: SolidTable) -> Parameter:
         f"how many times as large as in the scene the solid {solid.name} is, about its middle",
         Axis.SCALAR,
         lambda source: np.float64(1.0),
+        role=Role.STATE,
         range=Range.POSITIVE,
         change=lambda source, value: STRETCH * np.abs(value),
     )

@@ -28,7 +28,6 @@ from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.rotations import rotations
 
-
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
 """Of a solid in a state, as kernels call them."""
 
