@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from cortado import Problem, Simulation, certify
+from cortado import Problem, Scene, Simulation, certify
 from cortado.certificate.perturbations import coherent_directions, scales
 from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
@@ -175,6 +175,31 @@ def test_a_solid_that_is_told_where_it_begins_is_that_of_a_scene_that_says_so(ki
     assert abs(found / problem_of(told).value(fluid) - 1.0) > 1e-6
 
 
+@pytest.mark.parametrize(
+    ("shape", "scale"),
+    [
+        ({"shape": "box", "lower": [0.35, 0.25], "upper": [0.65, 0.55]}, 4.0 / 3.0),
+        ({"shape": "sphere", "centre": [0.5, 0.4], "radius": 0.15}, 0.9),
+    ],
+    ids=["box", "disc"],
+)
+def test_a_solid_that_is_told_how_large_it_is_has_the_walls_of_one_that_is(shape, scale, tmp_path):
+    """Water that is packed about one of that size has nearly the rest density beside it."""
+    solid = {**shape, "name": "one", "motion": "path", "velocity": [0.0, 0.0]}
+    table = plane(solid).solid[0].stretched(scale)
+    larger = {**solid, **{name: getattr(table, name) for name in table.measures}, "position": [0.5, 0.4]}
+    there = Simulation(plane(larger, fluid=[body("water", upper=(1.0, 0.8))], solver=PCISPH), precision="float64")
+    np.save(tmp_path / "water.npy", there.positions)
+    fluid = {"shape": "points", "file": str(tmp_path / "water.npy"), "phase": "water"}
+    told = Simulation(plane({**solid, "position": [0.5, 2.0]}, fluid=[fluid], solver=PCISPH), precision="float64")
+    near = table.solid().distance(there.positions) < 0.1
+    at = {"initial_positions": there.positions, "one.position": [0.5, 0.4]}
+    found, bare = (told.quantity("density", controls={**at, "one.scale": one})[near].mean() for one in (scale, 1.0))
+    print(there.quantity("density")[near].mean(), found, bare)
+    assert found == pytest.approx(there.quantity("density")[near].mean(), rel=5e-3)
+    assert bare != pytest.approx(found, rel=5e-2)
+
+
 def test_a_displacement_and_a_turn_are_from_where_it_begins():
     scene = plane(ROTOR)
     point, _ = point_of(scene)
@@ -253,6 +278,8 @@ def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
             [0.1, 0.1],
             r"'ball.position' is unknown, but must be one of .*, rotor.angular_velocity in this scene",
         ),
+        ("rotor.scale", [1.0, 1.1], r"has shape \(2,\), but must be \(\)"),
+        ("rotor.scale", 0.0, r"rotor.scale is 0.0, but must be greater than 0"),
         ("rotor.velocity", [0.1], r"has shape \(1,\), but must be \(2,\) in m/s"),
         ("rotor.angular_velocity", np.inf, "has a value that is not finite, but must be numbers in rad/s"),
     ],
@@ -286,6 +313,39 @@ def test_a_solid_that_jumps_is_warned_of():
         warnings.simplefilter("error", CortadoWarning)
         simulation.run(1, controls={"rotor.position": [0.3, 0.3]}, state=first.last_state)
         Simulation(plane(ROTOR)).run(4)
+
+
+@pytest.mark.filterwarnings("ignore:.*goes on")
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"rotor.scale": 1.6}, r"'rotor' is 1\.6 times as large .*, but its walls hold for 0\.6 to 1\.5"),
+        ({"rotor.scale": 0.5}, r"'rotor' is 0\.5 times as large .*, but its walls hold for 0\.6 to 1\.5"),
+        (
+            {"ball.scale": 1.4},
+            r"'ball' is 1\.4 times as large .* and reaches 0\.06 m, more than a spacing",
+        ),
+        ({"floor.scale": 1.1}, r"'floor' is 1\.1 times as large .*, so that it does not fill a period"),
+    ],
+)
+def test_a_size_that_walls_do_not_hold_is_warned_of(given, sentence):
+    floor = {"name": "floor", "shape": "box", "lower": [0.0, -0.2], "upper": [0.6, 0.0], "motion": "path"}
+    scene = periodic().model_dump(exclude_none=True)
+    scene["solid"] += ({**floor, "velocity": [0.1, 0.0]}, {**BALL, "centre": [0.3, 0.7], "radius": 0.15})
+    simulation = Simulation(Scene(**scene))
+    with pytest.warns(CortadoWarning, match=sentence):
+        simulation.run(1, controls=given)
+
+
+def test_a_run_that_goes_on_keeps_the_size():
+    simulation = Simulation(plane(ROTOR))
+    first = simulation.run(2, controls={"rotor.scale": 1.1})
+    rest = simulation.run(1, state=first.last_state)
+    assert first.solids["rotor"].scale == rest[:1].solids["rotor"].scale == np.float32(1.1)
+    with pytest.raises(InputError, match=r"rotor\.scale is given, but must be left out with a state"):
+        simulation.run(1, controls={"rotor.scale": 1.1}, state=first.last_state)
+    density = simulation.quantity("density", first, controls={"rotor.scale": 1.1})  # which is that of the run
+    np.testing.assert_array_equal(density[-1], simulation.quantity("density", first.last_state))
 
 
 def steady_of(scene, seed=0):

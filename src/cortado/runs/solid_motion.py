@@ -1,7 +1,7 @@
 """Where solids that move are in the frames of a run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -39,8 +39,8 @@ class SolidMotion:
 
     def __getitem__(self, frames: slice) -> Self:
         """In some of the frames."""
-        own = {name: getattr(self, name) for name in ("positions", "rotations", "velocities", "angular_velocities")}
-        return replace(self, **{name: None if one is None else one[frames] for name, one in own.items()})
+        moving: Any = (None if one is None else one[frames] for one in (self.velocities, self.angular_velocities))
+        return type(self)(self.positions[frames], self.rotations[frames], *moving, scale=self.scale)
 
 
 class SolidMotions(dict[str, SolidMotion]):
