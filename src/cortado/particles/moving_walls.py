@@ -61,6 +61,23 @@ def matrix_of(precision: Precision) -> Any:
 
 
 @cache
+def sizes_type(precision: Precision) -> Any:
+    """The Warp struct of how large solids are."""
+    real = precision.real
+
+    class Sizes:
+        scales: wp.array2d(dtype=real)
+        """(members, solids) sigma [-]."""
+        growths: wp.array2d(dtype=real)
+        """Their tangents, over themselves."""
+        power: real
+        """Of sigma, by which weights grow: d - 1."""
+
+    Sizes.__name__ = Sizes.__qualname__ = f"Sizes_{precision.name}"
+    return wp.struct(Sizes)
+
+
+@cache
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     """Those that place wall particles, that write them in the order of their cells, that say where cells begin, and
     that write tangents."""
@@ -68,7 +85,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     module = wp.get_module(f"cortado_moving_walls_{precision.name}")
     module.options["enable_backward"] = False
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
-    own_of: Any = bundle(own=vector, own_feet=vector, own_slides=vector, own_weights=real, own_grips=real)
+    own_vectors = dict.fromkeys(("own", "own_feet", "own_slides"), vector)
+    own_of: Any = bundle(**own_vectors, own_weights=real, own_grips=real, own_solids=wp.int32)
+    sizes_of = sizes_type(precision)
     walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, wall_solids=wp.int32)
     length_of: Any = bundle(time_step=real, time_step_dot=real)
     vector_dots = {f"wall_{name}_dot": vector for name in ("positions", "velocities", "turns")}
@@ -88,18 +107,17 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     def place(
         count: int,
         of: own_of,
-        solid: wp.array(dtype=wp.int32),
         positions: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
-        scales: wp.array2d(dtype=real),
+        sizes: sizes_of,
         # out
         x: wp.array(dtype=vector),
     ):
         j = wp.tid()
         member = j // count
         b = j - member * count
-        k = solid[b]
-        x[j] = positions[member, k] + turns[member, k] * place_of(b, scales[member, k], of)
+        k = of.own_solids[b]
+        x[j] = positions[member, k] + turns[member, k] * place_of(b, sizes.scales[member, k], of)
 
     @wp.kernel(module=module, enable_backward=False)
     def write(
@@ -108,12 +126,10 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         of: own_of,
-        solid: wp.array(dtype=wp.int32),
         before: wp.array2d(dtype=vector),
         turns_before: wp.array2d(dtype=matrix),
         turns: wp.array2d(dtype=matrix),
-        scales: wp.array2d(dtype=real),
-        power: real,
+        sizes: sizes_of,
         x: wp.array(dtype=vector),
         # out
         walls: walls_of,
@@ -122,9 +138,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         j = order[p]
         member = j // count
         b = j - member * count
-        k = solid[b]
-        foot, scale = turns[member, k] * of.own_feet[b], scales[member, k]
-        grown = wp.pow(scale, power)
+        k = of.own_solids[b]
+        foot, scale = turns[member, k] * of.own_feet[b], sizes.scales[member, k]
+        grown = wp.pow(scale, sizes.power)
         surface_before = before[member, k] + turns_before[member, k] * surface_of(b, scale, of)
         moved = x[j] + foot - surface_before
         walls.wall_positions[first + p] = x[j]
@@ -151,16 +167,13 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         order: wp.array(dtype=wp.int32),
         length: length_of,
         of: own_of,
-        solid: wp.array(dtype=wp.int32),
         turns_before: wp.array2d(dtype=matrix),
         turns: wp.array2d(dtype=matrix),
-        scales: wp.array2d(dtype=real),
-        power: real,
+        sizes: sizes_of,
         before_dot: wp.array2d(dtype=vector),
         turned_before_dot: wp.array2d(dtype=vector),
         after_dot: wp.array2d(dtype=vector),
         turned_dot: wp.array2d(dtype=vector),
-        growths: wp.array2d(dtype=real),
         wall_velocities: wp.array(dtype=vector),
         # out
         walls: dots_of,
@@ -169,10 +182,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         j = order[p]
         member = j // count
         b = j - member * count
-        k = solid[b]
+        k = of.own_solids[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
-        scale, growth = scales[member, k], growths[member, k]
-        surface = surface_of(b, scale, of)
+        growth, surface = sizes.growths[member, k], surface_of(b, sizes.scales[member, k], of)
         arm, arm_before = turns[member, k] * surface, turns_before[member, k] * surface
         surface_dot = after_dot[member, k] + wp.cross(turned, arm) + growth * arm
         x_dot = surface_dot - wp.cross(turned, turns[member, k] * of.own_feet[b])
@@ -184,7 +196,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         walls.wall_positions_dot[first + p] = x_dot
         walls.wall_velocities_dot[first + p] = moved_dot / dt + wp.cross(turned, slide)
         walls.wall_turns_dot[first + p] = turned
-        walls.wall_growths_dot[first + p] = power * growth
+        walls.wall_growths_dot[first + p] = sizes.power * growth
 
     return place, write, shift, write_tangent
 
@@ -197,13 +209,14 @@ class MovingWalls:
         search."""
         precision, device, count = layout.precision, layout.device, len(walls)
         sizes = (layout.members, solids, precision, device)
-        each = {"shape": (layout.members, solids), "dtype": precision.real, "device": device}
+        self.sizes, each = sizes_type(precision)(), {"dtype": precision.real, "device": device}
+        """How large they are, which others may write."""
+        self.sizes.scales, self.sizes.growths = (make((layout.members, solids), **each) for make in (wp.ones, wp.zeros))
+        self.sizes.power = precision.real(dimension - 1)
         self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
         """How many solids, and their poses before and after a step, which somebody else writes."""
         self.before_dot, self.after_dot = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
         """The tangents of these, likewise."""
-        self.scales, self.power = wp.ones(**each), precision.real(dimension - 1)
-        """(members, solids) By what solids are stretched, which others may write, and to which power weights grow."""
         self.named: dict[str, wp.array] = {
             "before": self.before.positions,
             "turns_before": self.before.turns,
@@ -213,10 +226,10 @@ class MovingWalls:
             "turned_before_dot": self.before_dot.turns,
             "after_dot": self.after_dot.positions,
             "turned_dot": self.after_dot.turns,
-            "scales": self.scales,
-            "growths": wp.zeros(**each),
+            "scales": self.sizes.scales,
+            "growths": self.sizes.growths,
         }
-        """Poses and scales as kernels call them, and their tangents: of a scale over itself."""
+        """Poses and sizes as kernels call them, and their tangents."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
         """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
         slides = np.zeros((solids, 3))
@@ -228,8 +241,8 @@ class MovingWalls:
         numbers = {"own_weights": walls.weights, "own_grips": walls.grips}
         self._own: dict[str, Any] = {
             "count": count,
-            "power": self.power,
-            "solid": wp.array(walls.solid, dtype=wp.int32, device=device),
+            "sizes": self.sizes,
+            "own_solids": wp.array(walls.solid, dtype=wp.int32, device=device),
             "x": wp.zeros(self._all, dtype=precision.vector, device=device),
             **{name: wp.array(values, dtype=precision.vector, device=device) for name, values in vectors.items()},
             **{name: wp.array(values, dtype=precision.real, device=device) for name, values in numbers.items()},

@@ -107,7 +107,7 @@ class SolidShares:
         sum ``over`` the walls of one solid, to that alone."""
         if self._walls is None:
             return
-        before, after, power = self._walls.before, self._walls.after, self._walls.power
+        before, after, power = self._walls.before, self._walls.after, self._walls.sizes.power
         poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns, "power": power}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
         for solid in range(self._walls.solids):

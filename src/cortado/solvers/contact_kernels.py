@@ -89,7 +89,8 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         R = matrix(real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0))
         y, scale = nearest(x - middle, period), real(1.0)
         if against >= 0:
-            R, scale = turns[member, against], scales[member, against]
+            R = turns[member, against]
+            scale = scales[member, against]
             y = wp.transpose(R) * nearest(x - after[member, against], period) / scale - middle
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(mesh, place, wp.float32(FAR))

@@ -89,7 +89,7 @@ class Containment:
         self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
         """Before and after a step."""
         none = wp.zeros((members, 0), dtype=layout.precision.real, device=device)
-        self._scales = none if moving is None else moving.scales
+        self._scales = none if moving is None else moving.sizes.scales
         self._constants: dict[str, Any] = {
             "bounds": self._made_bounds(),
             "solids": self._made_solids(device),
