@@ -255,13 +255,18 @@ def test_steps_that_are_chosen_know_how_fast_solids_are():
 
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
-    """With walls that weigh nothing."""
+    """With walls that weigh nothing; a larger one comes to it sooner, by what it reaches further down."""
     from cortado.scene import walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
-    falling = {"name": "block", "shape": "box", "lower": [0.2, 0.5], "upper": [0.4, 0.7], "motion": "path"}
-    with pytest.raises(DivergedError, match="entered the solid 'block' and was at"):
-        Simulation(plane({**falling, "velocity": [0.0, -1.0]})).run(400)
+    falling = {"name": "block", "shape": "box", "lower": [0.2, 0.45], "upper": [0.4, 0.65], "motion": "path"}
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}
+    simulation, steps = Simulation(plane({**falling, "velocity": [0.0, -1.0]}, fluid=[pool])), []
+    for scale in (1.0, 1.4):
+        with pytest.raises(DivergedError, match="entered the solid 'block' and was at") as found:
+            simulation.run(400, controls={"block.scale": scale})
+        steps.append(found.value.step)
+    assert steps[0] - steps[1] == pytest.approx(40, abs=4)
 
 
 @pytest.mark.parametrize(
