@@ -1,7 +1,7 @@
 """Where solids that move are in the frames of a run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -39,8 +39,9 @@ class SolidMotion:
 
     def __getitem__(self, frames: slice) -> Self:
         """In some of the frames."""
-        moving: Any = (None if one is None else one[frames] for one in (self.velocities, self.angular_velocities))
-        return type(self)(self.positions[frames], self.rotations[frames], *moving, scale=self.scale)
+        velocities, spins = (None if a is None else a[frames] for a in (self.velocities, self.angular_velocities))
+        places, turns = self.positions[frames], self.rotations[frames]
+        return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
 
 class SolidMotions(dict[str, SolidMotion]):
