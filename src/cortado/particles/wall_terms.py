@@ -5,8 +5,8 @@ A term is told by its work W, a number that is linear in a vector ``bar`` of par
 
     A_i = sum_b w_b dW / dbar_i.
 
-Warp makes the gradients of W. Component k of the tangent of A is the change of W for the k-th unit vector as ``bar``,
-and the adjoint is the gradient of W for the adjoint of A as ``bar``.
+Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
+``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``.
 """
 
 from dataclasses import dataclass, replace
