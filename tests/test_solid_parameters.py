@@ -12,6 +12,8 @@ from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
+from cortado.runs.exports.exported import Exported
+from cortado.runs.solid_motion import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, distance
 from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
@@ -337,10 +339,14 @@ def test_a_size_that_walls_do_not_hold_is_warned_of(given, sentence):
 
 
 def test_a_run_that_goes_on_keeps_the_size():
+    """And it is drawn and exported so."""
     simulation = Simulation(plane(ROTOR))
     first = simulation.run(2, controls={"rotor.scale": 1.1})
     rest = simulation.run(1, state=first.last_state)
     assert first.solids["rotor"].scale == rest[:1].solids["rotor"].scale == np.float32(1.1)
+    drawn, exported = posed(simulation.scene, first.solids, -1).solid[0], Exported(first, simulation.scene).solids[0]
+    for faces in (drawn.own_solid().faces(0.1).vertices, exported.mesh.points):
+        np.testing.assert_allclose(np.ptp(faces, axis=0)[:2], [0.22, 0.11], rtol=1e-6)
     with pytest.raises(InputError, match=r"rotor\.scale is given, but must be left out with a state"):
         simulation.run(1, controls={"rotor.scale": 1.1}, state=first.last_state)
     density = simulation.quantity("density", first, controls={"rotor.scale": 1.1})  # which is that of the run
