@@ -16,7 +16,7 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.crowding import check_crowding, crowding_of
-from cortado.discretise.packing import Packing
+from cortado.discretise.packing.packing import Packing
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
