@@ -51,17 +51,6 @@ def pairs_among(
     return first, second
 
 
-def are_near(some: Points, others: Points, reach: float, lower: ArrayLike, lengths: ArrayLike) -> NDArray[np.bool_]:
-    """(n,) whether each of ``some`` (n, d) [m] has one of the ``others`` at most ``reach`` [m] apart; the arguments are
-    those of `pairs_within`."""
-    from scipy.spatial import cKDTree
-
-    lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
-    some, others = (_wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
-    distances = cKDTree(others, boxsize=lengths).query(some, distance_upper_bound=reach * (1.0 + 1e-9))[0]
-    return np.asarray(np.isfinite(distances))
-
-
 def apart(separations: Points, lengths: ArrayLike) -> Points:
     """Separations (m, d) [m] of pairs with the nearest image, where ``lengths`` (d,) [m] are those of the period."""
     lengths = np.asarray(lengths, dtype=np.float64)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.calibration import rest_volume
+from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.cpu_launches import launched_in_bands, shared, started
 from cortado.discretise.shapes import Points
 from cortado.discretise.walls.weights import RestLattice
@@ -45,13 +45,17 @@ class PointsAround:
         support."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
-    def lists(self, particles: Points, blind: Which) -> tuple[Numbers, Numbers]:
+    def lists(self, particles: Points, blind: Which) -> tuple[Numbers, Numbers, Numbers]:
         """Which points are within the reach of particles (n, d) [m], the first of the points, and come after them:
-        numbers of points, one list behind the other, and where each begins (n + 1,)."""
-        counts = self._looked(particles, blind, are_own=True)["counts"]
-        starts = starts_of(counts)
-        others = np.empty(max(starts[-1], 1), dtype=np.int32)
-        return starts, self._looked(particles, blind, are_own=True, starts=starts, others=others)["others"]
+        where the list of each begins (n,) and ends (n,), and numbers of points, with gaps between the lists."""
+        room = len(lattice_offsets(self.lattice.spacing, self.reach, self.points.shape[1]))
+        while True:
+            starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
+            others = np.empty(max(starts[-1], 1), dtype=np.int32)
+            counts = self._looked(particles, blind, are_own=True, starts=starts, others=others)["counts"]
+            if counts.max(initial=0) <= room:
+                return starts[:-1], starts[:-1] + counts, others
+            room = int(counts.max())
 
     def _looked(self, particles: Points, blind: Which, **given: Any) -> dict[str, Any]:
         """What the kernel ``look_around`` finds."""

@@ -155,6 +155,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         around: Around,
         free: wp.array(dtype=wp.bool),
         starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         listed: wp.array(dtype=wp.int32),
         close: real,
         # in and out
@@ -163,8 +164,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         counts: wp.array(dtype=wp.int32),
         close_counts: wp.array(dtype=wp.int32),
     ):
-        """Adds up the weighted kernels of what is ``listed`` from ``starts`` on; how many of the pairs with one that is
-        free are within the support, and how many are nearer than ``close`` [m]."""
+        """Adds up the weighted kernels of what is ``listed`` between ``starts`` and ``ends``; how many of the pairs
+        with one that is free are within the support, and how many are nearer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)
@@ -172,7 +173,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         total = real(0.0)
         count = int(0)
         close_count = int(0)
-        for k in range(starts[i], starts[i + 1]):
+        for k in range(starts[i], ends[i]):
             j = listed[k]
             x_ij = separation(x_i, around.x[j], around)
             square = wp.length_sq(x_ij)
@@ -194,6 +195,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         around: Around,
         free: wp.array(dtype=wp.bool),
         starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
         listed: wp.array(dtype=wp.int32),
         close: real,
         # out
@@ -208,7 +210,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         own = vector()
         place = equations.starts[i]
         close_place = equations.close_starts[i]
-        for k in range(starts[i], starts[i + 1]):
+        for k in range(starts[i], ends[i]):
             j = listed[k]
             x_ij = separation(x_i, around.x[j], around)
             square = wp.length_sq(x_ij)

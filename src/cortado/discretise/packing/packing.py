@@ -41,22 +41,20 @@ class Packing:
     """(m,) what each counts for in the density, a particle being 1 [-]"""
     air: int
     """How many of these, the first ones, are of air."""
-    lower: Points
-    """(d,) where the period begins [m]"""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
     def packed(self, particles: Points, stays: Which) -> Points:
         """(n, d) [m] where particles (n, d) [m] come to lie, but for those that stay where they are (n,). The last few
         answers are kept."""
-        arrays = self.fixed, self.weights, self.lower, self.lengths, particles, stays
+        arrays = self.fixed, self.weights, self.lengths, particles, stays
         return _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays)).copy()
 
-    def errors(self, particles: Points, stays: Which) -> Points:
-        """(n,) by how much the densities of particles (n, d) [m] are above that of the lattice, relative; 0 for those
-        that stay, around which no air is counted, where they are below it."""
+    def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
+        """(m,) by how much the densities of ``some`` of particles (n, d) [m] are above that of the lattice, relative; 0
+        for those that stay (n,), around which no air is counted, where they are below it."""
         around = self._around(particles, self.lattice.support)
-        return density_errors(around, around.sums(particles, stays), stays)
+        return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> Points:
         """As `packed`, computed. Of particles that have the rest density already none moves."""
@@ -76,20 +74,21 @@ class Packing:
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)
         around, part = self._among(particles[~region]), particles[region]
+        part_stays, part_wrong = stays[region], wrong[region]
         for _ in range(MOST_ROUNDS // ROUNDS):
-            free = around._near(part, around._wrong(part, stays[region]), near) & movable[region]
+            free = around._near(part, part_wrong, near) & movable[region]
             if not free.any():
                 break
             seen = around._near(part, free, support)
             others, reach = around._among(part[~seen]), support + SKIN * self.lattice.spacing
-            relaxation = Relaxation(others._around(part[seen], reach), stays[region][seen], free[seen])
-            part[seen] = relaxation.relaxed()
+            part[seen] = Relaxation(others._around(part[seen], reach), part_stays[seen], free[seen]).relaxed()
+            part_wrong[seen] = around._wrong(part, part_stays, seen)
         found = particles.copy()
         found[region] = part
         return found
 
-    def _wrong(self, particles: Points, stays: Which) -> Which:
-        errors = self.errors(particles, stays)
+    def _wrong(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Which:
+        errors = self.errors(particles, stays, some)
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
@@ -115,8 +114,8 @@ class Packing:
 def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> Points:
     """See `Packing.packed`: simulations of one scene are made more than once."""
     *numbers, stays = arrays
-    fixed, weights, lower, lengths, particles = (np.frombuffer(one) for one in numbers)
-    packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lower, lengths)
+    fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
+    packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)
     is_long = shape[0] > MANY
     with timed_note(f"Packing the particles of round bodies, {shape[0]:,} in all") if is_long else nullcontext():
         return packing.settled(particles.reshape(shape), np.frombuffer(stays, dtype=bool))

@@ -1,12 +1,10 @@
-"""Least squares for the places of particles that are free, without a matrix, in float64."""
-
-from typing import Any
+"""Least squares for the places of particles that are free, in float64."""
 
 import numpy as np
 
 from cortado.discretise.calibration import SLACK
-from cortado.discretise.cpu_launches import launched, shared
-from cortado.discretise.packing.around import PointsAround, Which, starts_of
+from cortado.discretise.packing.around import PointsAround, Which
+from cortado.discretise.packing.linearised import ListedPairs
 from cortado.discretise.shapes import Points
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
@@ -37,12 +35,12 @@ class Relaxation:
     """Particles, the first of the points around, of which some are ``free`` (n,) to move."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
-        self._around, self._stays, self._free, self._count = around, stays, free, len(stays)
-        self._starts, self._listed = around.lists(around.points[: self._count], stays)
+        self._around, self._stays, self._free = around, stays, free
+        self._pairs = ListedPairs(around, stays, free)
 
     def relaxed(self) -> Points:
         """Particles (n, d) [m] after `ROUNDS` of least squares for those that are free, or fewer."""
-        spacing, places = self._around.lattice.spacing, self._around.in_space[: self._count]
+        spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
         first, dimension = places.copy(), self._around.points.shape[1]
         for _ in range(ROUNDS):
             moves = self._solved()
@@ -52,51 +50,24 @@ class Relaxation:
                 break
         return places[:, :dimension].copy()
 
-    def _linearised(self) -> tuple[Any, Points, Points]:
-        """The equations at the present places, the sums of kernels there (n,) [1 / m^d], and how far pairs are apart
-        that are too near (m,) [m]."""
-        around, kernels = self._around, self._around.kernels
-        given = {"around": around.on_cpu, "free": self._free, "starts": self._starts, "listed": self._listed}
-        given["close"] = NEAR * around.lattice.spacing
-        sums = np.full(self._count, around.own_weight)
-        counts, close_counts = np.empty(self._count, dtype=np.int32), np.empty(self._count, dtype=np.int32)
-        launched(kernels.count_pairs, self._count, sums=sums, counts=counts, close_counts=close_counts, **given)
-        starts, close_starts = (starts_of(one) for one in (counts, close_counts))
-        pairs, close_pairs = starts[-1], close_starts[-1]
-        arrays = {"starts": starts, "others": np.empty(pairs, dtype=np.int32), "gradients": np.empty((pairs, 3))}
-        arrays |= {"close_starts": close_starts, "close_others": np.empty(close_pairs, dtype=np.int32)}
-        arrays |= {"directions": np.empty((close_pairs, 3)), "own": np.empty((self._count, 3))}
-        equations, distances = kernels.equations(), np.empty(close_pairs)
-        for name, array in arrays.items():
-            setattr(equations, name, shared(array))
-        launched(kernels.linearise, self._count, equations=equations, distances=distances, **given)
-        return equations, sums, distances
-
     def _solved(self) -> Points:
         """(n, 3) moves [spacings]."""
         from scipy.sparse.linalg import LinearOperator, lsmr
 
-        equations, sums, distances = self._linearised()
-        kernels, count, spacing = self._around.kernels, self._count, self._around.lattice.spacing
-        errors = density_errors(self._around, sums, self._stays)
+        spacing, count = self._around.lattice.spacing, len(self._free)
+        equations = self._pairs.linearised(NEAR * spacing)
+        errors = density_errors(self._around, equations.sums, self._stays)
         counted = (~self._stays | (errors > HIGHEST)).astype(np.float64)
         unit, held = spacing * self._around.volume * counted, ~self._free
-        wanted = np.concatenate([counted * (np.clip(errors, *AIM) - errors), PUSH * (NEAR - distances / spacing)])
+        gaps = NEAR - equations.distances / spacing
+        wanted = np.concatenate([counted * (np.clip(errors, *AIM) - errors), PUSH * gaps])
 
         def multiply(moves: Points) -> Points:
-            found = np.zeros(len(wanted))
-            changes, approaches = found[:count], found[count:]
-            moves = moves.reshape(-1, 3)
-            launched(kernels.multiply, count, equations=equations, moves=moves, changes=changes, approaches=approaches)
-            changes *= unit
-            approaches *= PUSH
-            return found
+            changes, approaches = equations.multiply(moves.reshape(-1, 3))
+            return np.concatenate([unit * changes, PUSH * approaches])
 
-        def multiply_back(given: Points) -> Points:
-            moves, changes, approaches = np.zeros((count, 3)), unit * given[:count], PUSH * given[count:]
-            launched(
-                kernels.multiply_back, count, equations=equations, moves=moves, changes=changes, approaches=approaches
-            )
+        def multiply_back(wrong: Points) -> Points:
+            moves = equations.multiply_back(unit * wrong[:count], PUSH * wrong[count:])
             moves[held] = 0.0
             return moves.ravel()
 
