@@ -54,6 +54,10 @@ class Mesh(Solid):
         return self.known_trees or [TriangleTree.of(self.corners[part]) for part in self._numbers]
 
     def extent(self) -> tuple[Points, Points]:
+        return self._ends
+
+    @cached_property
+    def _ends(self) -> tuple[Points, Points]:
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
 
     def distance(self, points: Points) -> Points:
