@@ -73,6 +73,8 @@ class Mesh(Solid):
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
+        if len(self._trees) == 1:
+            return self._trees[0].nearest(points)[0]
         return self._looked_up(points, np.inf)[0]
 
     def outward(self, points: Points) -> Points:
