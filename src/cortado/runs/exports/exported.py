@@ -15,7 +15,7 @@ from cortado.pictures.stage import upright
 from cortado.pictures.surface import liquid, nearest_colours, spheres
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
-from cortado.runs.solid_motion import posed
+from cortado.runs.solid_motion import posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -96,7 +96,7 @@ class Exported:
 
     def __init__(self, trajectory: Trajectory, scene: Scene):
         self.times, self.scene = trajectory.times, scene
-        shown = _first_of_each(scene)
+        shown = _first_of_each(sized(scene, trajectory.solids))
         parts = _part_names(shown)
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
         self._trajectory = trajectory
