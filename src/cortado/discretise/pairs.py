@@ -25,7 +25,7 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
-    some, others = (_wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
+    some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
     tree = cKDTree(others, boxsize=lengths)
     first, second, distances = [], [], []
     for start in range(0, len(some), CHUNK):
@@ -46,7 +46,7 @@ def pairs_among(
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), points.shape[1:])
-    tree = cKDTree(_wrapped(points - np.asarray(lower, dtype=np.float64), lengths), boxsize=lengths)
+    tree = cKDTree(wrapped(points - np.asarray(lower, dtype=np.float64), lengths), boxsize=lengths)
     first, second = tree.query_pairs(reach, output_type="ndarray").T
     return first, second
 
@@ -57,7 +57,7 @@ def are_near(some: Points, others: Points, reach: float, lower: ArrayLike, lengt
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
-    some, others = (_wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
+    some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
     distances = cKDTree(others, boxsize=lengths).query(some, distance_upper_bound=reach * (1.0 + 1e-9))[0]
     return np.asarray(np.isfinite(distances))
 
@@ -70,7 +70,7 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
     return np.asarray(separations - lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf)))
 
 
-def _wrapped(positions: Points, lengths: Points) -> Points:
+def wrapped(positions: Points, lengths: Points) -> Points:
     """(n, d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
     safe = np.where(lengths > 0.0, lengths, 1.0)
     remainder = np.mod(positions, safe)
