@@ -184,17 +184,22 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
     assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
 
 
-def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_command, folder, monkeypatch):
-    def stopped(*_):
+@pytest.mark.parametrize(
+    ("drawn", "missing"), [("run_pictures", set()), ("particles", {"report.html"})], ids=["pictures", "plain figures"]
+)
+def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(
+    cortado_command, folder, monkeypatch, drawn, missing
+):
+    def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cortado.cli.commands.run_report.lacking", lambda _: None)
-    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", stopped)
+    monkeypatch.setattr(f"cortado.cli.commands.run_report.{drawn}", stopped)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
     there = Path("dam").absolute()
-    sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film goes on with it."
+    sentence = f"Interrupted; the run is whole, and in {there}; cortado picture {there} --film films it."
     assert (code, err.splitlines()[-1]) == (130, sentence)
-    assert {path.name for path in there.iterdir()} == RUN_FILES
+    assert {path.name for path in there.iterdir()} == RUN_FILES - missing
 
 
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])

@@ -1,10 +1,10 @@
-"""The films of the gallery: for each a picture, NAME.jpg, and an animated WebP, NAME.webp, and its run in runs/NAME.
+"""The films of the gallery: for each a picture, NAME.jpg, and an animated WebP, NAME.webp.
 
     python docs/site/gallery.py --device cuda:0 --out runs/gallery
     python docs/site/gallery.py --only honey --only jug
 
 ``--coarser 3 --part 0.1`` draws the first tenth of each film with spacings three times as wide, for a try on a CPU.
-Every film is made in a process of its own, some of them at a time; one that fails stops no other.
+Several films are made in processes of their own, some at a time; one that fails stops no other. Runs are not kept.
 """
 
 import argparse
@@ -15,12 +15,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 FIGURES, TEMPLATES = (Path(__file__).parents[2] / folder for folder in ("docs/figures", "src/cortado/cli/templates"))
 FRAMES, LASTS = 72, 3.6
 """Of a film, and how many seconds it takes to see them."""
 PICTURE = ("picture.width=640", "picture.height=360")
-FAR = 'picture.camera_path={kind = "orbit", turns = 0.25}'
+ORBIT = "picture.camera_path={kind = 'orbit', turns = 0.25}"
 PROJECTION = ("solver={kind = 'projection', time_step = 'auto'}",)
 NEW = ("solver.time_step=auto",)
 """Templates have steps for wider spacings."""
@@ -40,8 +41,8 @@ class Entry:
     values: tuple[str, ...] = ()
     """That replace those of the scene, as ``--set`` does."""
 
-    def draw(self, name: str, folder: Path, device: str, coarser: float, part: float) -> None:
-        """Run the scene and write the picture and the film."""
+    def draw(self, name: str, folder: Path, run: Path, device: str, coarser: float, part: float) -> None:
+        """Run the scene into a folder, and write the picture and the film into another."""
         from PIL import Image
 
         from cortado.cli.commands.picture import draw_run
@@ -49,11 +50,11 @@ class Entry:
         from cortado.runs.frame_choice import FramesPerSecond
         from cortado.runs.trajectory import Trajectory
 
-        run, frames = folder / "runs" / name, FramesPerSecond((FRAMES - 1) / self.seconds)
+        frames = FramesPerSecond((FRAMES - 1) / self.seconds)
         fine = f"discretisation.spacing={self.spacing * coarser:g}", f"picture.film_speed={self.seconds / LASTS:.3g}"
         values = [*PICTURE, *fine, *self.values]
         asked = {"time": self.seconds * part, "overrides": values, "device": device, "frames": frames}
-        run_scene(self.scene, RunRequest(run, **asked, overwrite=True, report=False))
+        run_scene(self.scene, RunRequest(run, **asked, report=False))
         draw_run(run, -1, True, folder / f"{name}.webp", [], device, {})
         last = len(Trajectory.load(run / "trajectory.vtkhdf")) - 1
         draw_run(run, round(self.still * last), False, run / "still.png", [], device, {})
@@ -65,21 +66,21 @@ ENTRIES = {
     "pillar": Entry(TEMPLATES / "pillar.toml", 0.0125, 1.3, 0.35, NEW),
     "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
     "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
-    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, (FAR,)),
-    "jug": Entry(FIGURES / "jug.toml", 0.0022, 1.9, 0.5),
+    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, (ORBIT,)),
+    "jug": Entry(FIGURES / "jug.toml", 0.0022, 1.8, 0.45),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
     "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, "container.colour=[0.8, 0.78, 0.72]")),
     "latte_art": Entry(TEMPLATES / "pour.toml", 0.0015, 0.9, 1.0, NEW),
     "rotor": Entry(FIGURES / "rotor.toml", 0.0026, 1.5, 0.7),
     "fountain": Entry(FIGURES / "fountain.toml", 0.004, 1.1, 0.8),
-    "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.16, 0.4, NEW),
+    "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.16, 0.4, (*NEW, "picture.field_of_view=21")),
     "raft": Entry(TEMPLATES / "raft.toml", 0.016, 1.8, 0.5, NEW),
     "baffles": Entry(FIGURES / "baffles.toml", 0.0065, 1.7, 0.4),
     "shaken": Entry(FIGURES / "shaken.toml", 0.0045, 0.75, 0.5, PROJECTION),
     "ring": Entry(FIGURES / "ring.toml", 0.0032, 0.6, 0.5),
     "beach": Entry(FIGURES / "beach.toml", 0.015, 3.0, 0.5),
     "two_layers": Entry(TEMPLATES / "rayleigh_taylor.toml", 0.004, 1.4, 0.7, NEW),
-    "jet": Entry(TEMPLATES / "jet.toml", 0.005, 0.9, 0.8, (*NEW, "picture.colour=speed")),
+    "jet": Entry(TEMPLATES / "jet.toml", 0.005, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
     "surface_tension": Entry(FIGURES / "surface_tension.toml", 0.0006, 0.4, 0.1),
 }
 
@@ -95,10 +96,11 @@ def main() -> int:
     parser.add_argument("--part", type=float, default=1.0, help="of the time of each film, from its start")
     asked = parser.parse_args()
     names = asked.only or list(ENTRIES)
-    if len(names) == 1:
-        ENTRIES[names[0]].draw(names[0], asked.out, asked.device, asked.coarser, asked.part)
-        return 0
     asked.out.mkdir(parents=True, exist_ok=True)
+    if len(names) == 1:
+        with TemporaryDirectory() as run:
+            ENTRIES[names[0]].draw(names[0], asked.out, Path(run) / "run", asked.device, asked.coarser, asked.part)
+        return 0
     cores = max(1, (os.cpu_count() or 1) // asked.at_a_time)
     threads = dict.fromkeys(("CORTADO_CORES", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(cores))
     shared = ["--device", asked.device, "--out", asked.out, "--coarser", asked.coarser, "--part", asked.part]
