@@ -453,7 +453,10 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
     main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
-    assert "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 5000 " in capsys.readouterr().out
+    assert (
+        "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 5000 "
+        in capsys.readouterr().out
+    )
     main(["optimise", "task.toml", "--out", "b"])
     assert capsys.readouterr().out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
