@@ -1,4 +1,5 @@
-"""Bodies of fluid that fill a mesh, a polygon, or a box or a cylinder that is turned: how many particles they have, where, and that they are at rest."""
+"""Bodies of fluid that fill a mesh, a polygon, or a box or a cylinder that is turned: how many particles they have,
+where, and that they are at rest."""
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
         (
             {**BAR, "rotation": [0.1, 0.2, 0.3]},
             2,
-            "fluid[0].rotation is [0.1, 0.2, 0.3], but must be one number in 2-D",
+            "rotation is [0.1, 0.2, 0.3], but must be one number in 2-D",
         ),
         ({**CAN, "rotation": 0.1}, 3, "fluid[0].rotation is [0.1], but must be a list of 3 components in 3-D"),
         ({"shape": "mesh", "file": "no.stl"}, 2, "fluid[0].shape"),

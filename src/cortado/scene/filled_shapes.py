@@ -91,7 +91,8 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 def turned(fluid: Fluid) -> Fluid:
     """The same body of fluid; one that has a rotation where it can do without, as one that is packed."""
-    kind = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}.get(type(fluid))
+    kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
+    kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:
         return fluid
     return kind.model_construct(fluid.model_fields_set, **dict(fluid))
