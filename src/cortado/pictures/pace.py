@@ -74,9 +74,8 @@ class Pace:
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
         if self.speed is not None and 1 < len(self.frames) == self.recorded and self.frames_per_second < SMOOTH:
-            enough = f"{USUAL / self.speed:.{2 if USUAL < 10.0 * self.speed else 0}f}"
-            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: --fps {enough}"
-            kept += f" records {USUAL:g} for each second of the film"
+            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: "
+            kept += f"--fps {USUAL / self.speed:.4g} records {USUAL:g} for each second of the film"
         return kept
 
 
