@@ -473,6 +473,7 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
         ),
         (["--colour", "heat"], "picture.colour is 'heat'"),
         (["--set", "solver.time_step=1"], "must begin with picture."),
+        (["--film", "--set", "picture.film_frames=0"], "--film is given, but picture.film_frames is 0"),
     ):
         with pytest.raises(SystemExit) as end:
             main(["picture", "a", *arguments])
