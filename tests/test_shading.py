@@ -106,6 +106,15 @@ def test_two_fluids_have_their_colours():
     assert (image[..., 0] > 3.0 * image[..., 2]).mean() > 0.02
 
 
+def test_fluid_that_left_a_periodic_plane_is_seen_where_it_comes_back():
+    """Up to the edges, and beside what is at the other edge."""
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.3], "periodic": [True, False]}
+    scene = scene_of(2, fluids=2, container=box)
+    x, colours = first_state(scene)
+    moved = drawn(scene, x + [1.5, 0.0])  # by two and a half periods: the fluids have changed places
+    np.testing.assert_allclose(moved, drawn(scene, x, colours[::-1]), atol=1e-9)
+
+
 def test_the_plane_shows_pure_colours_and_mixtures():
     scene = scene_of(2, fluids=2, picture={"width": 300, "height": 200})
     x, colours = first_state(scene)
