@@ -202,6 +202,21 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(
     assert {path.name for path in there.iterdir()} == RUN_FILES - missing
 
 
+def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command, folder, monkeypatch):
+    """As nobody knows how many steps it takes where these are chosen."""
+    told = []
+
+    @contextmanager
+    def track(*whole):
+        told.append(whole)
+        yield lambda n: told.append(n)
+
+    monkeypatch.setattr(cortado.cli.commands.run_recording, "track", track)
+    arguments = ["--time", 0.02, "--set", "solver.time_step=auto", "--no-pictures", "--out", "dam"]
+    assert cortado_command("run", "scene.toml", *arguments)[0] == 0
+    assert told[0] == (100, "run, % of its time") and sum(told[1:]) == 100 and min(told[1:]) >= 0
+
+
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.cli.commands.run_recording, cortado.cli.commands.optimise):

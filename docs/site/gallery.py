@@ -26,6 +26,11 @@ PROJECTION = ("solver={kind = 'projection', time_step = 'auto'}",)
 NEW = ("solver.time_step=auto",)
 """Templates have steps for wider spacings."""
 
+FOAM = "phase.milk.rest_density=600", "phase.milk.viscosity=0.2", "phase.coffee.viscosity=0.1"
+"""Milk that stays on the coffee."""
+DROP = "fluid.1.velocity=[0, -1.2, 0]", "phase.0.viscosity=0.05", "phase.1.viscosity=0.05", "picture.field_of_view=21"
+"""One that is slow enough for its crown to hold together."""
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -67,13 +72,13 @@ ENTRIES = {
     "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
     "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
     "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, (ORBIT,)),
-    "jug": Entry(FIGURES / "jug.toml", 0.0022, 1.8, 0.45),
+    "jug": Entry(FIGURES / "jug.toml", 0.002, 1.8, 0.45),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
     "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, "container.colour=[0.8, 0.78, 0.72]")),
-    "latte_art": Entry(TEMPLATES / "pour.toml", 0.0015, 0.9, 1.0, NEW),
+    "latte_art": Entry(TEMPLATES / "pour.toml", 0.0015, 0.9, 1.0, (*NEW, *FOAM)),
     "rotor": Entry(FIGURES / "rotor.toml", 0.0026, 1.5, 0.7),
     "fountain": Entry(FIGURES / "fountain.toml", 0.004, 1.1, 0.8),
-    "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.16, 0.4, (*NEW, "picture.field_of_view=21")),
+    "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.2, 0.4, (*NEW, *DROP)),
     "raft": Entry(TEMPLATES / "raft.toml", 0.016, 1.8, 0.5, NEW),
     "baffles": Entry(FIGURES / "baffles.toml", 0.0065, 1.7, 0.4),
     "shaken": Entry(FIGURES / "shaken.toml", 0.0045, 0.75, 0.5, PROJECTION),

@@ -104,7 +104,8 @@ class _Lines:
         self._done += n
         now = time.monotonic()
         skipped, begun = self._first = self._first or (self._done, now)
-        finished_late = self._done >= self._total and now - self._started >= self._interval
+        is_last = self._done - n < self._total <= self._done
+        finished_late = is_last and now - self._started >= self._interval
         if now - self._last_line < self._interval and not finished_late:
             return
         self._last_line = now
