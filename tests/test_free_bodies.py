@@ -71,6 +71,8 @@ def begun(scene):
             if table.angular_velocity is not None:
                 turning = table.angular_velocity
                 found[f"{table.name}.angular_velocity"] = np.array(turning[0] if flat else turning)
+        else:
+            found[f"{table.name}.scale"] = np.array(1.02)
     return found
 
 
@@ -199,11 +201,12 @@ def test_bodies_touch_across_a_period():
     ids=["plane", "space", "touching", "touching across a period", "touching in space"],
 )
 def test_derivatives_of_bodies(made, loss):
-    """Reverse and forward mode to round-off, and differences, of all that a body begins with and of its density."""
+    """Reverse and forward mode to round-off, and differences, of all that a body begins with, of its density, and of
+    how large what it touches is."""
     scene = made()
     problem, random = Problem(Simulation(scene, precision="float64"), 6, loss), np.random.default_rng(3)
     values = {**begun(scene), "gravity": np.array([0.5, -9.81, 0.2][: scene.dimension])}
-    scales = {"density": 50.0, "position": 0.01}
+    scales = {"density": 50.0, "position": 0.01, "scale": 0.1}
     along = {
         name: scales.get(name.split(".")[-1], 0.3) * random.normal(size=np.shape(value))
         for name, value in values.items()

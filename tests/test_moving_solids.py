@@ -8,6 +8,7 @@ from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.runs.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import greatest_speed
 from cortado.scene.stability import stability_limits
 from cortado.scene.turns import rotation_matrix
@@ -60,38 +61,41 @@ def space(**tables):
 
 
 def walls_of(simulation):
-    """Those that move, as the device has them: places, feet and velocities."""
+    """Those that move, as the device has them: places, feet, velocities and weights."""
     search = simulation.solver.search
     first = np.count_nonzero(simulation.solver.search.walls["wall_weights"].numpy()) - search.moving._own["count"]
-    names = ("wall_positions", "wall_feet", "wall_velocities")
+    names = ("wall_positions", "wall_feet", "wall_velocities", "wall_weights")
     return [search.walls[name].numpy()[first:] for name in names]
 
 
-@pytest.mark.parametrize("scene", [plane(ROTOR), space()], ids=["plane", "space"])
-def test_walls_are_where_the_path_says_and_move_as_it_does(scene):
-    """Against NumPy: after the last step, as a set."""
-    simulation = Simulation(scene, precision="float64")
+@pytest.mark.parametrize(("scene", "scale"), [(plane(ROTOR), 1.2), (space(), 0.9)], ids=["plane", "space"])
+def test_walls_are_where_the_path_says_and_move_as_it_does(scene, scale):
+    """Against NumPy: after the last step, as a set; beneath the surface of a solid that is stretched."""
+    simulation, table = Simulation(scene, precision="float64"), scene.solid[0]
     steps, dt, d = 30, 0.001, scene.dimension
-    run = simulation.run(steps)
-    motion = run.solids[scene.solid[0].name]
-    assert motion.positions.shape == (steps + 1, d) and len(motion.rotations) == steps + 1
-    own = simulation.walls[-len(walls_of(simulation)[0]) :]
-    table = scene.solid[0]
-    frame = (own - table.middle()) @ table.turn(d)
+    run = simulation.run(steps, controls={f"{table.name}.scale": scale})
+    motion = run.solids[table.name]
+    assert motion.positions.shape == (steps + 1, d) and len(motion.rotations) == steps + 1 and motion.scale == scale
+    walls = discretise(scene).walls
+    own = walls.solid == 0
+    surface, own_feet = (
+        vectors[own] @ table.turn(d) for vectors in (walls.positions + walls.feet - table.middle(), walls.feet)
+    )
 
     def placed(k):
         turn = rotation_matrix(tuple(np.atleast_1d(motion.rotations[k])))
-        return motion.positions[k] + frame @ turn.T
+        return motion.positions[k] + (scale * surface - own_feet) @ turn.T
 
     now, before = placed(steps), placed(steps - 1)
-    found, feet, velocities = (array[:, :d] for array in walls_of(simulation))
+    found, feet, velocities = (array[:, :d] for array in walls_of(simulation)[:3])
     order = np.lexsort(np.round(now, 9).T), np.lexsort(np.round(found, 9).T)
     np.testing.assert_allclose(found[order[1]], now[order[0]], atol=1e-12)
+    np.testing.assert_allclose(walls_of(simulation)[3][order[1]], walls.weights[own][order[0]] * scale ** (d - 1))
     turns = [rotation_matrix(tuple(np.atleast_1d(motion.rotations[k]))) for k in (steps, steps - 1)]
     feet_before = feet @ turns[0] @ turns[1].T
     moved = (now - before)[order[0]] + (feet - feet_before)[order[1]]  # of the surface
     np.testing.assert_allclose(velocities[order[1]], moved / dt, atol=1e-9)
-    solid = table.solid()
+    solid = table.stretched(scale).solid()
     turn = rotation_matrix(tuple(np.atleast_1d(motion.rotations[steps]))) @ table.turn(d).T
     back = table.middle() + (found + feet - motion.positions[steps]) @ turn
     np.testing.assert_allclose(solid.distance(back), 0.0, atol=1e-9)  # feet turn with it
@@ -251,13 +255,18 @@ def test_steps_that_are_chosen_know_how_fast_solids_are():
 
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
-    """With walls that weigh nothing."""
+    """With walls that weigh nothing; a larger one comes to it sooner, by what it reaches further down."""
     from cortado.scene import walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
-    falling = {"name": "block", "shape": "box", "lower": [0.2, 0.5], "upper": [0.4, 0.7], "motion": "path"}
-    with pytest.raises(DivergedError, match="entered the solid 'block' and was at"):
-        Simulation(plane({**falling, "velocity": [0.0, -1.0]})).run(400)
+    falling = {"name": "block", "shape": "box", "lower": [0.2, 0.45], "upper": [0.4, 0.65], "motion": "path"}
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}
+    simulation, steps = Simulation(plane({**falling, "velocity": [0.0, -1.0]}, fluid=[pool])), []
+    for scale in (1.0, 1.4):
+        with pytest.raises(DivergedError, match="entered the solid 'block' and was at") as found:
+            simulation.run(400, controls={"block.scale": scale})
+        steps.append(found.value.step)
+    assert steps[0] - steps[1] == pytest.approx(40, abs=4)
 
 
 @pytest.mark.parametrize(

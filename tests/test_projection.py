@@ -37,6 +37,21 @@ def test_a_step_is_that_of_the_twin(case):
     assert (k > 0.0).any() and (k < 0.0).any()
 
 
+@pytest.mark.parametrize("make", [plane, scene])
+def test_pressures_keep_both_momenta(make):
+    """Of fluid that nothing holds; the shift and repairs move particles whose velocities stay as they are."""
+    made = make(solver=SOLVER, container={"shape": "none"}).replaced("phase[0].viscosity=0")
+    made = made.replaced(f"forces.gravity={[0.0] * made.dimension}")
+    simulation = Simulation(made, precision="float64")
+    given = thrown(simulation)
+    x, v = given["initial_positions"], given["initial_velocities"]
+    impulses = simulation.run(1, given).velocities[-1] - v
+    twice = x.T @ impulses
+    assert np.abs(impulses.sum(axis=0)).max() < 1e-12 * np.abs(impulses).sum()
+    assert np.abs(twice - twice.T).max() < 1e-12 * np.abs(x).max() * np.abs(impulses).sum()
+    assert np.abs(impulses).max() > 0.01
+
+
 DERIVED = {
     **CASES,
     "mixture": lambda: two_layers(solver=SOLVER),

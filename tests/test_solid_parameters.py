@@ -1,16 +1,19 @@
-"""Where solids are, as parameters: reverse and forward mode of all four, in each solver and with each force."""
+"""Where solids are and how large, as parameters: reverse and forward mode of all five, in each solver and with each
+force."""
 
 import warnings
 
 import numpy as np
 import pytest
 
-from cortado import Problem, Simulation, certify
+from cortado import Problem, Scene, Simulation, certify
 from cortado.certificate.perturbations import coherent_directions, scales
 from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
+from cortado.runs.exports.exported import Exported
+from cortado.runs.solid_motion import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, distance
 from test_moving_solids import PADDLE, ROTOR, WATER, plane, space
@@ -109,6 +112,7 @@ def point_of(scene, steps=STEPS, seed=0):
             "rotation": (begun, 1.0),
             "displacement": (drift + 1e-5 * random.normal(size=drift.shape), 1e-3),
             "turn": (turned + 1e-4 * random.normal(size=turned.shape), 0.01),
+            "scale": (np.array(1.04 + 0.02 * seed), 0.1),
         }
         point |= {f"{solid.name}.{name}": value for name, (value, _) in own.items()}
         along |= {f"{solid.name}.{name}": size * random.normal(size=value.shape) for name, (value, size) in own.items()}
@@ -132,7 +136,7 @@ def check(problem, point, along):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_all_four_have_derivatives(name):
+def test_all_five_have_derivatives(name):
     scene = SCENES[name]()
     check(problem_of(scene), *point_of(scene))
 
@@ -173,6 +177,30 @@ def test_a_solid_that_is_told_where_it_begins_is_that_of_a_scene_that_says_so(ki
     assert abs(found / problem_of(told).value(fluid) - 1.0) > 1e-6
 
 
+@pytest.mark.parametrize(
+    ("shape", "scale"),
+    [
+        ({"shape": "box", "lower": [0.35, 0.25], "upper": [0.65, 0.55]}, 4.0 / 3.0),
+        ({"shape": "sphere", "centre": [0.5, 0.4], "radius": 0.15}, 0.9),
+    ],
+    ids=["box", "disc"],
+)
+def test_a_solid_that_is_told_how_large_it_is_has_the_walls_of_one_that_is(shape, scale, tmp_path):
+    """Water that is packed about one of that size has nearly the rest density beside it."""
+    solid = {**shape, "name": "one", "motion": "path", "velocity": [0.0, 0.0]}
+    table = plane(solid).solid[0].stretched(scale)
+    larger = {**solid, **{name: getattr(table, name) for name in table.measures}, "position": [0.5, 0.4]}
+    there = Simulation(plane(larger, fluid=[body("water", upper=(1.0, 0.8))], solver=PCISPH), precision="float64")
+    np.save(tmp_path / "water.npy", there.positions)
+    fluid = {"shape": "points", "file": str(tmp_path / "water.npy"), "phase": "water"}
+    told = Simulation(plane({**solid, "position": [0.5, 2.0]}, fluid=[fluid], solver=PCISPH), precision="float64")
+    near = table.solid().distance(there.positions) < 0.1
+    at = {"initial_positions": there.positions, "one.position": [0.5, 0.4]}
+    found, bare = (told.quantity("density", controls={**at, "one.scale": one})[near].mean() for one in (scale, 1.0))
+    assert found == pytest.approx(there.quantity("density")[near].mean(), rel=8e-3)
+    assert bare != pytest.approx(found, rel=5e-2)
+
+
 def test_a_displacement_and_a_turn_are_from_where_it_begins():
     scene = plane(ROTOR)
     point, _ = point_of(scene)
@@ -208,6 +236,7 @@ def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
 
     whole = simulation.run(STEPS, point)
     first = simulation.run(2, some(point, slice(2)))
+    point, along = ({n: v for n, v in values.items() if n != "rotor.scale"} for values in (point, along))  # in states
     rest = simulation.run(STEPS - 2, some(point, slice(2, None)), state=first.last_state)
     np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
     np.testing.assert_array_equal(rest.solids["rotor"].rotations, whole.solids["rotor"].rotations[2:])
@@ -250,6 +279,8 @@ def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
             [0.1, 0.1],
             r"'ball.position' is unknown, but must be one of .*, rotor.angular_velocity in this scene",
         ),
+        ("rotor.scale", [1.0, 1.1], r"has shape \(2,\), but must be \(\)"),
+        ("rotor.scale", 0.0, r"rotor.scale is 0.0, but must be greater than 0"),
         ("rotor.velocity", [0.1], r"has shape \(1,\), but must be \(2,\) in m/s"),
         ("rotor.angular_velocity", np.inf, "has a value that is not finite, but must be numbers in rad/s"),
     ],
@@ -283,6 +314,43 @@ def test_a_solid_that_jumps_is_warned_of():
         warnings.simplefilter("error", CortadoWarning)
         simulation.run(1, controls={"rotor.position": [0.3, 0.3]}, state=first.last_state)
         Simulation(plane(ROTOR)).run(4)
+
+
+@pytest.mark.filterwarnings("ignore:.*goes on")
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"rotor.scale": 1.6}, r"'rotor' is 1\.6 times as large .*, but its walls hold for 0\.6 to 1\.5"),
+        ({"rotor.scale": 0.5}, r"'rotor' is 0\.5 times as large .*, but its walls hold for 0\.6 to 1\.5"),
+        (
+            {"ball.scale": 1.4},
+            r"'ball' is 1\.4 times as large .* and reaches 0\.06 m, more than a spacing",
+        ),
+        ({"floor.scale": 1.1}, r"'floor' is 1\.1 times as large .*, so that it does not fill a period"),
+    ],
+)
+def test_a_size_that_walls_do_not_hold_is_warned_of(given, sentence):
+    floor = {"name": "floor", "shape": "box", "lower": [0.0, -0.2], "upper": [0.6, 0.0], "motion": "path"}
+    scene = periodic().model_dump(exclude_none=True)
+    scene["solid"] += ({**floor, "velocity": [0.1, 0.0]}, {**BALL, "centre": [0.3, 0.7], "radius": 0.15})
+    simulation = Simulation(Scene(**scene))
+    with pytest.warns(CortadoWarning, match=sentence):
+        simulation.quantity("speed", controls=given)
+
+
+def test_a_run_that_goes_on_keeps_the_size():
+    """And it is drawn and exported so."""
+    simulation = Simulation(plane(ROTOR))
+    first = simulation.run(2, controls={"rotor.scale": 1.1})
+    rest = simulation.run(1, state=first.last_state)
+    assert first.solids["rotor"].scale == rest[:1].solids["rotor"].scale == np.float32(1.1)
+    drawn, exported = posed(simulation.scene, first.solids, -1).solid[0], Exported(first, simulation.scene).solids[0]
+    for faces in (drawn.own_solid().faces(0.1).vertices, exported.mesh.points):
+        np.testing.assert_allclose(np.ptp(faces, axis=0)[:2], [0.22, 0.11], rtol=1e-6)
+    with pytest.raises(InputError, match=r"rotor\.scale is given, but must be left out with a state"):
+        simulation.run(1, controls={"rotor.scale": 1.1}, state=first.last_state)
+    density = simulation.quantity("density", first, controls={"rotor.scale": 1.1})  # which is that of the run
+    np.testing.assert_array_equal(density[-1], simulation.quantity("density", first.last_state))
 
 
 def steady_of(scene, seed=0):

@@ -38,10 +38,12 @@ slip = "no"
 steps = 10
 target.rotor.displacement = [[0.0, 0.0], [0.004, 0.001], [0.002, 0.0]]
 target.rotor.turn = [0.0, 0.05]
+target.rotor.scale = 1.05
 
 [optimise]
 start.rotor.displacement = [[0.0, 0.0], [0.0, 0.0]]
 start.rotor.turn = [0.0, 0.0]
+start.rotor.scale = 1.0
 bounds.rotor.turn = [-0.1, 0.1]
 knots = 3
 optimiser = "lbfgs"
@@ -51,11 +53,12 @@ iterations = 20
 
 
 def test_a_task_searches_a_path_by_its_knots(tmp_path):
-    """Also one of numbers, and a knot is where the solid is at the end of its step."""
+    """Also one of numbers, and a knot is where the solid is at the end of its step; and how large the solid is."""
     file = tmp_path / "task.toml"
     file.write_text(TASK)
     made = setup(load_task(file), "cpu", "float64")
     assert made.start["rotor.displacement"].shape == (3, 2) and made.start["rotor.turn"].shape == (3,)
+    assert made.start["rotor.scale"] == 1.0
     found = optimise(made.search, made.start, optimiser="lbfgs", iterations=8, bounds=made.bounds)
     assert found.loss < 0.5 * made.search.value(made.start)
     knots = knot_values(made, found.parameters, made.search.parameters(found.parameters))

@@ -24,7 +24,7 @@ class CarryCup(Carry):
 
     @classmethod
     def small(cls) -> Self:
-        return cls((16, 10), 0.0125, 0.003, 0.4, moving=240, standing=60, blocks=60)
+        return cls((16, 10), 0.0125, 0.003, 0.4, moving=240, standing=60, blocks=240)
 
     @classmethod
     def large(cls) -> Self:

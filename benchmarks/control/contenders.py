@@ -68,6 +68,7 @@ CONTENDERS: dict[str, Contender] = {
     "frozen_geometry": Descent(gradients.FrozenGeometry()),
     "damped": Descent(gradients.Damped(5.0)),
     "adjoint_viscosity": Descent(gradients.AdjointViscosity()),
+    "long_updates": Descent(gradients.AdjointViscosity(), optimisers.Adam(0.25)),
     "line_search": LINE_SEARCH,
     "line_search_exact": Descent(gradients.Exact(), optimisers.LineSearch()),
     "ensemble_mean": Descent(gradients.EnsembleMean(0.05)),

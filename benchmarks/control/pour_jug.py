@@ -47,7 +47,7 @@ class PourJug(Task):
 
     @classmethod
     def small(cls) -> Self:
-        return cls(0.0125, 0.0022, 550, blocks=25)
+        return cls(0.0125, 0.0022, 550, blocks=110)
 
     @classmethod
     def large(cls) -> Self:

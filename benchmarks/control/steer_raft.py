@@ -23,11 +23,11 @@ DEPTH = 0.2
 """Of the water [m]."""
 RAFT = (0.25, 0.1)
 """Its length and height [m]; it is half as dense as water, so that its middle is at the surface."""
-BEGIN, WANTED = 0.325, 0.39
+BEGIN, WANTED = 0.325, 0.46
 """How far the middle of the raft is from the paddle at first, and where it shall be at the end [m]."""
 VISCOSITY = 0.1
 """[Pa s]"""
-KNOWN = (0.7, 0.55, 0.2, 0.1, 0.1, 0.1)
+KNOWN = (0.9, 1.0, 1.0, 0.9, 0.7, 0.7, 0.5, 0.5, 0.7, 0.7)
 """What a search found, rounded."""
 
 

@@ -44,7 +44,7 @@ class StirMilk(Task):
 
     @classmethod
     def small(cls) -> Self:
-        return cls(14, 0.004, 0.004, actions=25, repeats=10)
+        return cls(14, 0.004, 0.004, actions=125, repeats=2)
 
     @classmethod
     def large(cls) -> Self:

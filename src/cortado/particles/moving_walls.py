@@ -1,5 +1,11 @@
 """The wall particles of solids that move: where they are at the end of a step, sorted by cell, and how fast the point
-of the surface above each gets there. Of a solid that turns that is not as fast as the particle."""
+of the surface above each gets there. Of a solid that turns that is not as fast as the particle.
+
+A solid may be stretched about its middle by a scale sigma. Its wall particles stay as deep beneath the surface as they
+are: one that has the place r, the foot f = q - r to the point q of the surface, and the weight w, in the frame of the
+solid, is at c + R (sigma q - f), has the foot R f, and the weight sigma^(d - 1) w, as its part of the surface grows by
+that. So flat walls keep the weights that were found for them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -55,6 +61,23 @@ def matrix_of(precision: Precision) -> Any:
 
 
 @cache
+def sizes_type(precision: Precision) -> Any:
+    """The Warp struct of how large solids are."""
+    real = precision.real
+
+    class Sizes:
+        scales: wp.array2d(dtype=real)
+        """(members, solids) sigma [-]."""
+        growths: wp.array2d(dtype=real)
+        """Their tangents, over themselves."""
+        power: real
+        """Of sigma, by which weights grow: d - 1."""
+
+    Sizes.__name__ = Sizes.__qualname__ = f"Sizes_{precision.name}"
+    return wp.struct(Sizes)
+
+
+@cache
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     """Those that place wall particles, that write them in the order of their cells, that say where cells begin, and
     that write tangents."""
@@ -62,26 +85,39 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     module = wp.get_module(f"cortado_moving_walls_{precision.name}")
     module.options["enable_backward"] = False
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
-    own_of: Any = bundle(own=vector, own_feet=vector, own_slides=vector, own_weights=real, own_grips=real)
+    own_vectors = dict.fromkeys(("own", "own_feet", "own_slides"), vector)
+    own_of: Any = bundle(**own_vectors, own_weights=real, own_grips=real, own_solids=wp.int32)
+    sizes_of = sizes_type(precision)
     walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, wall_solids=wp.int32)
     length_of: Any = bundle(time_step=real, time_step_dot=real)
-    dots_of: Any = bundle(wall_positions_dot=vector, wall_velocities_dot=vector, wall_turns_dot=vector)
+    vector_dots = {f"wall_{name}_dot": vector for name in ("positions", "velocities", "turns")}
+    dots_of: Any = bundle(**vector_dots, wall_growths_dot=real)
+
+    @wp.func
+    def place_of(b: int, scale: real, of: own_of) -> vector:
+        """In the frame of its solid; with a scale of 1 to the last bit its own place."""
+        return of.own[b] + (scale - real(1.0)) * (of.own[b] + of.own_feet[b])
+
+    @wp.func
+    def surface_of(b: int, scale: real, of: own_of) -> vector:
+        """The point of the surface above it, likewise."""
+        return scale * (of.own[b] + of.own_feet[b])
 
     @wp.kernel(module=module, enable_backward=False)
     def place(
         count: int,
-        own: wp.array(dtype=vector),
-        solid: wp.array(dtype=wp.int32),
+        of: own_of,
         positions: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
+        sizes: sizes_of,
         # out
         x: wp.array(dtype=vector),
     ):
         j = wp.tid()
         member = j // count
         b = j - member * count
-        k = solid[b]
-        x[j] = positions[member, k] + turns[member, k] * own[b]
+        k = of.own_solids[b]
+        x[j] = positions[member, k] + turns[member, k] * place_of(b, sizes.scales[member, k], of)
 
     @wp.kernel(module=module, enable_backward=False)
     def write(
@@ -90,10 +126,10 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         of: own_of,
-        solid: wp.array(dtype=wp.int32),
         before: wp.array2d(dtype=vector),
         turns_before: wp.array2d(dtype=matrix),
         turns: wp.array2d(dtype=matrix),
+        sizes: sizes_of,
         x: wp.array(dtype=vector),
         # out
         walls: walls_of,
@@ -102,15 +138,16 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         j = order[p]
         member = j // count
         b = j - member * count
-        k = solid[b]
-        foot = turns[member, k] * of.own_feet[b]
-        surface_before = before[member, k] + turns_before[member, k] * (of.own[b] + of.own_feet[b])
+        k = of.own_solids[b]
+        foot, scale = turns[member, k] * of.own_feet[b], sizes.scales[member, k]
+        grown = wp.pow(scale, sizes.power)
+        surface_before = before[member, k] + turns_before[member, k] * surface_of(b, scale, of)
         moved = x[j] + foot - surface_before
         walls.wall_positions[first + p] = x[j]
         walls.wall_feet[first + p] = foot
         walls.wall_velocities[first + p] = moved / time_step[member] + turns[member, k] * of.own_slides[b]
-        walls.wall_weights[first + p] = of.own_weights[b]
-        walls.wall_grips[first + p] = of.own_grips[b]
+        walls.wall_weights[first + p] = grown * of.own_weights[b]
+        walls.wall_grips[first + p] = grown * of.own_grips[b]
         walls.wall_solids[first + p] = k
 
     @wp.kernel(module=module, enable_backward=False)
@@ -130,9 +167,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         order: wp.array(dtype=wp.int32),
         length: length_of,
         of: own_of,
-        solid: wp.array(dtype=wp.int32),
         turns_before: wp.array2d(dtype=matrix),
         turns: wp.array2d(dtype=matrix),
+        sizes: sizes_of,
         before_dot: wp.array2d(dtype=vector),
         turned_before_dot: wp.array2d(dtype=vector),
         after_dot: wp.array2d(dtype=vector),
@@ -145,18 +182,21 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         j = order[p]
         member = j // count
         b = j - member * count
-        k = solid[b]
+        k = of.own_solids[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
-        x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
-        surface_dot = x_dot + wp.cross(turned, turns[member, k] * of.own_feet[b])
-        arm_before = turns_before[member, k] * (of.own[b] + of.own_feet[b])
+        growth, surface = sizes.growths[member, k], surface_of(b, sizes.scales[member, k], of)
+        arm, arm_before = turns[member, k] * surface, turns_before[member, k] * surface
+        surface_dot = after_dot[member, k] + wp.cross(turned, arm) + growth * arm
+        x_dot = surface_dot - wp.cross(turned, turns[member, k] * of.own_feet[b])
         surface_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], arm_before)
+        surface_before_dot += growth * arm_before
         dt = length.time_step[member]
         moved_dot = surface_dot - surface_before_dot
         moved_dot -= length.time_step_dot[member] * (wall_velocities[first + p] - slide)
         walls.wall_positions_dot[first + p] = x_dot
         walls.wall_velocities_dot[first + p] = moved_dot / dt + wp.cross(turned, slide)
         walls.wall_turns_dot[first + p] = turned
+        walls.wall_growths_dot[first + p] = sizes.power * growth
 
     return place, write, shift, write_tangent
 
@@ -164,11 +204,15 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 class MovingWalls:
     """Those of one search for neighbours, behind the wall particles that are at rest in its arrays."""
 
-    def __init__(self, walls: WallArrays, first: int, solids: int, grid: Grid, layout: Layout):
+    def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
         """``walls`` of so many solids that move; the first of them has the number ``first`` in the arrays of the
         search."""
         precision, device, count = layout.precision, layout.device, len(walls)
         sizes = (layout.members, solids, precision, device)
+        self.sizes, each = sizes_type(precision)(), {"dtype": precision.real, "device": device}
+        """How large they are, which others may write."""
+        self.sizes.scales, self.sizes.growths = (make((layout.members, solids), **each) for make in (wp.ones, wp.zeros))
+        self.sizes.power = precision.real(dimension - 1)
         self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
         """How many solids, and their poses before and after a step, which somebody else writes."""
         self.before_dot, self.after_dot = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
@@ -182,8 +226,10 @@ class MovingWalls:
             "turned_before_dot": self.before_dot.turns,
             "after_dot": self.after_dot.positions,
             "turned_dot": self.after_dot.turns,
+            "scales": self.sizes.scales,
+            "growths": self.sizes.growths,
         }
-        """Poses and their tangents as kernels call them."""
+        """Poses and sizes as kernels call them, and their tangents."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
         """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
         slides = np.zeros((solids, 3))
@@ -195,7 +241,8 @@ class MovingWalls:
         numbers = {"own_weights": walls.weights, "own_grips": walls.grips}
         self._own: dict[str, Any] = {
             "count": count,
-            "solid": wp.array(walls.solid, dtype=wp.int32, device=device),
+            "sizes": self.sizes,
+            "own_solids": wp.array(walls.solid, dtype=wp.int32, device=device),
             "x": wp.zeros(self._all, dtype=precision.vector, device=device),
             **{name: wp.array(values, dtype=precision.vector, device=device) for name, values in vectors.items()},
             **{name: wp.array(values, dtype=precision.real, device=device) for name, values in numbers.items()},
@@ -210,7 +257,7 @@ class MovingWalls:
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write them to the arrays of a search, given the length (members,) of the step [s]."""
         (place, write, shift, _), after = self._kernels, self.after
-        launch(place, self._all, self._device, self._own, positions=after.positions, turns=after.turns)
+        launch(place, self._all, self._device, self._own, self.named, positions=after.positions)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts
         launch(shift, starts.size, self._device, first=self._first, starts=starts, shifted=shifted)

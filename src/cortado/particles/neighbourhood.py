@@ -93,11 +93,13 @@ def neighbourhood_type(precision: Precision) -> Any:
         """The number of the solid whose a wall particle is: of those that move from 0 on, of those at rest from -2 on
         downwards; -1 of the container's."""
         wall_positions_dot: wp.array(dtype=vector)
-        """Tangents of their positions, which like the next two are there where walls move."""
+        """Tangents of their positions, which like the next three are there where walls move."""
         wall_velocities_dot: wp.array(dtype=vector)
         """Tangents of their velocities."""
         wall_turns_dot: wp.array(dtype=vector)
         """Tangents of how their solid is turned: the rotation vector over the change."""
+        wall_growths_dot: wp.array(dtype=real)
+        """Tangents of their weights and grips, over these [-]."""
         support: real
         """Support radius h [m]."""
         per_support: real
@@ -149,6 +151,7 @@ class PairFunctions:
     wall_position_dot: Any
     wall_velocity_dot: Any
     wall_turn_dot: Any
+    wall_growth_dot: Any
     vectors: Any
     numbers: Any
     sixes: Any

@@ -109,9 +109,10 @@ class NeighbourSearch:
         layout: Layout,
         capacity: int,
         solids: int = 0,
+        dimension: int = 3,
     ):
         """``walls`` at rest are the same ones for all scenes of a batch; those that move stand behind them, one scene
-        after the other, and are written by `MovingWalls.write`, of so many ``solids``."""
+        after the other, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
@@ -128,6 +129,7 @@ class NeighbourSearch:
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
         kinds |= {"weights": precision.real, "grips": precision.real, "solids": wp.int32}
         own = dict.fromkeys(("positions_dot", "velocities_dot", "turns_dot"), precision.vector)
+        own["growths_dot"] = precision.real
         sizes = {**dict.fromkeys(kinds, count), **dict.fromkeys(own, count if solids else 0)}
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
@@ -136,7 +138,7 @@ class NeighbourSearch:
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
-        self.moving = MovingWalls(moving, len(still), solids, grid, layout) if solids else None
+        self.moving = MovingWalls(moving, len(still), solids, dimension, grid, layout) if solids else None
         """Those of solids that move."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)

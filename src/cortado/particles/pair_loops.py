@@ -140,6 +140,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
         "wall_position_dot",
         "wall_velocity_dot",
         "wall_turn_dot",
+        "wall_growth_dot",
     )
     return {
         **{f"_{name}": getattr(pair, name) for name in used},

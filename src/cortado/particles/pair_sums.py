@@ -26,15 +26,18 @@ Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
 
 
-def pair_sum(d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False) -> Decorator:
+def pair_sum(
+    d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
+) -> Decorator:
     """A decorator that makes of a term the Warp function of its sum over fluid and walls. ``walls`` is the term of
     walls if they act in another way; its parameters are among those of the fluid's. A sum that ``rubs`` has nothing of
-    walls that slip freely."""
+    walls that slip freely. A tangent is given the sum that it is of, which ``grows`` with the weights of walls: their
+    tangents count as many times as the term of that."""
 
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
         _check_walls(wall, term)
-        return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d, rubs), wall)
+        return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d, rubs, grows), wall, grows=grows)
 
     return make
 
@@ -53,18 +56,18 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
     """What gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum` where some
     walls have no slip, and `fluid_sum` where all slip freely."""
 
-    def summed(walls: Function, ahead: bool = True) -> Decorator:
-        return pair_sum(d, walls, ahead, rubs=True) if sticks else fluid_sum(d, ahead)
+    def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
+        return pair_sum(d, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, ahead)
 
     return summed
 
 
-def wall_sum(d: Discretisation) -> Decorator:
+def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
     """As `pair_sum`, over the walls alone."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
-        return _made(term, d, _over_walls(term, d, rubs=False), term)
+        return _made(term, d, _over_walls(term, d, rubs=False, grows=grows), term, grows=grows)
 
     return make
 
@@ -96,10 +99,19 @@ def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     return over_fluid(d, term.of_neighbours, body, ahead, *knows)
 
 
-def _over_walls(wall: Term, d: Discretisation, rubs: bool, of_one: bool = False) -> str:
+def _over_walls(wall: Term, d: Discretisation, rubs: bool, grows: Any = None, of_one: bool = False) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
-        called = f"{_terms(wall)} = _wall_term({wall.seen_from_i(of_b, '-1')})"
-        return [called, *(f"_total_{n} += _w_b * _term_{n}" for n in _numbers(wall))]
+        return [*added("_wall_term", wall, "_w_b", of_b), *growth(of_b)]
+
+    def growth(of_b: Mapping[str, str]) -> list[str]:
+        if grows is None or not d.moving:
+            return []
+        lines = added("_grown_term", grows.wall, "_w_b * _growth", of_b)
+        return ["_growth = _wall_growth_dot(_b, s)", "if _growth != _real(0.0):", *(f"    {line}" for line in lines)]
+
+    def added(called: str, term: Term, weight: str, of_b: Mapping[str, str]) -> list[str]:
+        call = f"{_terms(term)} = {called}({term.seen_from_i(of_b, '-1')})"
+        return [call, *(f"_total_{n} += {weight} * _term_{n}" for n in _numbers(term))]
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
@@ -114,9 +126,10 @@ def _numbers(term: Term) -> range:
     return range(len(term.results))
 
 
-def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = None) -> Any:
+def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = None, grows: Any = None) -> Any:
     module = module or wp.get_module(term.function.__module__)
-    terms = {"_term": wp.func(term.function, module=module), "_wall_term": wp.func(wall.function, module=module)}
-    made = summed(term.name, d, term.arrays, term.others, term.results, loops, terms, module)
-    made.term, made.discretisation = term, d
+    terms = {"_term": term, "_wall_term": wall, "_grown_term": wall if grows is None else grows.wall}
+    functions = {name: wp.func(one.function, module=module) for name, one in terms.items()}
+    made = summed(term.name, d, term.arrays, term.others, term.results, loops, functions, module)
+    made.term, made.wall, made.discretisation = term, wall, d
     return made

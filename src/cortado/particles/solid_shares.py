@@ -1,17 +1,19 @@
-"""What sums over walls give to the adjoints of where solids that move are.
+"""What sums over walls give to the adjoints of where solids that move are, and of how large.
 
 For a sum S_i = sum_b w_b T(x_ib, foot_b, v_b, ...) over wall particles and an adjoint of each S_i, particle i gives,
 with W = T . S_i^, to wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
 
-made by Warp from W. The particle is at x_b = c + R r_b. Its velocity is that of the point of the surface above it,
-s_b = c + R q_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the start of the step, and R has turned
-its foot R (q_b - r_b), too. So a solid that moves by c' and turns further by w', and whose pose at the start of the
-step changed by c_0' and w_0', has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' with
+made by Warp from W. The point of the surface above it is s_b = c + R q_b, and it is at x_b = s_b - foot_b, with a foot
+that R has turned too. Its velocity is that of s_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the
+start of the step. A scale sigma has made q_b so many times as long, and w_b sigma^(d - 1) times as large. So a solid
+that moves by c', turns further by w', and grows by g' = sigma' / sigma, and whose pose at the start of the step changed
+by c_0' and w_0', has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
 
-    f = sum x_b^ + v_b^ / dt,    t = sum R r_b x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
-    f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt.
+    f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
+    f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
+    g = sum R q_b . x_b^ + (R q_b - R_0 q_b) . v_b^ / dt + (d - 1) w_b W.
 """
 
 from collections.abc import Callable
@@ -24,6 +26,7 @@ import warp as wp
 from cortado.device.binding import Named
 from cortado.device.bundles import bundle
 from cortado.device.launching import add
+from cortado.device.precision import Precision
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.state import Layout
@@ -31,12 +34,14 @@ from cortado.particles.terms import Term
 
 ALL_WALLS = -(2**31)
 """In the place of the number of a solid: those of all solids and of the container."""
-NAMES = ("force", "torque", "force_before", "torque_before")
-"""f, t, f_0 and t_0."""
+NAMES = ("force", "torque", "force_before", "torque_before", "growth")
+"""f, t, f_0, t_0 and g."""
+WHOLE = ("force", "torque", "growth")
+"""What others than particles give."""
 SUM = """\
 def {name}(
     i: int, x: _vectors, at: _seen, constants: _pair, solid: int, middle: _vector, back: _matrix, slide: _vector,
-    s: _neighbourhood,
+    power: _real, s: _neighbourhood,
 ):
     _x_i = x[i]
 {own}
@@ -46,6 +51,8 @@ def {name}(
     _twisted = _vector()
     _twisted_before = _vector()
     _rate = _real(0.0)
+    _grown = _real(0.0)
+    _spread = _real(0.0)
     for _place in range(s.fluid_count[i], s.count[i]):
         _b = _neighbour(_place, i, s)
         if _wall_solid(_b, s) == solid:
@@ -62,10 +69,13 @@ def {name}(
             _torque += _wp.cross(_arm, _x_bar){by_foot}
             _pulled += _v_bar
             _surface = _arm + _foot
+            _surface_before = back * _surface
             _twisted += _wp.cross(_surface, _v_bar)
-            _twisted_before += _wp.cross(back * _surface, _v_bar)
+            _twisted_before += _wp.cross(_surface_before, _v_bar)
             _rate += _wp.dot(_v_bar, _v_b - slide)
-    return _force, _torque, _pulled, _twisted, _twisted_before, _rate
+            _grown += _wp.dot(_surface, _x_bar) + power * _w_b * _work({arguments})
+            _spread += _wp.dot(_surface - _surface_before, _v_bar)
+    return _force, _torque, _pulled, _twisted, _twisted_before, _rate, _grown, _spread
 """
 
 
@@ -75,12 +85,12 @@ class SolidShares:
     def __init__(self, walls: MovingWalls | None, layout: Layout):
         """``walls`` of the solids; where None move, nothing is given."""
         self._walls, self._pair = walls, layout.precision.pair
-        size, vector, device = layout.all_particles, layout.precision.vector, layout.device
+        size, kinds, device = layout.all_particles, share_kinds(layout.precision), layout.device
         solids = range(0 if walls is None else walls.solids)
-        self._arrays = [{name: wp.zeros(size, dtype=vector, device=device) for name in NAMES} for _ in solids]
-        self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in solids]
+        self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
+        self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
         self._whole = [
-            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]} for _ in solids
+            {name: wp.zeros(layout.members, dtype=kinds[name], device=device) for name in WHOLE} for _ in solids
         ]
         """What was given by others than particles."""
 
@@ -97,15 +107,15 @@ class SolidShares:
         sum ``over`` the walls of one solid, to that alone."""
         if self._walls is None:
             return
-        before, after = self._walls.before, self._walls.after
-        poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns}
+        before, after, power = self._walls.before, self._walls.after, self._walls.sizes.power
+        poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns, "power": power}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
             if over in (ALL_WALLS, solid):
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
-        """(n,) vectors that the particles have given to one solid so far, as kernels call them."""
+        """(n,) what the particles have given to one solid so far, as kernels call it."""
         return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
@@ -116,10 +126,10 @@ class SolidShares:
         self._forget(solid)
         return found
 
-    def add_whole(self, solid: int, force: wp.array, torque: wp.array) -> None:
-        """(members,) f and t of one solid, which others than particles give."""
-        for given, own in zip((force, torque), self._whole[solid].values(), strict=True):
-            add(given, own)
+    def add_whole(self, solid: int, *given: wp.array) -> None:
+        """(members,) f, t, and g where there is one, which others than particles give to one solid."""
+        for one, own in zip(given, self._whole[solid].values(), strict=False):
+            add(one, own)
 
     def clear(self) -> None:
         """Forget what was given."""
@@ -129,6 +139,11 @@ class SolidShares:
     def _forget(self, solid: int) -> None:
         for array in (*self._arrays[solid].values(), *self._whole[solid].values()):
             array.zero_()
+
+
+def share_kinds(precision: Precision) -> dict[str, Any]:
+    """Types of what a particle gives, by `NAMES`."""
+    return {**dict.fromkeys(NAMES, precision.vector), "growth": precision.real}
 
 
 WorkMaker = Callable[[Discretisation], Callable[..., Any]]
@@ -152,7 +167,7 @@ def solid_kernel(
     module = replace(discretisation, lanes=1, taped=False).module(False, f"{topic}_{term.name}_solids")
     shares = _sum(term, d, seen, rubs, module)
     neighbourhood = neighbourhood_type(precision)
-    bars = bundle(**dict.fromkeys(NAMES, vector), time_step=real)
+    bars = bundle(**share_kinds(precision), time_step=real)
     LOOPED = wp.constant(looped)
 
     def share(
@@ -166,6 +181,7 @@ def solid_kernel(
         turns: wp.array2d(dtype=matrix),
         turns_before: wp.array2d(dtype=matrix),
         slides: wp.array(dtype=vector),
+        power: real,
         x: wp.array(dtype=vector),
         at: seen,
         # in and out
@@ -181,14 +197,15 @@ def solid_kernel(
         R = turns[member, solid]
         slide = R * slides[solid]
         back = turns_before[member, solid] * wp.transpose(R)
-        force, torque, pulled, twisted, twisted_before, rate = shares(
-            i, x, at, constants, solid, positions[member, solid], back, slide, s
+        force, torque, pulled, twisted, twisted_before, rate, grown, spread = shares(
+            i, x, at, constants, solid, positions[member, solid], back, slide, power, s
         )
         per = real(1.0) / time_step[member]
         bar.force[i] = bar.force[i] + force + per * pulled
         bar.torque[i] = bar.torque[i] + torque + per * twisted + wp.cross(slide, pulled)
         bar.force_before[i] = bar.force_before[i] - per * pulled
         bar.torque_before[i] = bar.torque_before[i] - per * twisted_before
+        bar.growth[i] = bar.growth[i] + grown + per * spread
         bar.time_step[i] = bar.time_step[i] - per * rate
 
     share.__qualname__ = share.__name__ = f"{term.name}_share"

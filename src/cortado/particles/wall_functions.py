@@ -59,6 +59,10 @@ def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dic
     def wall_turn_dot(b: int, s: neighbourhood) -> vector:
         return load_vector(s.wall_turns_dot, b)
 
+    @wp.func
+    def wall_growth_dot(b: int, s: neighbourhood) -> real:
+        return load_number(s.wall_growths_dot, b)
+
     return {
         "wall_position": wall_position,
         "wall_weight": wall_weight,
@@ -70,4 +74,5 @@ def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dic
         "wall_position_dot": wall_position_dot,
         "wall_velocity_dot": wall_velocity_dot,
         "wall_turn_dot": wall_turn_dot,
+        "wall_growth_dot": wall_growth_dot,
     }

@@ -5,8 +5,8 @@ A term is told by its work W, a number that is linear in a vector ``bar`` of par
 
     A_i = sum_b w_b dW / dbar_i.
 
-Warp makes the gradients of W. Component k of the tangent of A is the change of W for the k-th unit vector as ``bar``,
-and the adjoint is the gradient of W for the adjoint of A as ``bar``.
+Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
+``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``.
 """
 
 from dataclasses import dataclass, replace
@@ -147,7 +147,9 @@ class _Text:
             **{f"{name}_i": dots[name] for name in self._entries},
         }
         moved = [name for name in self.term.parameters if name in known]
-        terms = " + ".join(self._product(name, f"_change_{name}") for name in moved)
+        terms = [self._product(name, f"_change_{name}") for name in moved]
+        if moving:  # W is linear in the unit vector, of which its gradient is all that the wall does
+            terms.append(f"_wall_growth_dot(_b, s) * _by_{self.of.bar}_i[_k]")
         own = [f"{dot} = dot.{name}[i]" for name, dot in dots.items()]
         own += ["_three = int(3)", "_total = _vector()"]  # not a number: Warp would write the gradient out for each
         body = [f"_change_{name} = {known[name]}" for name in moved]
@@ -156,7 +158,7 @@ class _Text:
             f"    _{self.of.bar}_i = _vector()",
             f"    _{self.of.bar}_i[_k] = _real(1.0)",
         ]
-        body += [f"    {self._gradients}", f"    _total[_k] += _w_b * ({terms})"]
+        body += [f"    {self._gradients}", f"    _total[_k] += _w_b * ({' + '.join(terms)})"]
         return self._made("act_tangent", "at: _seen, dot: _seen, ", own, body, "return _total", module)
 
     def _adjoint(self, module: Any) -> Any:
@@ -194,7 +196,7 @@ class _Text:
             end=f"    {end}",
         )
         walls = (f"wall_{name}" for name in ("position", "weight", "grip", "foot", "velocity", "solid"))
-        dots = (f"wall_{name}_dot" for name in ("position", "velocity", "turn"))
+        dots = (f"wall_{name}_dot" for name in ("position", "velocity", "turn", "growth"))
         matrices = [kind for kind in self.term.arrays.values() if kind not in (d.precision.real, d.precision.vector)]
         known: dict[str, Any] = {
             **{f"_{name}": getattr(pair, name) for name in ("separation", "neighbour", *walls, *dots)},

@@ -12,7 +12,7 @@ from cortado.particles.state import Parameters, State
 from cortado.rollout.choosing import begin_choosing
 from cortado.rollout.first_positions import FirstPositions
 from cortado.rollout.parameter_checks import check_places, check_sizes, unstable_sentence
-from cortado.rollout.path_checks import jump_sentence
+from cortado.rollout.path_checks import path_sentence
 from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
@@ -131,7 +131,7 @@ class ParameterSpace:
             self._one.run({**self._one.scheduled(own, clock), **own})
             for own, clock in zip(members, clocks, strict=True)
         ]
-        self._warn(jump_sentence(simulation.scene, rollout.initial, chosen[0]))
+        self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0]))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [self._origin(one["rest_density"]) for one in chosen]
         rollout.origins = origins * (len(rollout.clocks) // len(origins))

@@ -1,14 +1,22 @@
-"""What to say of solids that are told to go too far in a step."""
+"""What to say of solids that are told to go too far in a step, or to be too large or too small."""
 
 import numpy as np
 
 from cortado.particles.state import State
-from cortado.scene.motions import displacement_name, position_name, told
+from cortado.scene.motions import displacement_name, position_name, scale_name, told
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
+from cortado.scene.walls import WHOLE
 
 FURTHEST = 1.0
 """In spacings: solids that go further in a step pass over fluid, which is in them then."""
+SCALES = (0.6, 1.5)
+"""Between which wall particles hold fluid as they should: twice as large, a disc lets it in by 0.8 spacings."""
+
+
+def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays) -> str | None:
+    """One of those below, with the parameters that were given and all that steps take; None if there is none."""
+    return stretch_sentence(scene, values) or jump_sentence(scene, first, run)
 
 
 def jump_sentence(scene: Scene, first: State, run: Arrays) -> str | None:
@@ -29,4 +37,26 @@ def jump_sentence(scene: Scene, first: State, run: Arrays) -> str | None:
                 f"spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and a run that "
                 f"goes on from a state is given {position} as the first one was."
             )
+    return None
+
+
+def stretch_sentence(scene: Scene, values: Arrays) -> str | None:
+    """Of the first solid whose scale, among the parameters of a run, is too far from 1 for its walls, makes it reach
+    over fluid that the scene puts beside it, or lets it fill a period no more; None if there is none."""
+    spacing, periods = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    for table in told(scene.solid):
+        scale = float(values.get(scale_name(table.name), 1.0))
+        if scale == 1.0:
+            continue
+        start = f"the solid {table.name!r} is {scale:.4g} times as large as in the scene"
+        least, most = SCALES
+        if not least <= scale <= most:
+            return f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
+        size = float(np.ptp(table.shape_about()[0].extent(), axis=0).max())
+        grown = 0.5 * size * (1.0 - scale if table.side == "inside" else scale - 1.0)
+        if grown > FURTHEST * spacing and "initial_positions" not in values:
+            return f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
+        lower, upper = table.solid().extent()
+        if ((periods > 0.0) & (upper - lower > periods * (1.0 - WHOLE))).any():
+            return f"{start}, so that it does not fill a period of the container, as it does there."
     return None

@@ -13,14 +13,9 @@ from cortado.rollout.stepper import Steppable
 from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import OVER_TIME
 from cortado.scene.quantities import check_readable
 from cortado.scene.restart import RestartState
-
-FIRST = names(Role.STATE)
-"""Parameters that a state has, and a step from it does not take."""
 
 
 class Measured(Steppable, Protocol):
@@ -83,7 +78,9 @@ class Measuring:
         check_readable(name, "quantity", cast(Measured, self).initial.names)
         if not isinstance(of, Trajectory):
             return self._quantity(name, of, controls)
-        frames = [self._quantity(name, of[: k + 1].last_state, _at(controls, of, k)) for k in range(len(of))]
+        first = cast(Measured, self).known.state
+        given = {name: value for name, value in (controls or {}).items() if name not in first}
+        frames = [self._quantity(name, of[: k + 1].last_state, _at(given, of, k)) for k in range(len(of))]
         return np.array(frames)
 
     @in_turn
@@ -95,9 +92,8 @@ class Measuring:
         return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
 
 
-def _at(controls: Mapping[str, Any] | None, trajectory: Trajectory, frame: int) -> dict[str, Any]:
+def _at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
     """The controls of the step after a frame of the run that they were given to."""
     step = int(trajectory.steps[frame] - trajectory.steps[0])
-    given = {name: value for name, value in (controls or {}).items() if name not in FIRST}
     rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
     return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}

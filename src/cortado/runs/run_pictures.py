@@ -23,7 +23,7 @@ from cortado.pictures.space import SpacePainter
 from cortado.pictures.stage import upright
 from cortado.runs.emitted import is_out
 from cortado.runs.report import Figures
-from cortado.runs.solid_motion import SolidMotion, posed, solid_motions
+from cortado.runs.solid_motion import SolidMotion, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.camera_paths import Moment
 from cortado.scene.picture import Picture
@@ -63,7 +63,7 @@ def run_page(
     out = [is_out(scene, frame.others.get("emitted"), trajectory.particles) for frame in trajectory]
     stride = max(len(trajectory) // ENOUGH, 1)
     poses = [posed(scene, motions, k) for k in range(0, len(trajectory), stride)] if motions else []
-    draws = painter(scene, _places(trajectory, out), device, poses)
+    draws = painter(sized(scene, motions), _places(trajectory, out), device, poses)
 
     def state(k: int) -> State:
         frame, shown = trajectory[k], out[k]

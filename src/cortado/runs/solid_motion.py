@@ -1,7 +1,7 @@
 """Where solids that move are in the frames of a run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +14,7 @@ from cortado.scene.motions import (
     moving,
     position_name,
     rotation_name,
+    scale_name,
     solids_in,
     turn_name,
     velocity_name,
@@ -33,11 +34,14 @@ class SolidMotion:
     """(frames, d) of the middle of a body that is free [m/s]; None for one that is told where to go."""
     angular_velocities: NDArray[Any] | None = None
     """(frames, 3), in 2-D (frames,), of a body that is free [rad/s]; None for others."""
+    scale: float = 1.0
+    """How many times as large as in the scene one is that is told where to go."""
 
     def __getitem__(self, frames: slice) -> Self:
         """In some of the frames."""
-        moving = (None if one is None else one[frames] for one in (self.velocities, self.angular_velocities))
-        return type(self)(self.positions[frames], self.rotations[frames], *moving)
+        velocities, spins = (None if a is None else a[frames] for a in (self.velocities, self.angular_velocities))
+        places, turns = self.positions[frames], self.rotations[frames]
+        return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
 
 class SolidMotions(dict[str, SolidMotion]):
@@ -72,11 +76,13 @@ def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> So
     position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
     if f"{name}.{AXES[0]}" in fields:  # of a body that is free
         axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
-        moving = {"velocities": fields[velocity_name(name)][:, 0]}
+        moving: dict[str, Any] = {"velocities": fields[velocity_name(name)][:, 0]}
         moving["angular_velocities"] = fields[angular_velocity_name(name)][:, 0]
         return SolidMotion(position, _turned(axes + np.eye(dimension, 3), begun, dimension), **moving)
     turns = fields[turn_name(name)][:, 0].astype(np.float64)
-    return SolidMotion(position, turns + begun if dimension == 2 else _product(turns, begun))
+    scale = [*fields.get(scale_name(name), np.zeros((0, 1)))[:, 0], 1.0][0]  # earlier versions kept none
+    rotations = turns + begun if dimension == 2 else _product(turns, begun)
+    return SolidMotion(position, rotations, scale=float(scale))
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
@@ -96,9 +102,18 @@ def _product(turns: NDArray[Any], begun: NDArray[Any]) -> NDArray[Any]:
     return np.asarray((Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
 
 
+def sized(scene: Scene, motions: Mapping[str, SolidMotion]) -> Scene:
+    """A scene with the solids that move as large as they are in a run."""
+    tables = (table.stretched(motions[table.name].scale) if table.name in motions else table for table in scene.solid)
+    return scene.model_copy(update={"solid": tuple(tables)})
+
+
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
-    """A scene to be drawn, with the solids that move where they are in a frame."""
-    tables = [_posed(table, motions[table.name], frame) if table.name in motions else table for table in scene.solid]
+    """The same where they are in a frame, to be drawn."""
+    tables = [
+        _posed(table, motions[table.name], frame) if table.name in motions else table
+        for table in sized(scene, motions).solid
+    ]
     return scene.model_copy(update={"solid": tuple(tables)})
 
 

@@ -1,4 +1,4 @@
-"""How solids that move are displaced and turned from where they begin, over time."""
+"""How solids that move are displaced and turned from where they begin, over time, and how large they are."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +15,8 @@ AXES = ("turn_x", "turn_y", "turn_z")
 """How fields of states end that keep how a free body is turned: how far the ends of its unit axes have moved [-]."""
 RADIAN = 1.0
 """What an optimiser would take for a large turn [rad]."""
+STRETCH = 0.2
+"""What it would take for a large change of a scale, in parts of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
     found = [0.0]
     for solid in moving(solids):
         shape, middle = solid.shape_about()
-        reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)))
+        reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
         d = len(middle)
         shift = values.get(velocity_name(solid.name))
         turn = values.get(angular_velocity_name(solid.name))
@@ -114,8 +116,8 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
     """Of solids that move: where they begin, and where they are at the end of each step, as from there, or, if their
-    motion is steady, how fast they go; of free bodies how they begin, and their density."""
-    found = [make(solid) for solid in told(solids) for make in (_position, _rotation, _displacement, _turn)]
+    motion is steady, how fast they go, and how large they are; of free bodies how they begin, and their density."""
+    found = [make(solid) for solid in told(solids) for make in (_position, _rotation, _scale, _displacement, _turn)]
     steady = [
         replace(make(solid), role=Role.VIEW, in_place_of=name(solid.name))
         for solid in told(solids)
@@ -141,6 +143,11 @@ def solids_in(fields: Iterable[str]) -> list[str]:
 def rotation_name(solid: str) -> str:
     """Of the parameter that says how it begins, and of the field that keeps it."""
     return f"{solid}.rotation"
+
+
+def scale_name(solid: str) -> str:
+    """Of the parameter that says how many times as large it is, and of the field that keeps it."""
+    return f"{solid}.scale"
 
 
 def displacement_name(solid: str) -> str:
@@ -193,6 +200,19 @@ def _rotation(solid: SolidTable) -> Parameter:
         lambda source: begun.reshape(_shape_of(angles)),
         components=None if angles == 1 else lambda dimension, phases: dimension,
         change=lambda source, value: np.full(np.shape(value), RADIAN),
+    )
+
+
+def _scale(solid: SolidTable) -> Parameter:
+    return Parameter(
+        scale_name(solid.name),
+        "",
+        f"how many times as large as in the scene the solid {solid.name} is, about its middle",
+        Axis.SCALAR,
+        lambda source: np.float64(1.0),
+        role=Role.STATE,
+        range=Range.POSITIVE,
+        change=lambda source, value: STRETCH * np.abs(value),
     )
 
 

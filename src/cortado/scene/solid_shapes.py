@@ -1,6 +1,6 @@
 """The shapes that solids may have."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,6 +20,7 @@ Axis = Literal["x", "y", "z"]
 class BoxSolid(SolidTable):
     """A box, or a rectangle in 2-D."""
 
+    measures: ClassVar = ("lower", "upper")
     shape: Literal["box"] = "box"
     lower: Vector[Length]
     """(d,) Corner with the least coordinates, before it is turned [m]."""
@@ -41,6 +42,7 @@ class BoxSolid(SolidTable):
 class SphereSolid(SolidTable):
     """A sphere, or a disc in 2-D."""
 
+    measures: ClassVar = ("centre", "radius")
     shape: Literal["sphere"] = "sphere"
     centre: Vector[Length]
     """(d,) Middle [m]."""
@@ -58,6 +60,7 @@ class SphereSolid(SolidTable):
 class CapsuleSolid(SolidTable):
     """All that is no further than a radius from a segment."""
 
+    measures: ClassVar = ("start", "end", "radius")
     shape: Literal["capsule"] = "capsule"
     start: Vector[Length]
     """(d,) One end of the segment [m]."""
@@ -77,6 +80,7 @@ class CapsuleSolid(SolidTable):
 class CylinderSolid(SolidTable):
     """A cylinder, in 3-D."""
 
+    measures: ClassVar = ("base", "radius", "height")
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
     """(3,) Middle of the bottom [m]."""
@@ -101,6 +105,7 @@ class CylinderSolid(SolidTable):
 class CupSolid(SolidTable):
     """A cup that is open at the top; in 2-D its cut through the axis."""
 
+    measures: ClassVar = ("base", "radius", "height", "thickness")
     shape: Literal["cup"] = "cup"
     base: Vector[Length]
     """(d,) Middle of the bottom, outside [m]."""
@@ -148,12 +153,16 @@ class CupSolid(SolidTable):
 class PolygonSolid(PolygonShape, SolidTable):
     """A polygon, in 2-D."""
 
+    measures: ClassVar = ("corners",)
+
     def thinnest(self) -> float:
         return np.inf
 
 
 class MeshSolid(MeshShape, SolidTable):
     """What a mesh of triangles holds, in 3-D."""
+
+    measures: ClassVar = ("scale",)
 
     def thinnest(self) -> float:
         return np.inf

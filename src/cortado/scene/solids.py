@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from dataclasses import replace
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from cortado.scene.turns import Rotation, Turning, check_turn, rotation_matrix
 class SolidTable(Coloured):
     """What fluid cannot enter."""
 
+    measures: ClassVar[tuple[str, ...]] = ()
+    """Fields with which its shape grows."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
@@ -90,6 +92,13 @@ class SolidTable(Coloured):
     def shape_about(self) -> tuple[Solid, Points]:
         """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
 
+    def stretched(self, scale: float) -> Self:
+        """So many times as large about its middle."""
+        if scale == 1.0:
+            return self
+        grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
+        return self.model_copy(update={**grown, "position": tuple(self.middle().tolist())})
+
     @abstractmethod
     def thinnest(self) -> float:
         """Of its thinnest part [m]; infinite where that is not known."""
@@ -128,6 +137,11 @@ class SolidTable(Coloured):
             check_turn((*path, name), getattr(self, name), dimension)
         _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
+
+
+def _times(scale: float, value: Any) -> Any:
+    """A number, or one by one those of a tuple."""
+    return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value
 
 
 def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:

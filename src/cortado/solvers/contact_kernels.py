@@ -75,6 +75,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         own: wp.array(dtype=vector),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
+        scales: wp.array2d(dtype=real),
         # in and out
         normal: wp.array(dtype=vector),
         depth: wp.array(dtype=real),
@@ -86,10 +87,11 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         member = j // points
         x = after[member, number] + turns[member, number] * own[j - member * points]
         R = matrix(real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0))
-        y = nearest(x - middle, period)
+        y, scale = nearest(x - middle, period), real(1.0)
         if against >= 0:
             R = turns[member, against]
-            y = wp.transpose(R) * nearest(x - after[member, against], period) - middle
+            scale = scales[member, against]
+            y = wp.transpose(R) * nearest(x - after[member, against], period) / scale - middle
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(mesh, place, wp.float32(FAR))
         if not found.result or real(found.sign) * side > real(0.0):
@@ -99,7 +101,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         b = vec(corners.points[corners.indices[3 * found.face + 1]])
         c = vec(corners.points[corners.indices[3 * found.face + 2]])
         n = side * wp.normalize(wp.cross(b - a, c - a))
-        d = wp.dot(n, a - y)
+        d = scale * wp.dot(n, a - y)
         if d > depth[j]:
             normal[j] = R * n
             depth[j] = d
@@ -116,6 +118,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         turns: wp.array2d(dtype=matrix),
         after_dot: wp.array2d(dtype=vector),
         turned_dot: wp.array2d(dtype=vector),
+        growths: wp.array2d(dtype=real),
         of: seen,
         # out
         normal_dot: wp.array(dtype=vector),
@@ -126,12 +129,13 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         member = j // points
         r, d = turns[member, number] * own[j - member * points], of.depth[j]
         away = after_dot[member, number] + wp.cross(turned_dot[member, number], r)
-        turn = vector()
+        turn, grown = vector(), real(0.0)
         if against >= 0:
             turn = turned_dot[member, against]
             x = nearest(after[member, number] + r - after[member, against], period)
             away = away - after_dot[member, against] - wp.cross(turn, x)
-        change = -wp.dot(of.normal[j], away)
+            grown = growths[member, against] * (d + wp.dot(of.normal[j], x))
+        change = grown - wp.dot(of.normal[j], away)
         if d <= real(0.0):
             change = real(0.0)
         normal_dot[j] = wp.cross(turn, of.normal[j])
@@ -245,13 +249,14 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         weighed_sum: wp.array(dtype=real),
         share_bar: bars,
         # out
-        moved: bundle(own_force=vector, own_torque=vector, other_force=vector, other_torque=vector),
+        moved: bundle(own_force=vector, own_torque=vector, other_force=vector, other_torque=vector, other_growth=real),
     ):
-        """To the adjoints of both poses, point by point."""
+        """To the adjoints of both poses, and of how the other solid grows, point by point."""
         j = wp.tid()
         member = j // points
         d, n = of.depth[j], of.normal[j]
         own_force, own_torque, other_force, other_torque = vector(), vector(), vector(), vector()
+        other_growth = real(0.0)
         if d > real(0.0):
             r, S = turns[member, number] * own[j - member * points], whole[member]
             root = wp.sqrt(S)
@@ -266,6 +271,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
                 u = u + wp.cross(share_bar.other_bar[member], x)
                 by_arm = wp.cross(f, share_bar.other_bar[member])
                 other_torque = -wp.cross(x, x_bar) + wp.cross(f, u)
+                other_growth = depth_bar * (d + wp.dot(n, x))
                 x_bar += by_arm
                 other_force = -x_bar
             own_force = x_bar
@@ -274,5 +280,6 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         moved.own_torque[j] = own_torque
         moved.other_force[j] = other_force
         moved.other_torque[j] = other_torque
+        moved.other_growth[j] = other_growth
 
     return ContactKernels(Kernels(look, look_tangent, look_adjoint), Kernels(push, push_tangent, push_adjoint))

@@ -1,6 +1,6 @@
 """Bodies that touch the container, solids and each other: see `cortado.solvers.contact_kernels`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cortado.device.binding import Named
 from cortado.device.launching import sum_of
 from cortado.particles.arrays import padded
+from cortado.particles.solid_shares import WHOLE
 from cortado.particles.state import Layout
 from cortado.scene.motions import density_name
 from cortado.solvers.contact_kernels import contact_kernels
@@ -59,7 +60,11 @@ class Contact:
 
     def arrays(self, names: Sequence[str], dtype: Any) -> Arrays:
         """(members points,) by name, all 0."""
-        return {name: wp.zeros(self.all, dtype=dtype, device=self._layout.device) for name in names}
+        return self.arrays_of(dict.fromkeys(names, dtype))
+
+    def arrays_of(self, kinds: Mapping[str, Any]) -> Arrays:
+        """The same of several types."""
+        return {name: wp.zeros(self.all, dtype=kind, device=self._layout.device) for name, kind in kinds.items()}
 
     def total(self, dtype: Any) -> Any:
         """What adds up values of points, scene by scene."""
@@ -195,15 +200,13 @@ class ContactsAdjoint:
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
         layout = contacts.layout
-        real, vector, moved = (
-            layout.precision.real,
-            layout.precision.vector,
-            ("own_force", "own_torque", "other_force", "other_torque"),
-        )
+        real, vector = layout.precision.real, layout.precision.vector
+        kinds = dict.fromkeys(("own_force", "own_torque", "other_force", "other_torque"), vector)
+        kinds["other_growth"] = real
         self._work = [contact.arrays(["work", "weighed"], real) for contact in contacts.contacts]
-        self._moved = [contact.arrays(moved, vector) for contact in contacts.contacts]
+        self._moved = [contact.arrays_of(kinds) for contact in contacts.contacts]
         self._weighed = [contact.total(real) for contact in contacts.contacts]
-        self._sums = [{name: contact.total(vector) for name in moved} for contact in contacts.contacts]
+        self._sums = [{name: contact.total(kind) for name, kind in kinds.items()} for contact in contacts.contacts]
         self._shares = {f"{name}_bar": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SHARES}
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
@@ -223,7 +226,7 @@ class ContactsAdjoint:
             sums = {name: total(moved[name]) for name, total in self._sums[number].items()}
             bar.solids.add_whole(bodies[0].table.number, sums["own_force"], sums["own_torque"])
             if contact.touching.against >= 0:
-                bar.solids.add_whole(contact.touching.against, sums["other_force"], sums["other_torque"])
+                bar.solids.add_whole(contact.touching.against, *(sums[f"other_{name}"] for name in WHOLE))
 
 
 def _both(contact: Contact, changes: Sequence[Changes]) -> tuple[Changes, Changes]:

@@ -88,6 +88,8 @@ class Containment:
         nothing = Poses.zeros(members, 0, layout.precision, device)
         self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
         """Before and after a step."""
+        none = wp.zeros((members, 0), dtype=layout.precision.real, device=device)
+        self._scales = none if moving is None else moving.sizes.scales
         self._constants: dict[str, Any] = {
             "bounds": self._made_bounds(),
             "solids": self._made_solids(device),
@@ -164,12 +166,13 @@ class Containment:
         """The name of the solid that holds a position (d,) [m], of those that move as they are after the last step; of
         a batch, as they are in its first scene."""
         d = self.walled.dimension
-        after = self._poses[1]
-        poses = zip(after.positions.numpy()[0], after.turns.numpy()[0], strict=True)
-        places = [position for _ in self.walled.solids]
-        places += [(position - middle[:d]) @ turn[:d, :d] for middle, turn in poses]
-        for one, place in zip(self._obstacles, places, strict=True):
-            if one.solid.distance(place[None])[0] < -self.walled.tolerance(one):
+        after, resting = self._poses[1], len(self.walled.solids)
+        scales = self._scales.numpy()[0]
+        poses = zip(after.positions.numpy()[0], after.turns.numpy()[0], scales, strict=True)
+        places = [position] * resting
+        places += [(position - middle[:d]) @ turn[:d, :d] / scale for middle, turn, scale in poses]
+        for one, place, scale in zip(self._obstacles, places, [1.0] * resting + [*scales], strict=True):
+            if scale * one.solid.distance(place[None])[0] < -self.walled.tolerance(one):
                 return one.name
         return None
 
@@ -186,7 +189,7 @@ class Containment:
         solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
         before, after = self._poses
         solids.before, solids.turns_before = before.positions, before.turns
-        solids.after, solids.turns = after.positions, after.turns
+        solids.after, solids.turns, solids.scales = after.positions, after.turns, self._scales
         solids.reach, solids.still = REACH * walled.spacing, len(walled.solids)
         solids.period = precision.vector(*periods)
         solids.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))

@@ -50,6 +50,8 @@ def solids_type(precision: Precision) -> Any:
         turns_before: wp.array2d(dtype=matrix)
         after: wp.array2d(dtype=vector)
         turns: wp.array2d(dtype=matrix)
+        scales: wp.array2d(dtype=real)
+        """(members, solids) how many times as large as their meshes they are."""
         sides: wp.array(dtype=real)
         """1 where fluid is outside of a mesh, -1 where it is inside."""
         tolerances: wp.array(dtype=real)
@@ -104,17 +106,18 @@ def lost_kernel(precision: Precision) -> Any:
     ) -> bool:
         """Whether x is not deep in any solid; what is far from all surfaces is."""
         for k in range(solids.meshes.shape[0]):
-            y = x - solids.middles[k]
+            y, scale = x - solids.middles[k], real(1.0)
             if k < solids.still:
                 y = nearest_image(y, solids)
             else:
                 away = nearest_image(x - positions[member, k - solids.still], solids)
-                y = wp.transpose(turns[member, k - solids.still]) * away - solids.middles[k]
+                scale = solids.scales[member, k - solids.still]
+                y = wp.transpose(turns[member, k - solids.still]) * away / scale - solids.middles[k]
             place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
             found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
             if found.result:
                 surface = wp.mesh_eval_position(solids.meshes[k], found.face, found.u, found.v)
-                depth = -real(found.sign) * solids.sides[k] * real(wp.length(place - surface))
+                depth = -real(found.sign) * solids.sides[k] * scale * real(wp.length(place - surface))
                 if depth > solids.tolerances[k]:
                     return False
         return True

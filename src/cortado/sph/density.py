@@ -44,7 +44,7 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
         return weight(x_ij, s)
 
     @tangent_of(weights)
-    @pair_sum(discretisation, ahead=False)
+    @pair_sum(discretisation, ahead=False, grows=weights)
     def weights_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> real:
         return wp.dot(gradient(x_ij, s), x_dot_ij)
 

@@ -2,7 +2,8 @@
 
 A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w:
 a wall particle with the place r in its frame is at c_0 + d + R(w) R(w_0) r then, and has the velocity that leads there
-from where it was, over the time step. States have the position c, the turn w, and w_0.
+from where it was, over the time step. States have the position c, the turn w, w_0, and by which scale it is stretched
+(`cortado.particles.moving_walls`).
 """
 
 from collections.abc import Mapping
@@ -18,14 +19,17 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.solid_shares import NAMES
+from cortado.particles.solid_shares import share_kinds
 from cortado.particles.state import Layout, Parameters, State
-from cortado.scene.motions import displacement_name, position_name, rotation_name, turn_name
+from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters.parameter import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.rotations import rotations
+
+FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
+"""Of a solid in a state, as kernels call them."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +49,12 @@ class PoseKernels:
 @cache
 def _kernels(precision: Precision, dimension: int) -> PoseKernels:
     """In 2 or 3 dimensions."""
-    vector, matrix = precision.vector, matrix_of(precision)
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     of = rotations(precision, dimension)
     angle, rotation, further, back = of.angle, of.rotation, of.further, of.back
     module = integration_module(precision, False)
-    state = bundle(position=vector, turn=angle, rotation=angle)
-    shares = bundle(**dict.fromkeys(NAMES, vector))
+    state = bundle(position=vector, turn=angle, rotation=angle, scale=real)
+    shares = bundle(**share_kinds(precision))
 
     @wp.kernel(module=module, enable_backward=False)
     def begin(
@@ -65,10 +69,12 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
         turns_before: wp.array2d(dtype=matrix),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
+        scales: wp.array2d(dtype=real),
     ):
         b = wp.tid()
         k = step[b]
         begun = rotation(of.rotation[b])
+        scales[b, number] = of.scale[b]
         before[b, number] = of.position[b]
         after[b, number] = place[b] + displacements[b, k]
         turns_before[b, number] = rotation(of.turn[b]) * begun
@@ -89,9 +95,11 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
         turned_before_dot: wp.array2d(dtype=vector),
         after_dot: wp.array2d(dtype=vector),
         turned_dot: wp.array2d(dtype=vector),
+        growths: wp.array2d(dtype=real),
     ):
         b = wp.tid()
         k = step[b]
+        growths[b, number] = dot.scale[b] / of.scale[b]
         begun_dot = further(of.rotation[b], dot.rotation[b])
         before, after = of.turn[b], turns_told[b, k]
         before_dot[b, number] = dot.position[b]
@@ -103,6 +111,7 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
     def end(
         step: wp.array(dtype=wp.int32),
         begun: wp.array(dtype=angle),
+        scale_begun: wp.array(dtype=real),
         place: wp.array(dtype=vector),
         displacements: wp.array2d(dtype=vector),
         turns_told: wp.array2d(dtype=angle),
@@ -110,11 +119,13 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
         position: wp.array(dtype=vector),
         turn: wp.array(dtype=angle),
         rotation: wp.array(dtype=angle),
+        scale: wp.array(dtype=real),
     ):
         b = wp.tid()
         position[b] = place[b] + displacements[b, step[b]]
         turn[b] = turns_told[b, step[b]]
         rotation[b] = begun[b]
+        scale[b] = scale_begun[b]
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
@@ -140,6 +151,7 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
         bar.position[b] = share.force_before[b]
         bar.turn[b] = back(before, share.torque_before[b])
         bar.rotation[b] = bar.rotation[b] + back(of.rotation[b], begun_bar)
+        bar.scale[b] = bar.scale[b] + share.growth[b] / of.scale[b]
 
     return PoseKernels(begin, tangent, end, adjoint)
 
@@ -179,18 +191,19 @@ class MovingSolidsPart(Part):
                 StateField(position_name(name), "m", Entry.VECTOR, Axis.SCALAR, position_name(name)),
                 StateField(turn_name(name), "rad", angle, Axis.SCALAR),
                 StateField(rotation_name(name), "rad", angle, Axis.SCALAR, rotation_name(name)),
+                StateField(scale_name(name), "", Entry.NUMBER, Axis.SCALAR, scale_name(name)),
             )
         )
-        """Where they are, how far they are turned from how they began, and how that was."""
+        """Where they are, how far they are turned from how they began, how that was, and how large they are."""
         self.kernels = _kernels(layout.precision, made_of.dimension)
         self.begun = layout.state(self.fields)
         """What a step began from."""
 
     def begin(self, step: StepContext, state: State) -> None:
         walls, search = self.made_of.walls, self.made_of.search
+        for field in self.fields:
+            wp.copy(self.begun[field.name], state[field.name])
         for name, number in self.made_of.numbers.items():
-            for field in (position_name(name), turn_name(name), rotation_name(name)):
-                wp.copy(self.begun[field], state[field])
             known = self.state(self.begun, name), self.told(step.parameters, name)
             step.launch(self.kernels.begin, *known, walls.named, number=number, threads=self.layout.members)
         walls.write(step.parameters["time_step"], search.walls)
@@ -201,13 +214,13 @@ class MovingSolidsPart(Part):
     def write_end(self, step: StepContext, parameters: Parameters, begun: State, state: State) -> None:
         """The fields at the end of a step, or their tangents."""
         for name in self.made_of.numbers:
-            new = {**self.state(state, name), **self.told(parameters, name), "begun": begun[rotation_name(name)]}
+            kept = {"begun": begun[rotation_name(name)], "scale_begun": begun[scale_name(name)]}
+            new = {**self.state(state, name), **self.told(parameters, name), **kept}
             step.launch(self.kernels.end, new, threads=self.layout.members)
 
     def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
         """The fields of a solid as kernels call them."""
-        fields = {"position": position_name(name), "turn": turn_name(name), "rotation": rotation_name(name)}
-        return {f"{label}{suffix}": state[field] for label, field in fields.items()}
+        return {f"{label}{suffix}": state[name_of(name)] for label, name_of in FIELDS.items()}
 
     def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
         """Where a solid is told to be, as kernels call it."""

@@ -94,7 +94,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         return (real(-1.0) / m_i) * (w_dot * pull + w * change)
 
     @tangent_of(force)
-    @summed(wall_force_tangent, ahead=False)
+    @summed(wall_force_tangent, ahead=False, grows=force)
     def force_tangent(
         x_ij: vector,
         x_dot_ij: vector,

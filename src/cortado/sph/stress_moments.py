@@ -90,7 +90,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         )
 
     @tangent_of(moments)
-    @summed(wall_moments_tangent, ahead=False)
+    @summed(wall_moments_tangent, ahead=False, grows=moments)
     def moments_tangent(
         x_ij: vector,
         x_dot_ij: vector,

@@ -109,7 +109,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         return (kappa * friction * s.volume / (m_i * n_i)) * total
 
     @tangent_of(force)
-    @summed(wall_tangent, ahead=False)
+    @summed(wall_tangent, ahead=False, grows=force)
     def force_tangent(
         x_ij: vector,
         x_dot_ij: vector,

@@ -1,8 +1,8 @@
 """What walls push a particle with, and its derivative:
 
-g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_i'.
+g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
 
-A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric: the sum
+A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric: its sum
 of forward mode is that of reverse mode too.
 """
 
@@ -45,7 +45,7 @@ def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
     def change(x_ij: vector, along: vector, s: neighbourhood) -> vector:
         return hessian_product(x_ij, along, s)
 
-    @wall_sum(discretisation)
+    @wall_sum(discretisation, grows=slope)
     def tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> vector:
         return hessian_product(x_ij, x_dot_ij, s)
 

@@ -10,7 +10,7 @@ import numpy as np
 from cortado.cli.viewer.quantities import HEIGHT_UNITS, own_fields, pull_on_height, quantities_of, sizes_of
 from cortado.cli.viewer.window import Shown, Window
 from cortado.pictures.painter import colours_of
-from cortado.runs.solid_motion import posed, solid_motions
+from cortado.runs.solid_motion import posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.values import OVER_TIME
 from cortado.scene.scene import Scene
@@ -34,7 +34,8 @@ class RecordedView:
         """``simulation``: of the scene, asked for when something has to be computed; ``units`` as of `Window`."""
         self.scene, self._simulation = scene, simulation
         own = own_fields(trajectory[0].others, trajectory.particles)
-        self.window = Window(scene, port, {**units, **dict.fromkeys(own, "")})
+        large = sized(scene, solid_motions(scene, trajectory.others))
+        self.window = Window(large, port, {**units, **dict.fromkeys(own, "")})
         gui, last = self.window.server.gui, len(trajectory) - 1
         self.playing = gui.add_checkbox("Play", last > 0)
         self.slider = gui.add_slider("Frame", 0, max(last, 1), 1, 0, disabled=not last)

@@ -18,7 +18,7 @@ from cortado.runs.colouring import coloured_by
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
 from cortado.runs.measuring import Measuring
-from cortado.runs.solid_motion import posed
+from cortado.runs.solid_motion import posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -102,7 +102,7 @@ class Exported:
         self.times, self.scene = trajectory.times, scene
         self._values = coloured_by(scene, trajectory, simulation)
         self._scale = None if self._values is None else Scale.of((scene.picture or Picture()).colour, self._values, "")
-        shown = _first_of_each(scene)
+        shown = _first_of_each(sized(scene, trajectory.solids))
         parts = _part_names(shown)
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
         self._trajectory = trajectory

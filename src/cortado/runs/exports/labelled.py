@@ -63,6 +63,7 @@ def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Va
     at = ("time", "solid")
     return {
         "solid_position": ((*at, "space"), stacked(places, places), {"units": "m"}),
+        "solid_scale": (("solid",), [one.scale for one in every], {"units": "1"}),
         "solid_rotation": ((*at, *turned), stacked(turns, turns), {"units": "rad"}),
         "solid_velocity": ((*at, "space"), stacked(own, places), {"units": "m/s"}),
         "solid_angular_velocity": ((*at, *turned), stacked(spins, turns), {"units": "rad/s"}),

@@ -93,7 +93,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         return ((c_i + c_j) * slope(x_ij, s)) * x_ij
 
     @tangent_of(force)
-    @pair_sum(discretisation, ahead=False)
+    @pair_sum(discretisation, ahead=False, grows=force)
     def force_tangent(
         x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
     ) -> vector:

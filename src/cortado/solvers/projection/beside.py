@@ -98,7 +98,7 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         part = normal(whole, foot)
         return part, whole, s.volume * weight(x_ij, s), wp.dot(part, v_j), wp.dot(whole, v_j)
 
-    @wall_sum(discretisation)
+    @wall_sum(discretisation, grows=beside)
     def beside_tangent(
         x_ij: vector,
         x_dot_ij: vector,
