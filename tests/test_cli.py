@@ -184,17 +184,37 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
     assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
 
 
-def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_command, folder, monkeypatch):
-    def stopped(*_):
+@pytest.mark.parametrize(
+    ("drawn", "missing"), [("run_pictures", set()), ("particles", {"report.html"})], ids=["pictures", "plain figures"]
+)
+def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(
+    cortado_command, folder, monkeypatch, drawn, missing
+):
+    def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cortado.cli.commands.run_report.lacking", lambda _: None)
-    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", stopped)
+    monkeypatch.setattr(f"cortado.cli.commands.run_report.{drawn}", stopped)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
     there = Path("dam").absolute()
-    sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film goes on with it."
+    sentence = f"Interrupted; the run is whole, and in {there}; cortado picture {there} --film films it."
     assert (code, err.splitlines()[-1]) == (130, sentence)
-    assert {path.name for path in there.iterdir()} == RUN_FILES
+    assert {path.name for path in there.iterdir()} == RUN_FILES - missing
+
+
+def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command, folder, monkeypatch):
+    """As nobody knows how many steps it takes where these are chosen."""
+    told = []
+
+    @contextmanager
+    def track(*whole):
+        told.append(whole)
+        yield lambda n: told.append(n)
+
+    monkeypatch.setattr(cortado.cli.commands.run_recording, "track", track)
+    arguments = ["--time", 0.02, "--set", "solver.time_step=auto", "--no-pictures", "--out", "dam"]
+    assert cortado_command("run", "scene.toml", *arguments)[0] == 0
+    assert told[0] == (100, "run, % of its time") and sum(told[1:]) == 100 and min(told[1:]) >= 0
 
 
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
@@ -243,6 +263,10 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
         (["walk"], "walk is unknown, but must be one of gradients, new, "),
         (["rnu", "scene.toml"], "rnu is unknown; run may be meant"),
         (["run", "scene"], "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
+        (
+            ["run", "secne.toml"],
+            "secne.toml: the scene cannot be read: No such file or directory; did you mean scene.toml?",
+        ),
         (["run"], "SCENE.toml is missing; see cortado run --help."),
         (["gradients"], "a command is missing, one of check; see cortado gradients --help."),
         (["bench"], "cortado bench is now python -m benchmarks bench, in a clone of the repository."),

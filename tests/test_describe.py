@@ -161,6 +161,28 @@ def test_densities_leave_out_what_waits_in_an_emitter():
     assert RunSummary.of(simulation, rollout, last, 1.0).densities[1] < 1.1 * rest
 
 
+def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
+    """And not where they were at the start, where fluid is by now: as frames record them of a solid that came to
+    rest."""
+    box = {"name": "paddle", "shape": "box", "lower": [0.15, 0.0], "upper": [0.25, 0.6]}
+    simulation = cortado.Simulation(
+        cortado.Scene(
+            dimension=2,
+            discretisation={"spacing": 0.05},
+            phase=[{"name": "water", "rest_density": 800.0, "viscosity": 0.1}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.4], "phase": "water"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.8]},
+            solid=[{**box, "motion": "path", "times": [0.0, 0.2], "positions": [[0.2, 0.3], [0.4, 0.3]]}],
+            solver={"kind": "projection", "time_step": 0.004},
+        )
+    )
+    steps = 60
+    rollout = simulation.rollout(steps)
+    found = RunSummary.of(simulation, rollout, rollout.forward(keep=False), 1.0).densities
+    wanted = simulation.run(steps, record_every=steps, record=["density"])[-1]["density"]
+    assert found == pytest.approx((wanted.min(), wanted.max()), rel=1e-6)
+
+
 def test_a_run_ends_with_them(capsys):
     main(["run", "scene.toml", "--steps", "4", "--no-pictures"])
     summary, place = capsys.readouterr().out.splitlines()

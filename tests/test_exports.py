@@ -11,6 +11,7 @@ import trimesh
 
 import cortado
 from cortado import ComputationError, InputError, Trajectory
+from cortado.pictures.scale import Scale
 from cortado.runs.exports import by_vtk
 from cortado.runs.exports.by_usd import time_codes
 from cortado.runs.exports.export import FORMATS
@@ -115,6 +116,22 @@ def test_usd_has_all_of_it_over_time(tmp_path):
     np.testing.assert_array_equal(fields.GetPrimvar("mass_fraction_1").Get(0), trajectory().mass_fractions[0, :, 1])
     colours = np.array(particles.GetDisplayColorAttr().Get(1))
     np.testing.assert_allclose(np.unique(colours, axis=0), [PHASES[0]["colour"], PHASES[1]["colour"]], rtol=1e-6)
+
+
+def test_colours_are_those_of_the_scale_that_pictures_have(tmp_path):
+    """Blue where particles are slow, yellow where they are fast, in every frame alike."""
+    run = trajectory()
+    speeds = np.linspace(0.0, 1.0, run.particles)[None, :, None] * [[[0.0, 1.0, 0.0]]]
+    run = replace(run, velocities=np.broadcast_to(speeds, run.positions.shape).astype(np.float32))
+    by_speed = run.scene.replaced('picture={colour = "speed"}')
+    run.export(tmp_path / "glb", "glb", by_speed)
+    cloud = trimesh.load(tmp_path / "glb/frame_00001.glb").geometry["particles"]
+    wanted = Scale.of("speed", speeds[0, :, 1]).colours(speeds[0, :, 1])
+    np.testing.assert_allclose(cloud.colors[:, :3] / 255.0, wanted, atol=0.04)  # a step of the palette
+    assert wanted[-1, 0] > 0.9 and wanted[0, 0] < 0.1
+    with pytest.raises(InputError, match="pressure was not recorded"):
+        run.export(tmp_path / "none", "glb", run.scene.replaced('picture={colour = "pressure"}'))
+    assert not (tmp_path / "none").exists()
 
 
 def test_usd_has_a_surface_that_encloses_the_fluid_and_solids_in_motion(tmp_path):

@@ -1,4 +1,5 @@
-"""Bodies of fluid that fill a mesh or a polygon: how many particles they have, where, and that they are at rest."""
+"""Bodies of fluid that fill a mesh, a polygon, or a box or a cylinder that is turned: how many particles they have,
+where, and that they are at rest."""
 
 import numpy as np
 import pytest
@@ -6,10 +7,13 @@ import trimesh
 
 from cortado import Scene, SceneError, Simulation
 from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.turns import rotation_matrix
 from test_packing import densities
 
 SPACING = 0.05
 MAJOR, MINOR = 0.3, 0.15
+BAR = {"shape": "box", "lower": [0.2, 0.3], "upper": [0.7, 0.5]}
+CAN = {"shape": "cylinder", "base": [0.5, 0.2, 0.4], "radius": 0.2, "height": 0.4}
 TRIANGLE = {"shape": "polygon", "corners": [[0.0, 0.0], [0.6, 0.0], [0.3, 0.7]]}
 
 
@@ -64,6 +68,35 @@ def test_what_is_along_the_lattice_is_as_a_box_to_the_bit(tmp_path):
     np.testing.assert_allclose(as_mesh, as_box, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("fluid", "rotation", "middle", "half", "volume"),
+    [
+        (BAR, 0.5, [0.45, 0.4], [0.25, 0.1], 0.1),
+        (CAN, [0.0, 0.0, 0.9], [0.5, 0.4, 0.4], [0.2, 0.2, 0.2], 0.016 * np.pi),
+    ],
+    ids=["box", "cylinder"],
+)
+def test_a_box_and_a_cylinder_are_turned_about_their_middle(fluid, rotation, middle, half, volume):
+    """Turned back, all particles are within the shape; the can is as wide as it is high."""
+    dimension = len(middle)
+    table = scene({**fluid, "rotation": rotation}, dimension)
+    found = discretise(table)
+    x = found.fluid.positions
+    assert len(x) * SPACING**dimension == pytest.approx(volume, rel=0.05)
+    assert densities(table, found).max() < 1.005
+    centred(found, middle, 0.1 * SPACING)
+    back = (x - middle) @ rotation_matrix(np.atleast_1d(rotation))
+    assert (np.abs(back).max(axis=0) < np.array(half) + 0.1 * SPACING).all()
+    assert (np.abs(x - middle).max(axis=0) > np.array(half) + 0.1 * SPACING).any()  # as it is, it is not
+    assert table.replaced(f"fluid.0.rotation={rotation}").fluid[0] == table.fluid[0]  # by way of a file
+
+
+def test_a_box_turned_by_a_right_angle_is_on_its_lattice_still():
+    turned = discretise(scene({**BAR, "rotation": np.pi / 2.0}, 2)).fluid.positions
+    straight = discretise(scene({**BAR, "lower": [0.35, 0.15], "upper": [0.55, 0.65]}, 2)).fluid.positions
+    np.testing.assert_allclose(turned, straight, atol=1e-12)
+
+
 def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
     """All of the fluid begins at the rest density between walls that lean; it gains no energy and stays inside."""
     tank = {"name": "tank", "side": "inside", **TRIANGLE}
@@ -86,6 +119,12 @@ def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
         ({**TRIANGLE, "corners": [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}, 2, "sides that do not cross"),
         ({**TRIANGLE, "corners": [[0.0, 0.0], [0.02, 0.0], [0.0, 0.02]]}, 2, "too thin to hold a particle"),
         (TRIANGLE, 3, "fluid[0].shape"),
+        (
+            {**BAR, "rotation": [0.1, 0.2, 0.3]},
+            2,
+            "rotation is [0.1, 0.2, 0.3], but must be one number in 2-D",
+        ),
+        ({**CAN, "rotation": 0.1}, 3, "fluid[0].rotation is [0.1], but must be a list of 3 components in 3-D"),
         ({"shape": "mesh", "file": "no.stl"}, 2, "fluid[0].shape"),
         ({"shape": "mesh", "file": "no.stl"}, 3, "fluid[0].file cannot be used: "),
     ],

@@ -235,5 +235,6 @@ def test_a_fluid_at_rest_does_not_flicker():
     moved = simulation.positions + 0.02 * 0.05 * noise.standard_normal(simulation.positions.shape)
     stirred = moved + 1e-3 * 0.05 * noise.standard_normal(moved.shape)
     artist, colours = painter(made, moved), np.tile([0.1, 0.3, 0.8], (len(moved), 1))
-    one, other = (artist.image(positions, colours) ** (1.0 / 2.4) for positions in (moved, stirred))
+    one, again, other = (artist.image(positions, colours) ** (1.0 / 2.4) for positions in (moved, moved, stirred))
+    assert (one == again).all()  # to the bit
     assert (np.abs(one - other).max(axis=2) > 1.0 / 255.0).mean() < 1e-3

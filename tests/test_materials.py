@@ -8,8 +8,10 @@ import cortado
 from cortado.device.bands import BandLauncher
 from cortado.errors import SceneError
 from cortado.pictures.environment import environment_of
+from cortado.pictures.liquid import liquid_surface
 from cortado.pictures.media import TINT, media_of
 from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.particles import Particles
 from cortado.pictures.scenery import State
 from cortado.pictures.wetting import particles_of
 from cortado.scene.materials import FINISHES, LIQUIDS
@@ -69,6 +71,19 @@ def test_fluids_side_by_side_keep_their_own_media():
     image = drawn(scene_of("milk", "water"))
     left, right = image[28:36, 14:22].mean(), image[28:36, 42:50].mean()
     assert left > right + 0.2
+
+
+def test_water_beside_a_thin_wall_is_no_milk():
+    """Across a wall of one and a half spacings, where a part of the milk's smoothing reaches: one sees through the
+    water's side all the same, and no further into the milk's."""
+    places = 0.01 * (np.stack(np.meshgrid(*[np.arange(6.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5)
+    both = np.concatenate([places - [0.06, 0.0, 0.0], places + [0.015, 0.0, 0.0]])
+    media = [[LIQUIDS[name].scattering, LIQUIDS[name].absorption] for name in ("water", "milk")]
+    launch = BandLauncher(wp.get_device("cpu"))
+    particles = Particles.on(launch.device, both, np.zeros_like(both), np.repeat(media, len(places), axis=0))
+    found = liquid_surface(particles, 0.01, launch)
+    scattering, left = found.media.numpy()[:, 0], found.points.numpy()[:, 0] < 0.007
+    assert scattering[left].max() < 10.0 and scattering[~left].min() > 100.0
 
 
 def test_particles_have_the_media_of_what_they_are_made_of():

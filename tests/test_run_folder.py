@@ -309,7 +309,7 @@ def test_progress_on_a_file_is_a_line_now_and_then():
         advance(loss=0.123456)
         advance(3)
     assert quiet.getvalue() == ""
-    assert chatty.getvalue() == "run 1/4, 0:00:00 left, loss 0.1235\nrun 4/4, 0:00:00 left\n"
+    assert chatty.getvalue() == "run 1/4, loss 0.1235\nrun 4/4, 0:00:00 left\n"
 
 
 def test_no_time_is_left_after_more_than_was_expected(monkeypatch):
@@ -319,7 +319,17 @@ def test_no_time_is_left_after_more_than_was_expected(monkeypatch):
     with track(2, "optimise", stream=chatty, interval=0.0) as advance:
         for _ in range(3):
             advance()
-    assert [line.split(", ")[1] for line in chatty.getvalue().splitlines()] == ["0:00:30 left"] + 2 * ["0:00:00 left"]
+    assert chatty.getvalue().splitlines() == ["optimise 1/2", *(f"optimise {k}/2, 0:00:00 left" for k in (2, 3))]
+
+
+def test_the_time_left_counts_no_compiling(monkeypatch):
+    """Which the first step waits for: 60 s, and then a second for each step."""
+    seconds, chatty = iter([0.0, 60.0, 61.0, 62.0]), io.StringIO()
+    monkeypatch.setattr("time.monotonic", lambda: next(seconds))
+    with track(10, "run", stream=chatty, interval=0.0) as advance:
+        for _ in range(3):
+            advance()
+    assert chatty.getvalue().splitlines() == ["run 1/10", "run 2/10, 0:00:08 left", "run 3/10, 0:00:07 left"]
 
 
 def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):

@@ -185,6 +185,26 @@ def test_a_misspelt_key_is_told_the_right_one():
     assert str(caught.value) == wanted
 
 
+@pytest.mark.parametrize(
+    ("table", "key", "advice"),
+    [
+        (None, "gravity", "gravity is not a key of the scene; did you mean forces.gravity or schedule.gravity?"),
+        (None, "time_step", "time_step is not a key of the scene; did you mean solver.time_step?"),
+        ("solver", "spacing", "solver.spacing is not a key of [solver]; did you mean discretisation.spacing?"),
+        ("forces", "dimension", "forces.dimension is not a key of [forces]; did you mean dimension at the top of the"),
+        ("picture", "turns", "picture.turns is not a key of [picture]; did you mean picture.camera_path.turns?"),
+        ("container", "lid", "container.lid is not a key of [container]; its keys are shape, lower"),  # of a cup
+        (None, "colour", "colour is not a key of the scene; its keys are name, dimension"),  # of many tables
+    ],
+)
+def test_a_key_of_another_table_is_told_where_it_stands(table, key, advice):
+    data = good_data()
+    (data if table is None else data.setdefault(table, {}))[key] = 1.0
+    with pytest.raises(SceneError) as caught:
+        scene_from_dict(data)
+    assert str(caught.value).startswith(advice)
+
+
 @pytest.mark.parametrize("fluid", [np.zeros(2), date(2020, 1, 1), 3, MixtureTable()], ids=str)
 def test_a_fluid_that_is_no_table_is_a_sentence(fluid):
     with pytest.raises(SceneError, match=r"^fluid\[0\] is .*, but must be a table\.$"):

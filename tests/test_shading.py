@@ -106,6 +106,15 @@ def test_two_fluids_have_their_colours():
     assert (image[..., 0] > 3.0 * image[..., 2]).mean() > 0.02
 
 
+def test_fluid_that_left_a_periodic_plane_is_seen_where_it_comes_back():
+    """Up to the edges, and beside what is at the other edge."""
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.3], "periodic": [True, False]}
+    scene = scene_of(2, fluids=2, container=box)
+    x, colours = first_state(scene)
+    moved = drawn(scene, x + [1.5, 0.0])  # by two and a half periods: the fluids have changed places
+    np.testing.assert_allclose(moved, drawn(scene, x, colours[::-1]), atol=1e-9)
+
+
 def test_the_plane_shows_pure_colours_and_mixtures():
     scene = scene_of(2, fluids=2, picture={"width": 300, "height": 200})
     x, colours = first_state(scene)
@@ -453,7 +462,10 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
     main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
-    assert "film.mp4: 4 frames, 1.7 s, at 0.005 x." in capsys.readouterr().out
+    assert (
+        "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 5000 "
+        in capsys.readouterr().out
+    )
     main(["optimise", "task.toml", "--out", "b"])
     assert capsys.readouterr().out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
@@ -470,6 +482,7 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
         ),
         (["--colour", "heat"], "picture.colour is 'heat'"),
         (["--set", "solver.time_step=1"], "must begin with picture."),
+        (["--film", "--set", "picture.film_frames=0"], "--film is given, but picture.film_frames is 0"),
     ):
         with pytest.raises(SystemExit) as end:
             main(["picture", "a", *arguments])

@@ -25,7 +25,7 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
-    some, others = (_wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
+    some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
     numbers = _around(some, others, reach, lengths)
     tree = cKDTree(others[numbers], boxsize=lengths)
     first, second, distances = [], [], []
@@ -47,7 +47,7 @@ def pairs_among(
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), points.shape[1:])
-    tree = cKDTree(_wrapped(points - np.asarray(lower, dtype=np.float64), lengths), boxsize=lengths)
+    tree = cKDTree(wrapped(points - np.asarray(lower, dtype=np.float64), lengths), boxsize=lengths)
     first, second = tree.query_pairs(reach, output_type="ndarray").T
     return first, second
 
@@ -70,7 +70,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> NDAr
     return np.flatnonzero(((others >= lower) & (others <= upper)).all(axis=1))
 
 
-def _wrapped(positions: Points, lengths: Points) -> Points:
+def wrapped(positions: Points, lengths: Points) -> Points:
     """(n, d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
     if not lengths.any():
         return positions

@@ -17,7 +17,7 @@ from cortado.files.srgb import to_srgb
 from cortado.files.video import writing
 
 SUFFIX = ".webp"
-QUALITY = 70
+QUALITY = 80
 """Of lossy WebP, from 0 to 100."""
 REST = 1.5
 """Seconds that the last frame is shown before the first one comes again."""

@@ -91,23 +91,29 @@ def _nothing(n: int = 1, **fields: Any) -> None:
 
 
 class _Lines:
-    """Writes at most one line every `interval` seconds, and one for the last step."""
+    """Writes at most one line every `interval` seconds, and one for the last step. The time left follows from the steps
+    after the first report, before which kernels are compiled, or what an earlier process has done is skipped."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
         self._done = 0
+        self._first: tuple[int, float] | None = None
         self._started = self._last_line = time.monotonic()
 
     def __call__(self, n: int = 1, **fields: Any) -> None:
         self._done += n
         now = time.monotonic()
-        finished_late = self._done >= self._total and now - self._started >= self._interval
+        skipped, begun = self._first = self._first or (self._done, now)
+        is_last = self._done - n < self._total <= self._done
+        finished_late = is_last and now - self._started >= self._interval
         if now - self._last_line < self._interval and not finished_late:
             return
         self._last_line = now
-        left = (now - self._started) * max(self._total - self._done, 0) / max(self._done, 1)
-        line = f"{self._description} {self._done}/{self._total}, {_clock(left)} left"
-        print(", ".join([line, *filter(None, [_text(fields)])]), file=self._stream, flush=True)
+        words = [f"{self._description} {self._done}/{self._total}"]
+        if self._done > skipped:
+            left = (now - begun) * max(self._total - self._done, 0) / (self._done - skipped)
+            words.append(f"{_clock(left)} left")
+        print(", ".join([*words, *filter(None, [_text(fields)])]), file=self._stream, flush=True)
 
 
 def _text(fields: dict[str, Any]) -> str:

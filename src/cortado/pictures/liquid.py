@@ -26,6 +26,8 @@ WeightedLook = wp.types.vector(6, wp.float32)
 """A `Look` times a weight, and the weight."""
 MOST_CELLS = 1 << 26
 """One spacing wide, in which particles are looked for."""
+CLEAREST = wp.constant(wp.float32(1.0e-3))
+"""[1/m] of scattering and of absorption, which cannot be seen."""
 FULL = wp.constant(wp.float32(2.84))
 """Sum of the bumps of others near a particle from which on it is not in a thin sheet."""
 
@@ -61,8 +63,10 @@ def crowd(s: NearParticles, j: wp.int32):
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
+    """Colours count by themselves, media by their logarithms: milk across a wall, that is far and scatters ten thousand
+    times as much, makes no milk of water."""
     x = s.looks[j]
-    return WeightedLook(x[0], x[1], x[2], x[3], x[4], 1.0)
+    return WeightedLook(x[0], x[1], x[2], wp.log(x[3] + CLEAREST), wp.log(x[4] + CLEAREST), 1.0)
 
 
 crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
@@ -98,7 +102,7 @@ def find_looks(
         near = tint_near(s, points[v], 2.0 * reach)
     weight = wp.max(near[5], 1.0e-9)
     colours[v] = wp.vec3(near[0], near[1], near[2]) / weight
-    media[v] = wp.vec2(near[3], near[4]) / weight
+    media[v] = wp.vec2(wp.exp(near[3] / weight) - CLEAREST, wp.exp(near[4] / weight) - CLEAREST)
 
 
 def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -> LiquidSurface:

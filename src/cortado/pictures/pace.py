@@ -16,7 +16,9 @@ SHORTEST = 4.0
 """[s] that a film lasts at least, if it has frames enough."""
 SLOWEST, USUAL, QUICKEST = 6.0, 25.0, 60.0
 """Frames that a film shows in a second: fewer are seen one by one, of more the eye sees no more."""
-EASY = (5.0, 2.5, 1.0)
+SMOOTH = 12.0
+"""Frames in a second below which a film says how more are recorded."""
+EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 """Speeds that are easy to think of, and these times powers of ten."""
 
 
@@ -69,7 +71,12 @@ class Pace:
         left_out = self.recorded - len(self.frames)
         seconds = f"{self.times[-1] + 1.0 / self.frames_per_second:.1f} s"
         kept = f"{counted(len(self.frames), 'frame')}, {seconds}, {self.in_words}"
-        return f"{kept}; {left_out} of the {self.recorded} that were recorded are left out" if left_out else kept
+        if left_out:
+            kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
+        if self.speed is not None and 1 < len(self.frames) == self.recorded and self.frames_per_second < SMOOTH:
+            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: "
+            kept += f"--fps {USUAL / self.speed:.4g} records {USUAL:g} for each second of the film"
+        return kept
 
 
 def pace_of(times: Sequence[float] | NDArray, picture: Picture) -> Pace:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
-from cortado.pictures.labels import Text, lined, written
+from cortado.pictures.labels import INK, Text, lined, written
 from cortado.pictures.painter import painter
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -20,7 +20,8 @@ HEAD = 0.22
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
     """A picture (rows, columns, 3), linear: particles at positions (n, d) [m] with colours (n, 3) as spheres, the
-    opening of an emitter with an arrow, paths of solids and of the opening, and how large it is along each axis."""
+    opening of an emitter with an arrow, paths of solids and of the opening, and along each axis a line that is as long
+    as the whole, and says how long."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
@@ -37,8 +38,10 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
     if scene.emitter is not None:
         paths.append(_arrow(np.array(scene.emitter.outlet), np.array(scene.emitter.direction), ARROW * size))
     thin = max(round(look.height / 240), 1)
+    edges = _edges(stage, *ends)
     image = lined(image, [stage.on_screen(path) for path in paths], MOVING, thin)
-    return written(image, _sizes(stage, *ends), max(round(0.030 * look.height), 10))
+    image = lined(image, edges, INK, thin)
+    return written(image, _sizes(stage, edges, *ends), max(round(0.030 * look.height), 10))
 
 
 def _paths(scene: Scene) -> list[Points]:
@@ -67,16 +70,24 @@ def _arrow(start: Points, direction: Points, length: float) -> Points:
     return np.array([start, tip, barbs[0], tip, barbs[1]])
 
 
-def _sizes(stage: Any, lower: Points, upper: Points) -> list[Text]:
-    """How long the box is along each axis, beside those of its edges that are outermost on the screen."""
-    box, found, middle = corners(lower, upper), list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
+def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
+    """(2, 2) on the screen, along each axis: the ends of that edge of the box which is outermost on the screen."""
+    box, found = corners(lower, upper), list[Points]()
     for axis in range(len(lower)):
-        pairs = [(a, b) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
-        places = np.array([stage.on_screen(np.array(pair)).mean(axis=0) for pair in pairs])
+        pairs = [np.array([a, b]) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
+        places = np.array([stage.on_screen(pair) for pair in pairs])
         sought = (0.0, 1.0) if axis != stage.up_axis else (-1.0, 0.0)  # below, and on the left
-        best = places[int((places @ sought).argmax())]
-        away = best - middle
-        place = best + 0.035 * stage.picture.height * away / max(float(np.linalg.norm(away)), 1e-9)
-        text = f"{'xyz'[axis]}: {upper[axis] - lower[axis]:.3g} m"
-        found.append(((round(place[0]), round(place[1])), text, "rm" if axis == stage.up_axis else "mm"))
+        found.append(places[int((places.mean(axis=1) @ sought).argmax())])
+    return found
+
+
+def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> list[Text]:
+    """How long the box is along each axis, beside its edges."""
+    found, middle = list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
+    for axis, edge in enumerate(edges):
+        away = edge.mean(axis=0) - middle
+        place = edge.mean(axis=0) + 0.035 * stage.picture.height * away / max(float(np.linalg.norm(away)), 1e-9)
+        text, across = f"{'xyz'[axis]}: {upper[axis] - lower[axis]:.3g} m", abs(away[0]) > abs(away[1])
+        anchor = ("lm" if away[0] > 0.0 else "rm") if across else "mm"
+        found.append(((round(place[0]), round(place[1])), text, anchor))
     return found

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.cores import usable_cores
+from cortado.discretise.pairs import wrapped
 from cortado.discretise.shapes import Points
 from cortado.pictures.gloss import glossy
 from cortado.pictures.mirrored import mirrored
@@ -78,16 +79,19 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Positions (n, 2) and their mirror images behind walls that they touch, and which particle each shows."""
+        """Positions (n, 2), their mirror images behind walls that they touch and images a period away, and which
+        particle each shows."""
         stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
+        lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
+        positions = stage.lower + wrapped(positions - stage.lower, lengths)
         if stage.solids:
             behind, of_those = mirrored(positions, stage.solids, reach, stage.spacing)
             positions, of = np.concatenate([positions, behind]), np.concatenate([of, of_those])
         for axis in range(2 if stage.container is not None else 0):
-            for place in (stage.lower[axis], stage.upper[axis]):
-                near = np.abs(positions[:, axis] - place) < reach
+            for place, way in ((stage.lower[axis], lengths[axis]), (stage.upper[axis], -lengths[axis])):
+                near = np.abs(positions[:, axis] - place) < (2.0 * SUPPORT * stage.spacing if way else reach)
                 behind = positions[near].copy()
-                behind[:, axis] = 2.0 * place - behind[:, axis]
+                behind[:, axis] = behind[:, axis] + way if way else 2.0 * place - behind[:, axis]
                 positions, of = np.concatenate([positions, behind]), np.concatenate([of, of[near]])
         return positions, of
 

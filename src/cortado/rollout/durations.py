@@ -59,7 +59,20 @@ def expected_frames(rollout: Rollout, record_every: int) -> int:
 
 def expected_of(rollout: Rollout) -> int:
     """How many steps of a rollout are to be expected: all of them, unless it ends at a time."""
-    return rollout.steps // ROOM if np.isfinite(rollout.step_sizes.end) else rollout.steps
+    return rollout.steps // ROOM if ends_at_a_time(rollout) else rollout.steps
+
+
+def ends_at_a_time(rollout: Rollout) -> bool:
+    """Whether nobody knows how many steps a rollout has, as it ends at a time."""
+    return bool(np.isfinite(rollout.step_sizes.end))
+
+
+def done_of(rollout: Rollout, step: int, time: float) -> int:
+    """How far a rollout is after a step, at a time [s]: so many steps, or percents of its time if it ends at one."""
+    if not ends_at_a_time(rollout):
+        return step
+    begun, end = rollout.clocks[0].time, rollout.step_sizes.end
+    return min(int(100.0 * (time - begun) / (end - begun)), 100)
 
 
 def expected_steps(scene: Scene, time: float, values: Arrays) -> int:

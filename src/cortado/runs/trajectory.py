@@ -249,15 +249,16 @@ class Trajectory(Showing):
             append_frame(writer, frame, int(step), recorded, float(self.times[k]))
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
-        """Writes the surface of the fluid, coloured by phase, its particles, and solids for other programs: see
-        `docs/into_blender.md`. Returns the file to open, or the folder of a series.
+        """Writes the surface of the fluid and its particles, in the colours of pictures, and solids for other programs:
+        see `docs/into_blender.md`. Returns the file to open, or the folder of a series.
 
         ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
         ``run.pvd`` for ParaView. ``scene``: of a trajectory from a file the scene, or the path of its file. The folder
         must be empty or missing. In the plane there is no surface, and z is 0.
 
         Raises:
-            InputError: another format, a folder with files, no scene or another one, or a library that is missing.
+            InputError: another format, a folder with files, no scene or another one, a library that is missing, or a
+                ``picture.colour`` of the scene that was not recorded.
             ComputationError: the disk is full.
         """
         from cortado.runs.exports.export import export

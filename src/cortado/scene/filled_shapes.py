@@ -1,6 +1,7 @@
-"""Bodies of fluid that fill a mesh or a polygon."""
+"""Bodies of fluid that fill a mesh, a polygon, or a box or a cylinder that is turned."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Annotated, Self
 
 import numpy as np
@@ -10,30 +11,34 @@ from cortado.discretise.shapes import Block, Points
 from cortado.discretise.solids.inside_points import block_around, points_inside
 from cortado.discretise.solids.solid import Placed, Solid
 from cortado.scene.fields import FieldPath, Length
-from cortado.scene.fluids import ALIGNED, BoxFluid, CylinderFluid, PointsFluid, RegionFluid, SphereFluid
+from cortado.scene.fluids import (
+    ALIGNED,
+    BoxFluid,
+    CylinderFluid,
+    Fluid,
+    PointsFluid,
+    RegionFluid,
+    SphereFluid,
+    Turnable,
+    box_about,
+    cylinder_about,
+)
 from cortado.scene.outlines import MeshShape, PolygonShape
-from cortado.scene.turns import Rotation, check_turn, rotation_matrix
+from cortado.scene.turns import rotation_matrix
 
 
-class FilledShape(RegionFluid):
-    """A body of fluid that fills a shape, which may be turned; its particles are packed unless its surface goes along
-    cells of the lattice from the lower corner of the box around it."""
-
-    position: tuple[Length, ...] | None = None
-    """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
-    rotation: Rotation | None = None
-    """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
-    counterclockwise."""
+class Filled(Turnable):
+    """A body of fluid that fills a solid shape; its particles are packed unless its surface goes along cells of the
+    lattice from the lower corner of the box around it."""
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
         """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
 
-    def body(self) -> Solid:
+    def body(self) -> Placed:
         """The shape in its place."""
         shape, middle = self.shape_about()
-        turn = rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3))
-        return Placed(shape, middle if self.position is None else np.array(self.position), turn)
+        return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
 
     def block(self, spacing: float) -> Block:
         return block_around(self.body(), spacing)
@@ -44,14 +49,53 @@ class FilledShape(RegionFluid):
     def particles(self, spacing: float) -> Points:
         return points_inside(self.body(), spacing)
 
+    def witnesses(self, spacing: float) -> Points:
+        return self.particles(spacing)
+
+    def lattice(self, spacing: float, reach: float) -> Points:
+        return RegionFluid.lattice(self, spacing, reach)
+
     def cuts_cells(self, spacing: float) -> bool:
         points = self.block(spacing).grown(1).points()
         return bool((np.abs(self.distance(points, spacing, spacing)) < (0.5 - ALIGNED) * spacing).any())
 
+
+class FilledShape(Filled):
+    """One with a place of its own."""
+
+    position: tuple[Length, ...] | None = None
+    """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
+
+    def body(self) -> Placed:
+        placed = super().body()
+        return placed if self.position is None else replace(placed, position=np.array(self.position))
+
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("position",), dimension, path)
-        check_turn((*path, "rotation"), self.rotation, dimension)
         return super().in_dimension(dimension, path)
+
+
+class TurnedBox(Filled, BoxFluid):
+    """A box of fluid with a rotation."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        return box_about(self.lower, self.upper)
+
+
+class TurnedCylinder(Filled, CylinderFluid):
+    """A cylinder of fluid with a rotation."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        return cylinder_about(self.base, self.radius, self.height, self.axis)
+
+
+def turned(fluid: Fluid) -> Fluid:
+    """The same body of fluid; one that has a rotation where it can do without, as one that is packed."""
+    kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
+    kind = kinds.get(type(fluid))
+    if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:
+        return fluid
+    return kind.model_construct(fluid.model_fields_set, **dict(fluid))
 
 
 class PolygonFluid(PolygonShape, FilledShape):

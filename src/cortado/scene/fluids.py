@@ -10,10 +10,11 @@ from pydantic import ValidationInfo, field_validator, model_validator
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
+from cortado.discretise.solids.solid import Box, Revolved, Solid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table
-from cortado.scene.turns import Turning, check_turn
+from cortado.scene.turns import Rotation, Turning, check_turn
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 ALIGNED = 1e-3
@@ -121,12 +122,24 @@ class RegionFluid(LatticeFluid):
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
-class BoxFluid(RegionFluid):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``."""
+class Turnable(RegionFluid):
+    """A body that may be turned, which then cuts cells of the lattice: `cortado.scene.filled_shapes`."""
+
+    rotation: Rotation | None = None
+    """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
+    counterclockwise."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        check_turn((*path, "rotation"), self.rotation, dimension)
+        return super().in_dimension(dimension, path)
+
+
+class BoxFluid(Turnable):
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned."""
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) Corner with the least coordinates [m]."""
+    """(d,) Corner with the least coordinates, before it is turned [m]."""
     upper: Vector[Length]
     """(d,) Corner with the greatest coordinates [m]."""
 
@@ -174,7 +187,7 @@ class SphereFluid(RoundFluid):
         return Region.ball(np.array(self.centre), self.radius).distance(points)
 
 
-class CylinderFluid(RoundFluid):
+class CylinderFluid(Turnable, RoundFluid):
     """A cylinder, in 3-D."""
 
     shape: Literal["cylinder"] = "cylinder"
@@ -185,7 +198,7 @@ class CylinderFluid(RoundFluid):
     height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands."""
+    """The axis of space along which it stands, before it is turned."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         refuse_plane(dimension, path, '"box", "sphere" or "points"')
@@ -249,6 +262,17 @@ def beside_scene(file: str, info: ValidationInfo) -> str:
         return str((folder / file).absolute())
     except (OSError, ValueError):
         raise field_error((), file, "the name of a file") from None
+
+
+def box_about(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[Solid, Points]:
+    """A box about its middle, and where that is, (d,) [m]."""
+    return Box(0.5 * np.subtract(upper, lower)), 0.5 * np.add(lower, upper)
+
+
+def cylinder_about(base: tuple[float, ...], radius: float, height: float, axis: str) -> tuple[Solid, Points]:
+    """A cylinder about its middle, and where that is, (3,) [m]."""
+    along = INDEX_OF_AXIS[axis]
+    return Revolved(Box(np.array([radius, 0.5 * height])), along), np.array(base) + 0.5 * height * np.eye(3)[along]
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:

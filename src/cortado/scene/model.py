@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
-from cortado.scene.filled_shapes import AnyFluid
+from cortado.scene.filled_shapes import AnyFluid, turned
 from cortado.scene.materials import LIQUIDS, Coloured
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.package_tables import AnyForces
@@ -180,7 +180,7 @@ class SceneTables(Table):
             if table.name in [one.name for one in tables[:index]]:
                 wanted = f"another name than those of the {info.field_name}s before"
                 raise field_error((index, "name"), table.name, wanted)
-        tables = cls._resolve_fluids(tables, info)
+        tables = cls._resolve_each(tables, info)
         if info.field_name != "solid" or not {"dimension", "container"} <= set(info.data):
             return tables
         return tuple(solid.in_container(info.data["container"], (index,)) for index, solid in enumerate(tables))
@@ -188,6 +188,10 @@ class SceneTables(Table):
     @field_validator("fluid")
     @classmethod
     def _resolve_fluids(cls, fluids: Any, info: ValidationInfo) -> Any:
+        return tuple(map(turned, cls._resolve_each(fluids, info)))
+
+    @classmethod
+    def _resolve_each(cls, tables: Any, info: ValidationInfo) -> Any:
         if "dimension" not in info.data:
-            return fluids
-        return tuple(fluid.in_dimension(info.data["dimension"], (index,)) for index, fluid in enumerate(fluids))
+            return tables
+        return tuple(table.in_dimension(info.data["dimension"], (index,)) for index, table in enumerate(tables))

@@ -6,10 +6,14 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from cortado.errors import LONGEST, SceneError, shown
+from cortado.errors import LONGEST, SceneError, Words, shown
 from cortado.scene.fields import GREATEST, MISSING, FieldPath
 
 Schema = Mapping[str, Any]
+MOST_HOMES = 2
+"""Tables that have a key, up to which a sentence names them where the key stands in another table."""
+UNKNOWN = Words("unknown")
+"""What was found of a key that its table does not have."""
 ABSENT = {"rigid": "rigid bodies"}
 """What scenes are asked for and cannot have, by what it is called in them: in words, in the plural."""
 
@@ -47,6 +51,8 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     if first["type"] == "scene":
         own = first["ctx"]["error"]
         path, sentence = [*path, *own.path], own.sentence
+        if own.found is UNKNOWN and (homes := _homes(model.model_json_schema(), path)):
+            sentence = f"is not a key of {{table}}; did you mean {' or '.join(homes)}?"
         if sentence:
             sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
         return SceneError(None, field_name(path), own.found, own.wanted, sentence)
@@ -62,6 +68,27 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
         words = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
     return SceneError(None, field_name(path), found, words)
+
+
+def _homes(whole: Schema, path: FieldPath) -> list[str]:
+    """Where the key at the end of a path stands in other tables of a JSON schema, as ``forces.gravity``; nothing if it
+    stands in none or in many of them."""
+    key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
+    found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
+    words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
+    return words if len(words) <= MOST_HOMES else []
+
+
+def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
+    """The paths of all keys in a part of a JSON schema that is at a path itself: through lists and unions, too."""
+    if "$ref" in part:
+        part = whole["$defs"][part["$ref"].rpartition("/")[2]]
+    for name, field in part.get("properties", {}).items():
+        yield (*path, name)
+        yield from _fields(whole, field, (*path, name))
+    members = [one for kind in ("anyOf", "oneOf", "allOf") for one in part.get(kind, ())]
+    for member in [*members, *([part["items"]] if "items" in part else [])]:
+        yield from _fields(whole, member, path)
 
 
 def _is_out_of_size(number: float, schema: Schema) -> bool:

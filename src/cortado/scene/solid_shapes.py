@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Box, Polygon, Revolved, Round, Solid
+from cortado.discretise.solids.solid import Polygon, Revolved, Round, Solid
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.scene.fluids import INDEX_OF_AXIS, box_about, check_order, cylinder_about, refuse_plane
 from cortado.scene.outlines import MeshShape, PolygonShape
 from cortado.scene.planes import PlaneSolid
 from cortado.scene.solids import SolidTable
@@ -33,8 +33,7 @@ class BoxSolid(SolidTable):
         return self
 
     def shape_about(self) -> tuple[Solid, Points]:
-        lower, upper = np.array(self.lower), np.array(self.upper)
-        return Box(0.5 * (upper - lower)), 0.5 * (lower + upper)
+        return box_about(self.lower, self.upper)
 
     def thinnest(self) -> float:
         return float(np.subtract(self.upper, self.lower).min())
@@ -97,9 +96,7 @@ class CylinderSolid(SolidTable):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        axis = INDEX_OF_AXIS[self.axis]
-        profile = Box(np.array([self.radius, 0.5 * self.height]))
-        return Revolved(profile, axis), np.array(self.base) + 0.5 * self.height * np.eye(3)[axis]
+        return cylinder_about(self.base, self.radius, self.height, self.axis)
 
     def thinnest(self) -> float:
         return min(2.0 * self.radius, self.height)

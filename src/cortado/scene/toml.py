@@ -4,6 +4,7 @@ import os
 import re
 import tomllib
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from cortado.errors import LONGEST, InputError, SceneError, shown
@@ -45,10 +46,21 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
         said = _TWICE.sub(r"\g<0>; entries of a list are written [[\1]]", reason(problem))
         raise _unreadable(file, f"is not valid TOML: {said}.") from None
     except OSError as problem:
-        beside = f"{file}.toml"
-        there = f"; did you mean {beside}?" if os.path.isfile(beside) else "."
+        beside = _beside(file) if isinstance(problem, FileNotFoundError) else None
+        there = f"; did you mean {beside}?" if beside else "."
         raise _unreadable(file, f"cannot be read: {reason(problem)}{there}") from None
     return put_in(data, overrides, file)
+
+
+def _beside(file: str) -> str | None:
+    """The scene file in the same folder that is called nearly as one that is not there."""
+    folder, name = os.path.split(file)
+    try:
+        names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
+    except OSError:
+        return None
+    close = [f"{name}.toml"] if f"{name}.toml" in names else get_close_matches(name, names, 1, cutoff=0.8)
+    return os.path.join(folder, close[0]) if close else None
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[str, Any]:

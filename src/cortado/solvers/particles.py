@@ -254,10 +254,10 @@ class ParticleSolver:
                 threads=self.layout.members,
             )
 
-    def densities(self, state: State, parameters: Parameters) -> NDArray:
-        """(n,) of a state, in the scene's order, of a batch one scene behind the other [kg / m3]. What the solver keeps
-        of a step is overwritten."""
-        self.reset()
+    def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
+        """(n,) of a state, in the scene's order, of a batch one scene behind the other [kg / m3]. Solids are where they
+        are at the end of a ``step``, counted from 0. What the solver keeps of a step is overwritten."""
+        self.reset(step)
         self.sort(state, parameters)
         while self.make_room():
             self.sort(state, parameters)

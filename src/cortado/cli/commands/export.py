@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from cortado.errors import InputError
+from cortado.runs.exports.export import export
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
+from cortado.simulation import Simulation
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int) -> str:
@@ -12,6 +14,6 @@ def export_run(run: Path, to: str, out: Path | None, every: int) -> str:
     folder = RunFolder.open(run)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")
-    trajectory = Trajectory.load(folder.trajectory)[::every]
-    found = trajectory.export(folder.path / to if out is None else out, to, folder.read_scene())
+    trajectory, scene = Trajectory.load(folder.trajectory)[::every], folder.read_scene()
+    found = export(trajectory, folder.path / to if out is None else out, to, scene, lambda: Simulation(scene))
     return f"The run is in {found}."

@@ -49,6 +49,8 @@ def draw_run(
     if missing:
         raise InputError(missing)
     page = run_page(scene, trajectory, device, coloured_by(scene, trajectory, lambda: Simulation(scene, device)))
+    if as_film and (scene.picture or Picture()).film_frames == 0:
+        raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if as_film:
         path = out or folder.figures / "film.mp4"
         with keeping(lambda: f"what is drawn is in {path}, and the same command goes on with it"):

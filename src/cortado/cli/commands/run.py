@@ -136,10 +136,11 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
         report(Section("What came out", failures=[error]))
         raise told from error
-    summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
-    announce(str(summary))
-    folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
-    report(Section("In numbers", head=("", "value", "unit"), rows=summary.rows()))
+    with keeping(lambda: f"the run is whole, and in {folder.path}; cortado picture {folder.path} --film films it"):
+        summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
+        announce(str(summary))
+        folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
+        report(Section("In numbers", head=("", "value", "unit"), rows=summary.rows()))
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:

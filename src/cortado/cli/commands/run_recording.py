@@ -8,7 +8,7 @@ import numpy as np
 from cortado.files.progress import track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
-from cortado.rollout.durations import expected_of
+from cortado.rollout.durations import done_of, ends_at_a_time
 from cortado.rollout.progress import Progress
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_choice import FrameChoice
@@ -60,24 +60,28 @@ class RunRecording:
         noted, expected = rollout.diagnostics, self.frames.expected(rollout)
         kept = 1 if self.kept is None else len(self.kept)
         file = self.folder.trajectory, times, first, constants, steps, noted, origin, self.watch.names, expected, kept
-        with frame_writer(*file) as writer, track(expected_of(rollout), "run") as advance:
-            notes = Notes(self, writer)
+        whole = (100, "run, % of its time") if ends_at_a_time(rollout) else (rollout.steps, "run")
+        with frame_writer(*file) as writer, track(*whole) as advance:
+            notes, done = Notes(self, writer), 0
             if self.kept is None:
                 append_frame(writer, first, rollout.clocks[0].steps, self.watch.frame(0, rollout.initial))
                 self.watch.step(0, rollout.initial)
             else:
                 self.kept.write_frames(writer)
-                advance(rollout.progress.step)
+                done = done_of(rollout, rollout.progress.step, float(self.kept.times[-1]))
+                advance(done)
             size = float(rollout.time_steps[0])
 
             def observe(step: int, state: State) -> None:
+                nonlocal done
                 before, now = (float(rollout.clocks[0].times(np.array(k), size)) for k in (step - 1, step))
                 if self.frames.is_due(step, before, now) or rollout.is_last(step):
                     number = rollout.clocks[0].steps + step
                     append_frame(writer, self.simulation.frame(state), number, self.watch.frame(step, state), now)
                 self.watch.step(step, state)
                 notes.now_and_then(step)
-                advance()
+                before, done = done, done_of(rollout, step, now)
+                advance(done - before)
 
             try:
                 last = rollout.forward(observe, keep=False)

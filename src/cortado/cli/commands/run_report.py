@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from cortado.cli.commands.run_summary import simulated, sizes_in_words
-from cortado.files.interruption import keeping
 from cortado.files.terminal import say
 from cortado.files.video import write_video
 from cortado.pictures.figures import images, particles
@@ -57,11 +56,8 @@ def write_run_report(
     if missing:
         say(missing)
     elif pictures:
-        with keeping(
-            lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film goes on with it"
-        ):
-            values = coloured_by(scene, trajectory, lambda: simulation)
-            write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
+        values = coloured_by(scene, trajectory, lambda: simulation)
+        write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
 
 
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:

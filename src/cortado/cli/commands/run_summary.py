@@ -88,7 +88,7 @@ class RunSummary:
         """``last``: the state at the end."""
         solver, taken, found = rollout.solver, rollout.taken, None
         if isinstance(solver, ParticleSolver):
-            densities = solver.densities(last, rollout.parameters)[_out(simulation, last)]
+            densities = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
             found = float(densities.min()), float(densities.max())
         return cls(
             steps=taken,

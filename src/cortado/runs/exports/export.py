@@ -12,6 +12,7 @@ from cortado.runs.exports.by_trimesh import Advance, write_glb, write_obj, write
 from cortado.runs.exports.by_usd import write_usd
 from cortado.runs.exports.by_vtk import write_vtp
 from cortado.runs.exports.exported import Exported
+from cortado.runs.measuring import Measuring
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene, as_scene
 
@@ -24,8 +25,14 @@ FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
 }
 
 
-def export(trajectory: Trajectory, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str]) -> Path:
-    """See `Trajectory.export`; returns the file to open, or the folder of a series."""
+def export(
+    trajectory: Trajectory,
+    folder: str | PathLike[str],
+    to: str,
+    scene: Scene | str | PathLike[str],
+    simulation: Callable[[], Measuring] | None = None,
+) -> Path:
+    """See `Trajectory.export`, and `Exported`; returns the file to open, or the folder of a series."""
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
     if not len(trajectory):
@@ -36,12 +43,13 @@ def export(trajectory: Trajectory, folder: str | PathLike[str], to: str, scene: 
             f"scene has {of.dimension} dimensions and {len(of.phase)} phases, but must be that of the trajectory, with "
             f"{trajectory.dimension} and {_phases(trajectory)}."
         )
+    run = Exported(trajectory, of, simulation)
     with sentences(into):
         into.mkdir(parents=True, exist_ok=True)
         if any(into.iterdir()):
             raise InputError(f"{into} is not empty; choose another folder, in which no other files get in between.")
     with track(len(trajectory), "export") as advance:
-        return FORMATS[to](Exported(trajectory, of), into, advance)
+        return FORMATS[to](run, into, advance)
 
 
 def _phases(trajectory: Trajectory) -> int:

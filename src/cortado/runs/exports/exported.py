@@ -1,7 +1,7 @@
 """What is written of a run for other programs: in every frame the particles, the surface of the fluid, and solids."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +9,15 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.pictures.painter import colours_of
+from cortado.pictures.scale import Scale
 from cortado.pictures.shown_solids import ShownSolid, shown_solids
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import upright
 from cortado.pictures.surface import liquid, nearest_colours, spheres
+from cortado.runs.colouring import coloured_by
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
+from cortado.runs.measuring import Measuring
 from cortado.runs.solid_motion import posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
@@ -82,7 +85,7 @@ class ExportedFrame:
     velocities: Points
     """(n, 3) [m/s]"""
     colours: Points
-    """(n, 3) of the particles, linear, from 0 to 1: those of their phases"""
+    """(n, 3) of the particles, linear, from 0 to 1: those of the pictures"""
     fields: Mapping[str, np.ndarray]
     """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
     surface: Mesh | None
@@ -92,10 +95,13 @@ class ExportedFrame:
 
 
 class Exported:
-    """A run and its scene as other programs are given it."""
+    """A run and its scene as other programs are given it; ``simulation`` computes what ``picture.colour`` names and was
+    not recorded. Raises `InputError` where nothing does."""
 
-    def __init__(self, trajectory: Trajectory, scene: Scene):
+    def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Measuring] | None = None):
         self.times, self.scene = trajectory.times, scene
+        self._values = coloured_by(scene, trajectory, simulation)
+        self._scale = None if self._values is None else Scale.of((scene.picture or Picture()).colour, self._values, "")
         shown = _first_of_each(sized(scene, trajectory.solids))
         parts = _part_names(shown)
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
@@ -122,6 +128,8 @@ class Exported:
     def _frame(self, number: int, frame: Frame) -> ExportedFrame:
         positions, velocities = in_space(frame.positions), in_space(frame.velocities)
         colours = colours_of(self.scene, frame.mass_fractions, len(positions))
+        if self._scale is not None and self._values is not None:
+            colours = self._scale.colours(self._values[number])
         fractions = np.zeros((len(positions), 0)) if frame.mass_fractions is None else frame.mass_fractions
         fields = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
         placed = _first_of_each(posed(self.scene, self._trajectory.solids, number))
