@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from cortado.device.cells import CellSort, Grid, cell_kernels
 from cortado.device.launching import launch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.particles.cells import CellSort, Grid, cell_kernels
 
 CPU = wp.get_device("cpu")
 REACH = 0.1

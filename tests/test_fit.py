@@ -1,5 +1,8 @@
 """Fits of measured experiments: error bars that hold the truth, tangents that are right, and mistakes in sentences."""
 
+import pickle
+from html import escape
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -237,6 +240,32 @@ def test_bars_of_fits_hold_the_truth_where_counted_ones_do_not(shaken):
     assert all(one.intervals()["viscosity"][0] < TRUE < one.intervals()["viscosity"][1] for one in fits)
 
 
+def test_a_fit_in_float32_is_that_in_float64(shaken):
+    tracers = shaken.observations["tracers"]
+    times, first = tracers.times, shaken.simulation.positions[::3]
+    single = cortado.Simulation(SCENE, precision="float32")
+    noisy = with_shake(shaken, 0).observations["tracers"].measured
+    tracks = measured.Tracks(single, first, times, noisy.reshape(len(times), -1, 2))
+    both = [
+        cortado.fit(one, {"viscosity": 1.5})
+        for one in (measured.Experiment(single, {"tracers": tracks}), shaken.measured_again({"tracers": noisy}))
+    ]
+    off = both[0].values["viscosity"] - both[1].values["viscosity"]
+    assert abs(off) < 0.1 * both[1].standard_errors["viscosity"]
+    assert both[0].standard_errors["viscosity"] == pytest.approx(both[1].standard_errors["viscosity"], rel=0.01)
+    assert both[0].converged
+
+
+def test_a_notebook_shows_numbers_with_bars_and_doubts(shaken):
+    found = cortado.fit(
+        with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.0, -9.0]}, {"gravity": ([0.0, -9.0],) * 2}
+    )
+    page = found._repr_html_()
+    assert "Pa s" in page and "±" in page and "data:image/png;base64," in page
+    assert escape(found.doubts[0]) in page and page.count("<tr>") == 2
+    assert repr(found).startswith("Fit(viscosity ") and "±" in repr(found)
+
+
 def test_two_experiments_tell_more_than_one(shaken):
     pair = [with_shake(shaken, seed) for seed in (0, 1)]
     both = cortado.fit(pair, {"viscosity": 1.5})
@@ -248,6 +277,20 @@ def test_two_experiments_tell_more_than_one(shaken):
 def test_a_profile_of_small_noise_is_a_parabola(shaken):
     found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).profile("viscosity", points=3)
     assert found.deviance == pytest.approx(found.expected, rel=0.1, abs=0.05)
+
+
+def test_the_posterior_is_that_of_the_bars(shaken):
+    bounds = {"gravity": ([-5.0, -9.81], [5.0, -9.81])}
+    found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5, "gravity": [0.5, -9.81]}, bounds)
+    assert found.log_posterior(found.u) == pytest.approx(0.0, abs=0.01)
+    V = found.coordinate_covariance
+    for away in np.linalg.cholesky(V).T * 2.0:
+        assert found.log_posterior(found.u + away) == pytest.approx(-2.0, rel=0.1)
+    assert found.log_posterior([0.0, 6.0]) == -np.inf == found.log_posterior([np.nan, 0.0])
+    with pytest.raises(InputError, match=r"u has shape \(1,\), but must be \(2,\)"):
+        found.log_posterior([0.0])
+    with pytest.raises(InputError, match="was pickled, but must have its experiments"):
+        pickle.loads(pickle.dumps(found)).log_posterior(found.u)
 
 
 def test_a_wrong_model_is_doubted(shaken):

@@ -1,6 +1,8 @@
 """Tasks with measured data: their files, their command, and mistakes in them."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +36,23 @@ def test_a_fit_writes_its_numbers_and_its_report(task, tmp_path, cortado_command
     assert found["lower_95"]["viscosity"] < found["parameters"]["viscosity"] < found["upper_95"]["viscosity"]
     report = (tmp_path / "run/report.html").read_text()
     assert "Residuals" in report and "standard error" in report and "left gauge" in report
+
+
+@pytest.mark.parametrize("full", ["scene.json", "result.json", "residuals.png"])
+def test_on_a_full_disk_a_fit_says_so(full, task, tmp_path, cortado_command, monkeypatch):
+    replace = os.replace
+
+    def refuse(old, new, **options):
+        if Path(new).name == full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replace(old, new, **options)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    code, _, err = cortado_command("fit", task, "--out", tmp_path / "run", "--set", "fit.profiles=0")
+    assert code == 1, err
+    assert_one_sentence(err.removesuffix("\n").splitlines()[-1])
+    assert "No space left on device" in err
+    assert not list((tmp_path / "run").rglob(".*"))
 
 
 @pytest.mark.parametrize(

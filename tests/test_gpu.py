@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
+from cortado.device.cells import CellSort, Grid
 from cortado.device.launching import sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.particles.cells import CellSort, Grid
 from cortado.pictures.painter import painter
 from cortado.scene.motions import told
 from scenes import HONEY, plane, plane_of_three, scene, splash, thrown, two_layers

@@ -495,8 +495,19 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
     other = layer.state(Simulation(plane(discretisation={"spacing": 0.04}), precision="float64"))
     space = layer.state(Simulation(scene(), precision="float64"))
     gentle = gradients.RandomizedSmoothing(samples=4)
-    single = jax.numpy.float32(2.0)
+    single, rounded = jax.numpy.float32(2.0), np.array([0.0, -9.81], dtype=np.float16)
+    half, brain = (
+        {**state, "velocities": np.asarray(state["velocities"]).astype(one)} for one in ("float16", jax.numpy.bfloat16)
+    )
     for use, words in [
+        (lambda: layer.step(simulation, half), "state velocities is float16, but must be float32 or float64, as half"),
+        (
+            lambda: layer.step(simulation, brain),
+            "state velocities is bfloat16, but must be float32 or float64, as",
+        ),
+        (lambda: layer.measure(simulation, "density")(half), "state velocities is float16, but must be float32 or"),
+        (lambda: layer.restart_state(simulation, half), "state velocities is float16, but must be float32 or float64"),
+        (lambda: layer.step(simulation, state, {"gravity": rounded}), "parameter gravity is float16, but must be"),
         (lambda: layer.step(simulation, other), "state positions has shape"),
         (lambda: layer.step(simulation, space), "state positions has shape"),
         (lambda: layer.step(simulation, state, steps=0), "steps is 0, but must be a whole number of at least 1"),

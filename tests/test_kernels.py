@@ -16,10 +16,10 @@ import warp as wp
 
 from cortado.device.binding import bound
 from cortado.device.bundles import Bundles, bundles_of
+from cortado.device.cells import Grid
 from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout

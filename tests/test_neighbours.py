@@ -10,11 +10,11 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cortado.device.cells import Grid
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles import candidates
-from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout

@@ -7,8 +7,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 import cortado
-from cortado.discretise.pairs import apart, are_near, pairs_among, pairs_within
+from cortado.discretise.packing.around import PointsAround
+from cortado.discretise.packing.linearised import Linearised, ListedPairs
+from cortado.discretise.pairs import apart, pairs_among, pairs_within
 from cortado.discretise.region import Region
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.discretise.walls.weights import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.sampling import period
 from cortado.scene.scene import Scene
@@ -58,7 +62,7 @@ def near_air(scene: Scene, found: DiscreteScene) -> np.ndarray:
         outside = fluid.distance(places, SPACING) if ends is None else Region.between(*ends).distance(places)
         empty &= outside > 0.0
     lower, lengths = period(scene)
-    return are_near(x, places[empty], reach, lower, lengths) if empty.any() else np.zeros(len(x), dtype=bool)
+    return np.isin(np.arange(len(x)), pairs_within(x, places[empty], reach, lower, lengths)[0])
 
 
 CASES = {
@@ -156,11 +160,59 @@ def test_distances_from_a_region():
     assert (Region.everywhere(3).distance(points) == -np.inf).all()
 
 
+def around(points: np.ndarray, air: tuple[int, int], lengths: np.ndarray, reach: float) -> PointsAround:
+    lattice = RestLattice(CUBIC_SPLINE, 0.1, 0.2)
+    weights = np.where(np.arange(len(points)) < 100, 1.0, 0.7)
+    return PointsAround(lattice, points, weights, air, lengths, reach)
+
+
+@pytest.mark.parametrize("lengths", [[0.0, 0.0, 0.0], [0.0, 0.5, 1.1], [0.0, 0.0], [1.0, 0.0]])
+def test_what_is_around_particles_is_what_pairs_are(lengths):
+    """Of 100 particles every other one is blind, so that it does not see the air behind them; some periods are so short
+    that a particle would see two images."""
+    lengths = np.array(lengths)
+    points, blind = np.random.default_rng(3).uniform(-0.3, 1.6, size=(400, len(lengths))), np.arange(100) % 2 == 0
+    found = around(points, (100, 250), lengths, 0.26)
+    i, j, distances = pairs_within(points[:100], points, 0.26, 0.0, lengths)
+    seen = ~(blind[i] & (j >= 100) & (j < 250))
+    later = seen & (j > i)
+    starts, ends, others = found.lists(points[:100], blind)
+    listed = {(n, other) for n in range(100) for other in others[starts[n] : ends[n]]}
+    assert listed == {*zip(i[later], j[later], strict=True)} and ends.sum() - starts.sum() == len(listed) > 50
+    sums = np.bincount(i, seen * found.weights[j] * CUBIC_SPLINE.weight(distances, len(lengths), 0.2), 100)
+    np.testing.assert_allclose(found.sums(points[:100], blind), sums, rtol=1e-13)
+    some = around(points[:3], (0, 0), lengths, 0.26)
+    np.testing.assert_array_equal(some.near(points[:100]), np.isin(np.arange(100), i[j < 3]))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_derivatives_of_densities_and_distances(dimension):
+    """Against differences, and the product with the transpose against that with the derivatives."""
+    generator = np.random.default_rng(4)
+    points, free = generator.uniform(size=(300, dimension)), np.arange(100) % 3 > 0
+    blind, lengths = np.arange(100) % 2 == 0, np.array([0.0, 1.0, 0.0])[:dimension]
+
+    def linearised(moves: np.ndarray | float = 0.0) -> Linearised:
+        moved = points.copy()
+        moved[:100] += moves
+        return ListedPairs(around(moved, (100, 200), lengths, 0.25), blind, free).linearised(0.09)
+
+    moves = free[:, None] * generator.normal(size=(100, dimension))
+    found, step = linearised(), 1e-6
+    changes, approaches = found.multiply(np.pad(moves, [(0, 0), (0, 3 - dimension)]))
+    forward, back = linearised(step * moves), linearised(-step * moves)
+    for product, after, before in ((changes, forward.sums, back.sums), (approaches, forward.distances, back.distances)):
+        quotient = (after - before) / (2.0 * step)
+        np.testing.assert_allclose(product, quotient, atol=1e-7 * np.abs(quotient).max())
+    a, b = generator.normal(size=100), generator.normal(size=len(approaches))
+    assert len(b) > 10
+    transposed = (found.multiply_back(a, b)[:, :dimension] * moves).sum()
+    assert transposed == pytest.approx(changes @ a + approaches @ b, rel=1e-12)
+
+
 def test_pairs_of_one_set_are_those_of_two():
     points = np.random.default_rng(2).uniform(size=(200, 2))
     for lengths in (np.zeros(2), np.array([1.0, 0.0])):
         i, j, _ = pairs_within(points, points, 0.1, 0.0, lengths)
         a, b = pairs_among(points, 0.1, 0.0, lengths)
         assert {*zip(i[i < j], j[i < j], strict=True)} == {*zip(a, b, strict=True)} and len(a) > 100
-        near = are_near(points, points[:3], 0.1, 0.0, lengths)
-        np.testing.assert_array_equal(near, np.isin(np.arange(200), i[j < 3]))

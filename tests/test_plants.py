@@ -51,7 +51,7 @@ UNNAMED = {
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
     "particles.neighbourhood": {"pair_functions.factor_gradient", "pair_functions.hessian_product"},
-    "particles.smoothing": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
+    "discretise.smoothing_functions": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
     "losses.image_losses": {"adjoint", "reduce_transposed"},
     "losses.matching": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},

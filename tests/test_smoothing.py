@@ -19,8 +19,8 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.smoothing import KERNELS, smoothing_kernel
+from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.errors import InputError
-from cortado.particles.smoothing import smoothing_functions
 from finite_differences import decades, plateau
 
 SUPPORT = 0.13

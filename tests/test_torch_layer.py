@@ -337,6 +337,10 @@ BAD_STATES = {
     "another shape": (lambda s: {**s, "positions": s["positions"][1:]}, r"state positions has shape \(63, 2\), but"),
     "float32": (lambda s: {**s, "positions": s["positions"].float()}, "state positions is torch.float32, but must be"),
     "half": (lambda s: {**s, "velocities": s["velocities"].half()}, "state velocities is torch.float16, but must be"),
+    "half of NumPy": (
+        lambda s: {**s, "velocities": s["velocities"].numpy().astype(np.float16)},
+        "state velocities is float16, but must be float32 or float64, as half precision rounds to three digits",
+    ),
     "complex": (lambda s: {**s, "positions": s["positions"] + 0j}, "state positions is a tensor of torch.complex128"),
     "truth values": (lambda s: {**s, "positions": s["positions"] > 0}, "state positions is a tensor of torch.bool"),
     "sparse": (lambda s: {**s, "positions": s["positions"].to_sparse()}, "torch.sparse_coo, but must be a dense"),

@@ -42,6 +42,14 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
     raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers.")
 
 
+def as_precise_numbers(what: str, value: Any) -> np.ndarray:
+    """The same of float32, of float64 or of integers: half precision, which rounds to three digits, is refused."""
+    kind = str(getattr(value, "dtype", ""))
+    if kind.endswith("float16"):  # bfloat16 too
+        raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
+    return as_numbers(what, value)
+
+
 def read_only(what: str, value: Any) -> np.ndarray:
     """The same as an array of its own that cannot be changed."""
     array = as_numbers(what, value).copy()

@@ -200,11 +200,21 @@ class Problem:
         """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
         of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
         `states` does."""
-        require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
-        values = self._checked(parameters)
-        along = self._space.checked(directions, "direction")
-        ends = self._ends(values, self._checked_steps(steps), keep=False, varied=along)
-        self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
+        return self.several_tangents(parameters, [(directions, observe)], steps)
+
+    @in_turn
+    def several_tangents(
+        self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
+    ) -> dict[int, Any]:
+        """The same along several directions, each with an observer of its own, of one run."""
+        values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
+        for directions, observe in each:
+            require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
+            along.append((self._space.checked(directions, "direction"), observe))
+        varied = {name for directions, _ in along for name in directions}
+        ends = self._ends(values, self._checked_steps(steps), keep=False, varied=varied)
+        for directions, observe in along:
+            self._rollout.tangent(*self._space.direction(self._rollout, values, directions), observe)
         return ends
 
     @in_turn

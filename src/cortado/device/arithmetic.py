@@ -1,7 +1,8 @@
 """Roots and reciprocals for pairs of particles: in CUDA and float32 the GPU's own, within 2 units in the last place.
 
 Those of IEEE 754 take a GPU some ten instructions each, and a branch for numbers that are next to 0 or infinite. What
-pairs hand over is not: squares of distances have a floor (`cortado.particles.smoothing`), all else is positive.
+pairs hand over is not: squares of distances have a floor (`cortado.discretise.smoothing_functions`), and all else is
+positive.
 """
 
 from dataclasses import dataclass

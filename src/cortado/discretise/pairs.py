@@ -26,13 +26,14 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
     some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
-    tree = cKDTree(others, boxsize=lengths)
+    numbers = _around(some, others, reach, lengths)
+    tree = cKDTree(others[numbers], boxsize=lengths)
     first, second, distances = [], [], []
     for start in range(0, len(some), CHUNK):
         chunk = cKDTree(some[start : start + CHUNK], boxsize=lengths)
         found = chunk.sparse_distance_matrix(tree, reach, output_type="ndarray")
         first.append(found["i"] + start)
-        second.append(found["j"])
+        second.append(numbers[found["j"]])
         distances.append(found["v"])
     none = np.zeros(0, dtype=np.int64)
     return np.concatenate([none, *first]), np.concatenate([none, *second]), np.concatenate([np.zeros(0), *distances])
@@ -51,17 +52,6 @@ def pairs_among(
     return first, second
 
 
-def are_near(some: Points, others: Points, reach: float, lower: ArrayLike, lengths: ArrayLike) -> NDArray[np.bool_]:
-    """(n,) whether each of ``some`` (n, d) [m] has one of the ``others`` at most ``reach`` [m] apart; the arguments are
-    those of `pairs_within`."""
-    from scipy.spatial import cKDTree
-
-    lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
-    some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
-    distances = cKDTree(others, boxsize=lengths).query(some, distance_upper_bound=reach * (1.0 + 1e-9))[0]
-    return np.asarray(np.isfinite(distances))
-
-
 def apart(separations: Points, lengths: ArrayLike) -> Points:
     """Separations (m, d) [m] of pairs with the nearest image, where ``lengths`` (d,) [m] are those of the period."""
     lengths = np.asarray(lengths, dtype=np.float64)
@@ -70,8 +60,20 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
     return np.asarray(separations - lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf)))
 
 
+def _around(some: Points, others: Points, reach: float, lengths: Points) -> NDArray[np.int64]:
+    """Numbers of the ``others`` (m, d) [m] that are in the box around ``some`` (n, d) [m] and ``reach`` [m] further; of
+    all of them where there is a period, or nothing to be near to."""
+    if lengths.any() or not len(some):
+        return np.arange(len(others))
+    beyond = reach * (1.0 + 1e-9)
+    lower, upper = some.min(axis=0) - beyond, some.max(axis=0) + beyond
+    return np.flatnonzero(((others >= lower) & (others <= upper)).all(axis=1))
+
+
 def wrapped(positions: Points, lengths: Points) -> Points:
     """(n, d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
+    if not lengths.any():
+        return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)
     remainder = np.mod(positions, safe)
     return np.where(lengths > 0.0, np.where(remainder >= safe, 0.0, remainder), positions)

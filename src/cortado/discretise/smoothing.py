@@ -6,7 +6,7 @@ With q = r / h, s = x / h and the normalisation sigma [1 / m^d]:
 
 where f(q) = w'(q) / q is finite at q = 0 for every kernel here, so that no direction is needed at r = 0.
 Cubic spline: Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The same in Warp, with Hessians:
-`cortado.particles.smoothing`.
+`cortado.discretise.smoothing_functions`.
 """
 
 from collections.abc import Callable

@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
-from cortado.particles.cells import cell_functions, cell_grid_type
 from cortado.particles.loads import loads
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 

@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bundles import bundle
+from cortado.device.cells import CellSort, Grid, cell_grid_type
 from cortado.device.launching import launch
 from cortado.device.precision import Precision
-from cortado.particles.cells import CellSort, Grid, cell_grid_type
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
 

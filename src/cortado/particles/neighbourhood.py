@@ -11,8 +11,8 @@ from cortado.device.kernels import kind_of
 from cortado.device.lanes import set_lanes
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
+from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.loads import loads
-from cortado.particles.smoothing import smoothing_functions
 from cortado.particles.wall_functions import wall_functions
 
 UNROLL = 4

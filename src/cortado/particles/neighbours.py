@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.device.host import HostCopy
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.particles.candidates import scan_around
-from cortado.particles.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.state import Layout

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
+from cortado.device.cells import CellSort, Grid
 from cortado.device.precision import FLOAT32
-from cortado.particles.cells import CellSort, Grid
 from cortado.pictures.particles import MODULE, Look, Particles
 
 

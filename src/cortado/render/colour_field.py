@@ -13,10 +13,10 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.precision import Precision
-from cortado.particles.cells import cell_functions, cell_grid_type
+from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.smoothing import smoothing_functions
 
 
 @cache

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.cells import CellSort, Grid
 from cortado.device.launching import launch, sum_of
 from cortado.device.memory import field_parts, require
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
-from cortado.particles.cells import CellSort, Grid
 from cortado.particles.neighbourhood import Discretisation
 from cortado.render.colour_field import colour_field_kernels, nodes_type, rgba_type
 from cortado.render.phase_colours import colours_type, phase_colour_kernels

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import as_numbers, as_one_number, is_whole
+from cortado.arrays import as_one_number, as_precise_numbers, is_whole
 from cortado.discretise.crowding import check_apart, nearest
 from cortado.errors import InputError, shown
 from cortado.rollout.parameter_checks import outside, place_in_words
@@ -81,7 +81,7 @@ def check_state(
 
 
 def _numbers(name: str, value: object, shape: tuple[int, ...], simulation: Simulated) -> NDArray:
-    array, precision = as_numbers(f"state {name}", value), simulation.precision
+    array, precision = as_precise_numbers(f"state {name}", value), simulation.precision
     if array.shape != shape:
         raise InputError(f"state {name} has shape {array.shape}, but must be {shape}.")
     if not np.isfinite(array).all():

@@ -16,7 +16,7 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.crowding import check_crowding, crowding_of
-from cortado.discretise.packing import Packing
+from cortado.discretise.packing.packing import Packing
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
@@ -127,4 +127,4 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
     stays = ~fluid.is_packed
     air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
     fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
-    return Packing(lattice, fixed, weights, len(air), lower, lengths).packed(fluid.positions, stays)
+    return Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)

@@ -7,10 +7,12 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from cortado.errors import InputError
+from cortado.scene.docstrings import field_docstrings
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
 from cortado.scene.sentences import UNKNOWN, absent, sentences
 
@@ -18,7 +20,7 @@ from cortado.scene.sentences import UNKNOWN, absent, sentences
 class Table(BaseModel):
     """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
     """Tables of others that a file may hold beside its keys; only for advice."""
 
@@ -44,6 +46,16 @@ class Table(BaseModel):
             if key not in cls.model_fields:
                 raise _unknown_key(str(key), [*cls.model_fields, *(name for name in cls.beside if name != key)])
         return {name: without_numpy(value) for name, value in data.items()}
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """With the docstrings of fields as their descriptions."""
+        schema = handler(core_schema)
+        properties = handler.resolve_ref_schema(schema).get("properties", {})
+        texts = field_docstrings(cls)
+        for name in properties.keys() & texts.keys():
+            properties[name].setdefault("description", texts[name])
+        return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         """This table, at a path, with its vectors checked, and those left out filled in, for 2 or 3 dimensions."""

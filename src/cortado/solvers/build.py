@@ -6,13 +6,13 @@ from importlib import import_module
 
 import numpy as np
 
+from cortado.device.cells import Grid
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solids.mass import Mass
 from cortado.discretise.solids.solid import Hollow, Solid
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
-from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout

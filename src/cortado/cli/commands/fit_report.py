@@ -57,22 +57,14 @@ def _apart(fitted: Fit) -> list[str]:
 
 
 def _rows(fitted: Fit) -> list[tuple[object, ...]]:
-    coordinates, free = fitted.coordinates, fitted.coordinates.free
-    ends = fitted.intervals()
-    lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
-    slopes = coordinates.slopes(fitted.u)
-    columns = (
-        coordinates.at_start[free],
-        coordinates.numbers(fitted.u),
-        np.sqrt(np.diag(fitted.covariance)),
-        lower,
-        upper,
-        np.round(fitted.degrees_of_freedom, 1),
-        np.sqrt(np.diag(fitted.naive_covariance)) * slopes,
-    )
+    counted_errors = np.sqrt(np.diag(fitted.naive_covariance)) * fitted.coordinates.slopes(fitted.u)
+    each = zip(fitted.numbers(), fitted.degrees_of_freedom, counted_errors, strict=True)
     return [
-        (label.replace("_", " "), unit_of(label), *(float(column[k]) for column in columns))
-        for k, label in enumerate(fitted.labels)
+        (
+            *(one.label.replace("_", " "), unit_of(one.label), one.start, one.value, one.error, one.lower, one.upper),
+            *(round(float(freedom), 1), float(error)),
+        )
+        for one, freedom, error in each
     ]
 
 

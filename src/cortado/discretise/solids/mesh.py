@@ -54,6 +54,10 @@ class Mesh(Solid):
         return self.known_trees or [TriangleTree.of(self.corners[part]) for part in self._numbers]
 
     def extent(self) -> tuple[Points, Points]:
+        return self._ends
+
+    @cached_property
+    def _ends(self) -> tuple[Points, Points]:
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
 
     def distance(self, points: Points) -> Points:
@@ -69,6 +73,8 @@ class Mesh(Solid):
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
+        if len(self._trees) == 1:
+            return self._trees[0].nearest(points)[0]
         return self._looked_up(points, np.inf)[0]
 
     def outward(self, points: Points) -> Points:

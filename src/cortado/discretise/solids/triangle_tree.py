@@ -1,12 +1,12 @@
 """A tree of boxes around triangles, which finds the nearest of them, in float64."""
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.cpu_launches import launched_in_bands, shared, started
 from cortado.discretise.shapes import Points
 
 Numbers = NDArray[np.int64]
@@ -93,22 +93,19 @@ class TriangleTree:
     def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
         """Launch one of the kernels for points (n, d) [m], with what it takes beside the tree; it writes to arrays that
         it takes."""
-        kernels, launch = _launcher()
-        if not len(points):
-            return
-        from cortado.device.threads import WARP
+        started()
+        from cortado.discretise.solids import tree_kernels
 
-        with WARP:
-            launch(
-                getattr(kernels, kernel),
-                len(points),
-                points=_shared(np.ascontiguousarray(points, dtype=np.float64)),
-                boxes=_shared(self.boxes, kernels.box),
-                starts=_shared(self.starts),
-                corners=_shared(self.corners),
-                leaves=len(self.starts) - 1,
-                **{name: _shared(x) if isinstance(x, np.ndarray) else x for name, x in arguments.items()},
-            )
+        launched_in_bands(
+            getattr(tree_kernels, kernel),
+            len(points),
+            points=np.ascontiguousarray(points, dtype=np.float64),
+            boxes=shared(self.boxes, tree_kernels.box),
+            starts=self.starts,
+            corners=self.corners,
+            leaves=len(self.starts) - 1,
+            **arguments,
+        )
 
 
 def _starts(count: int, level: int) -> Numbers:
@@ -126,26 +123,3 @@ def _along_a_curve(points: Points) -> Numbers:
     for shift, mask in SPREAD:
         cells = (cells | cells << shift) & mask
     return np.argsort(cells @ np.array([1, 2, 4]), kind="stable")
-
-
-@cache
-def _launcher() -> Any:
-    """The kernels, and what launches them on the CPU."""
-    from cortado.device.kernel_cache import start_warp
-
-    start_warp()
-    import warp as wp
-
-    from cortado.device.bands import BandLauncher
-    from cortado.discretise.solids import tree_kernels
-
-    return tree_kernels, BandLauncher(wp.get_device("cpu"))
-
-
-def _shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """An array of Warp's in the memory of one of NumPy's; what has more than one axis is vectors along the last one."""
-    import warp as wp
-
-    types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i)}
-    found = dtype or types[values.dtype.name][values.ndim > 1]
-    return wp.array(values, dtype=found, device="cpu", copy=False)

@@ -92,7 +92,8 @@ class Coordinates:
     def numbers(self, u: np.ndarray) -> np.ndarray:
         """(free,) numbers in the units of the parameters."""
         is_log = self.logarithmic[self.free]
-        return np.where(is_log, np.exp(np.where(is_log, u, 0.0)), u)
+        with np.errstate(over="ignore"):  # an interval may have no upper end
+            return np.where(is_log, np.exp(np.where(is_log, u, 0.0)), u)
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """(free,) the derivative of each number with respect to its coordinate."""

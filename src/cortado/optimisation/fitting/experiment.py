@@ -1,6 +1,6 @@
 """An experiment: a simulation of it, and what was measured."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from cortado.losses import FinalPositions, Snapshot
 from cortado.optimisation.fitting.observation import Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
+from cortado.rollout.rollout import Observer
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
@@ -75,13 +76,10 @@ class Experiment:
         self, parameters: Values, directions: Sequence[Values]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """The same, and its derivatives along directions, (frames, m, directions), by forward mode."""
-        values, along, ends = self._shared(parameters), [], dict[int, Any]()
-        for direction in directions:
-            moved = self._shared(direction)
-            if moved or not ends:
-                ends, dots = self._along(values, moved)
-            along.append((direction, moved, dots if moved else self._still(ends)))
-        found = {}
+        values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
+        ends, dots = self._along(values, [moved for moved in moves if moved])
+        still, found = self._still(ends), dict[str, Any]()
+        along = [(one, moved, next(dots) if moved else still) for one, moved in zip(directions, moves, strict=True)]
         for name, one in self.observations.items():
             own, slopes = self._own(name, parameters), {}
             for step in self._frames[name].needed:
@@ -94,18 +92,19 @@ class Experiment:
             found[name] = self._frames[name].between(slopes)
         return self._read(ends, parameters), found
 
-    def _along(self, values: Values, moved: Values) -> tuple[dict[int, Any], dict[int, Arrays]]:
-        """States, and their tangents by fields, by the number of steps before them."""
-        dots: dict[int, Arrays] = {}
-        if not moved:
-            return self.problem.states(values, self._steps), dots
-        wanted, dimension = set(self._steps), self.simulation.dimension
+    def _along(self, values: Values, moves: Sequence[Values]) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
+        """States by the number of steps before them, and along each of some directions their tangents, by fields."""
+        wanted, dimension, dots = set(self._steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
-        def observe(step: int, dot: State) -> None:
-            if step in wanted:
-                dots[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
+        def observer(kept: dict[int, Arrays]) -> Observer:
+            def observe(step: int, dot: State) -> None:
+                if step in wanted:
+                    kept[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
 
-        return self.problem.tangents(values, moved, observe, self._steps), dots
+            return observe
+
+        each = zip(moves, map(observer, dots), strict=True)
+        return self.problem.several_tangents(values, each, self._steps), iter(dots)
 
     def _still(self, ends: Mapping[int, Snapshot]) -> dict[int, Arrays]:
         """Tangents of states where only an observation's own parameters change, such as those of a camera."""

@@ -11,11 +11,14 @@ from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import doubts
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.fitted import Fit, FittedPart
-from cortado.optimisation.fitting.least_squares import ROUGHLY, LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
 from cortado.optimisation.fitting.noise import ScoreCovariance, correlation_time, independent_frames, score_covariance
+from cortado.optimisation.fitting.search import least, search
 from cortado.scene.parameters.parameter import Range
 
 POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
+ROUGHLY = 1e-3
+"""Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
 SINGULAR = 1e-10
 """Relative: where the Hessian has an eigenvalue below, a combination of parameters cannot be told."""
 
@@ -29,9 +32,10 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, and say how certain they are.
 
-    Each residual is what a simulation predicts less what was measured; the Jacobian comes from forward-mode tangents,
-    one run for each number that is searched. The first fit takes residuals as they are. Their scatter and correlation
-    then weight the second one, from whose residuals the error bars come (see `cortado.optimisation.fitting.noise`).
+    Each residual is what a simulation predicts less what was measured. The search estimates the Jacobian by a forward
+    run for each number; at its end forward-mode tangents give it. The first fit takes residuals as they are. Their
+    scatter and correlation then weight the second one, from whose residuals the error bars come (see
+    `cortado.optimisation.fitting.noise`).
 
     Args:
         experiments: one `measured.Experiment`, or several that have these parameters in common.
@@ -63,14 +67,12 @@ def fit(
     positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
     coordinates = Coordinates.of(given, positive, bounds)
     problem = LeastSquares(each, coordinates, on_trial)
-    first = problem.residuals(coordinates.start)
-    weights = [
-        Weighting(part.observation.noise or _spread(r) or 1.0) for part, r in zip(problem.parts, first, strict=True)
-    ]
-    u, _ = problem.solve(coordinates.start, weights, iterations, enough=ROUGHLY)
-    weights = _noise_of(problem, problem.linearised(u), weights)
-    u, outcome = problem.solve(u, weights, iterations)
-    return _fitted(problem, problem.linearised(u), weights, outcome)
+    at = problem.estimated(coordinates.start)
+    sizes = [part.observation.noise or _spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
+    weights = [Weighting(size) for size in sizes]
+    at = search(problem, at, weights, iterations, ROUGHLY).at
+    weights = _noise_of(problem, at, weights)
+    return _fitted(problem, *least(problem, at, weights, iterations), weights)
 
 
 def _noise_of(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
@@ -93,7 +95,7 @@ def _inflation(J: np.ndarray, r: np.ndarray) -> float:
     return float(np.mean((pooled**2).sum(axis=(0, 1))[has] / len(r) / counted[has])) if has.any() else 1.0
 
 
-def _fitted(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], outcome: Any) -> Fit:
+def _fitted(problem: LeastSquares, at: Linearised, converged: bool, weights: Sequence[Weighting]) -> Fit:
     """With the covariance, and what the residuals say of the noise and of the model."""
     coordinates = problem.coordinates
     hessian = _hessian(problem, at, weights)
@@ -118,12 +120,13 @@ def _fitted(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting],
         degrees_of_freedom=freedom,
         parts=tuple(parts),
         doubts=doubts(problem, at, weights, scores, coordinates.labels),
-        converged=outcome is None or outcome.status > 0,
+        converged=converged,
         runs=problem.runs,
         tangents=problem.tangents,
         sum_of_squares=squares,
         hessian=hessian,
         problem=problem,
+        at=at,
     )
     return found
 

@@ -9,11 +9,14 @@ import numpy as np
 from cortado.arrays import as_one_number
 from cortado.errors import InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.least_squares import LeastSquares, Part, Weighting
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
+from cortado.optimisation.fitting.search import TINY, search
 from cortado.scene.parameters.values import UNITS
 
 ALIKE = 0.9
 """Two numbers whose estimates are correlated by more are not told apart."""
+NEARLY = 0.01
+"""In squared standard errors: a point of a profile ends where a step lowers the sum of squares by less."""
 OF_VIEWS = {
     "translation": "m",
     "rotation": "rad",
@@ -64,6 +67,24 @@ class Profile:
     """(points,) the same of a model that is linear, from which the intervals come."""
 
 
+@dataclass(frozen=True)
+class FittedNumber:
+    """One of the numbers that were searched."""
+
+    label: str
+    start: float
+    value: float
+    error: float
+    """Standard error."""
+    lower: float
+    upper: float
+
+    @property
+    def words(self) -> str:
+        """Such as "viscosity 2.63 ± 0.05 Pa s"."""
+        return f"{self.label.replace('_', ' ')} {with_error(self.value, self.error)}{_unit(self.label)}"
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters that were fitted to experiments, with their error bars."""
@@ -90,9 +111,11 @@ class Fit:
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
+    at: Linearised | None = field(default=None, repr=False)
+    """The end of the search, with the Jacobian that the bars come from; neither is pickled."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "problem": None}
+        return {**self.__dict__, "problem": None, "at": None}
 
     @property
     def values(self) -> dict[str, Any]:
@@ -152,7 +175,7 @@ class Fit:
         """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
         parabola of a linear model, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
         `InputError`."""
-        if label not in self.labels or self.problem is None:
+        if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
         V = self.coordinate_covariance
@@ -162,28 +185,60 @@ class Fit:
         for shift in shifts:
             begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
             begun[k] = self.u[k] + shift
-            ended, _ = self.problem.solve(begun, weights, 2, fixed=[k])
-            squares = self.problem.sum_of_squares(self.problem.residuals(ended), weights)
+            at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
+            ended = search(self.problem, at, weights, 2, NEARLY / max(self.sum_of_squares, TINY), fixed=[k])
+            squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.gain
             deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
         values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
-    def lines(self, confidence: float = 0.95) -> list[str]:
-        """One for each number: its value, its standard error, and its interval."""
+    def log_posterior(self, u: Any) -> float:
+        """The logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it takes a
+        forward run.
+
+        The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
+        where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
+        `Fit.coordinates.values` makes parameters of coordinates. Raises `InputError`.
+        """
+        from cortado.optimisation.fitting.posterior import log_posterior
+
+        return log_posterior(self, u)
+
+    def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
+        """Those that were searched, with the intervals of `intervals`."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
-        numbers, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        values, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        each = zip(self.labels, self.coordinates.at_start[free], values, errors, lower, upper, strict=True)
+        return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
+
+    def lines(self, confidence: float = 0.95) -> list[str]:
+        """One for each number: its value, its standard error, and its interval."""
         return [
-            f"{label.replace('_', ' ')} {with_error(value, error)}{_unit(label)} "
-            f"({100 * confidence:g} % between {a:.4g} and {b:.4g})"
-            for label, value, error, a, b in zip(self.labels, numbers, errors, lower, upper, strict=True)
+            f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
+            for one in self.numbers(confidence)
         ]
 
+    def __repr__(self) -> str:
+        ended = "" if self.converged else "; not converged"
+        return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
+
+    def _repr_html_(self) -> str:
+        """With a table of the numbers, what is doubted, and residuals over time."""
+        from cortado.optimisation.fitting.fit_page import fit_page
+
+        return fit_page(self)
+
     def __str__(self) -> str:
-        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})" for a, b, c in self.not_told_apart]
+        return "\n".join([*self.lines(), *self.cautions])
+
+    @property
+    def cautions(self) -> list[str]:
+        """Sentences: what is not told apart, whether it ended too early, and the doubts."""
+        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
-        return "\n".join([*self.lines(), *apart, *ended, *self.doubts])
+        return [*apart, *ended, *self.doubts]
 
 
 def with_error(value: float, error: float) -> str:

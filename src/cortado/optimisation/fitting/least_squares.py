@@ -1,8 +1,7 @@
 """The least-squares problem of several experiments: residuals and Jacobian as functions of one vector."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -12,12 +11,8 @@ from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.noise import whitened
 from cortado.optimisation.fitting.observation import Observation
 
-ENOUGH = 1e-6
-"""A search ends where the sum of squares changes by less, relative to itself: by far less than an error bar."""
-ROUGHLY = 1e-3
-"""The same of a search whose end only tells the weights of the next."""
-NEAR = 1e-6
-"""Or where a step is shorter than this, relative to the size of the coordinates."""
+DIFFERENCE = 0.02
+"""Of the logarithm of a number, for an estimate of a derivative."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +69,7 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = 0
-        """Forward runs, and runs along a tangent, each of one experiment."""
-        self._last: Linearised | None = None
+        """Forward runs, and passes along a tangent, each of one experiment."""
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
         """Of each part; raises `DivergedError`."""
@@ -88,68 +82,53 @@ class LeastSquares:
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
 
     def linearised(self, u: np.ndarray) -> Linearised:
-        """At a point; the last one is kept."""
-        if self._last is not None and np.array_equal(self._last.u, u):
-            return self._last
-        directions, values = self.coordinates.directions(u), self.coordinates.values(u)
+        """At a point, by tangents."""
+        return self._along(u, range(len(u)))
+
+    def estimated(self, u: np.ndarray) -> Linearised:
+        """At a point, with derivatives of positive numbers by differences: a forward run costs less than one along a
+        tangent, and this is enough to search. Raises `DivergedError`."""
+        positive = self.coordinates.logarithmic[self.coordinates.free]
+        at = self._along(u, np.flatnonzero(~positive))
+        _, upper = self.coordinates.bounds
+        for k in np.flatnonzero(positive):
+            change = DIFFERENCE if u[k] + DIFFERENCE <= upper[k] else -DIFFERENCE
+            try:
+                moved = self.residuals(u + change * np.eye(len(u))[k])
+            except DivergedError:  # hard by a point that does not
+                return self.linearised(u)
+            for J, before, after in zip(at.jacobians, at.residuals, moved, strict=True):
+                J[..., k] = (after - before) / change
+        return at
+
+    def _along(self, u: np.ndarray, columns: Iterable[int]) -> Linearised:
+        """Residuals, and derivatives along some of the coordinates."""
+        every, values = self.coordinates.directions(u), self.coordinates.values(u)
+        directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
         for k, experiment in enumerate(self.experiments):
-            own = [self._values(k, direction) for direction in directions]
-            run = [number for number, one in enumerate(own) if one]
-            self.runs += len(run)
+            own = {number: self._values(k, direction) for number, direction in directions.items()}
+            run = [number for number, one in own.items() if one]
+            self.runs += 1
             self.tangents += len(run)
-            predicted, slopes = experiment.linearised(self._values(k, values), [own[number] for number in run])
+            at = self._values(k, values)
+            along = [own[number] for number in run]
+            predicted, slopes = experiment.linearised(at, along) if run else (experiment.predicted(at), {})
             for part in self.parts:
                 if part.experiment == k:
-                    jacobian = np.zeros((*part.observation.measured.shape, len(directions)))
-                    jacobian[..., run] = slopes[part.name]
+                    jacobian = np.zeros((*part.observation.measured.shape, len(u)))
+                    jacobian[..., run] = slopes.get(part.name, 0.0)
                     jacobian[np.isnan(part.observation.measured)] = 0.0
                     residuals.append(self._residual(part, predicted[part.name]))
                     jacobians.append(jacobian)
-        self._last = Linearised(u.copy(), residuals, jacobians)
-        return self._last
+        return Linearised(u.copy(), residuals, jacobians)
 
-    def solve(
-        self,
-        u: np.ndarray,
-        weights: Sequence[Weighting],
-        iterations: int,
-        fixed: Sequence[int] = (),
-        enough: float = ENOUGH,
-    ) -> tuple[np.ndarray, Any]:
-        """Lower the sum of the squared residuals by the trust-region method of Branch, Coleman and Li (1999), from a
-        point, with the coordinates of some numbers ``fixed``: where it ended, and what SciPy says of it. A step to
-        where the run diverges is made shorter."""
-        from scipy.optimize import least_squares
-
-        free = np.setdiff1d(np.arange(len(u)), fixed)
-
-        def whole(x: np.ndarray) -> np.ndarray:
-            point = u.copy()
-            point[free] = x
-            return point
-
-        def together(arrays: Sequence[np.ndarray], width: tuple[int, ...]) -> np.ndarray:
-            times = (part.observation.times for part in self.parts)
-            each = (w.of(a, t).reshape(-1, *width) for w, a, t in zip(weights, arrays, times, strict=True))
-            return np.concatenate(list(each))
-
-        def residuals(x: np.ndarray) -> np.ndarray:
-            try:
-                return together(self.residuals(whole(x)), ())
-            except DivergedError:
-                return np.full(sum(part.observation.measured.size for part in self.parts), np.inf)
-
-        def jacobian(x: np.ndarray) -> np.ndarray:
-            return together(self.linearised(whole(x)).jacobians, (len(u),))[:, free]
-
-        if not len(free):
-            return u, None
-        lower, upper = (ends[free] for ends in self.coordinates.bounds)
-        settings: dict[str, Any] = {"ftol": enough, "xtol": NEAR, "gtol": None, "x_scale": "jac"}
-        settings |= {"bounds": (lower, upper), "max_nfev": iterations}
-        found = least_squares(residuals, u[free], jacobian, **settings)
-        return whole(found.x), found
+    def stacked(self, at: Linearised, weights: Sequence[Weighting]) -> tuple[np.ndarray, np.ndarray]:
+        """The Jacobian (numbers, free) and the residuals (numbers,) of all parts, weighted."""
+        times = [part.observation.times for part in self.parts]
+        J = [w.of(J, t).reshape(-1, len(at.u)) for w, J, t in zip(weights, at.jacobians, times, strict=True)]
+        r = [w.of(r, t).ravel() for w, r, t in zip(weights, at.residuals, times, strict=True)]
+        return np.concatenate(J), np.concatenate(r)
 
     def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
         """Of weighted residuals."""

@@ -62,6 +62,8 @@ class Again:
         self._observation, self.measured = observation, own.measured
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_observation":  # while it is unpickled
+            raise AttributeError(name)
         return getattr(self._observation, name)
 
 

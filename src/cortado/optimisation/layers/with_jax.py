@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_precise_numbers
 from cortado.errors import InputError, LibraryMissingError, Words
 from cortado.optimisation.layers import residuals
 from cortado.optimisation.layers.compiled import ForeignFunction
@@ -185,7 +185,7 @@ class JaxBridge:
                 'jax.config.update("jax_enable_x64", True) before anything else, or make the simulation in float32.'
             )
         if not isinstance(value, jax.Array):
-            return jnp.asarray(as_numbers(what, value), dtype=real)
+            return jnp.asarray(as_precise_numbers(what, value), dtype=real)
         if jnp.issubdtype(value.dtype, jnp.floating) and value.dtype != real and not value.weak_type:
             raise InputError(f"{what} is {value.dtype}, but must be {real}, the simulation's precision.")
         if not jnp.issubdtype(value.dtype, jnp.floating) and not jnp.issubdtype(value.dtype, jnp.integer):
@@ -199,7 +199,7 @@ class JaxBridge:
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """An array on the host, in float64."""
-        return as_numbers(what, value)
+        return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_precise_numbers
 from cortado.errors import InputError, LibraryMissingError, Words
 from cortado.optimisation.layers.layer import Array, Layer, Named
 
@@ -176,7 +176,7 @@ class TorchBridge:
         """A tensor of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
         real = _dtype(layer)
         if not isinstance(value, torch.Tensor):
-            return torch.as_tensor(np.array(as_numbers(what, value)), dtype=real, device=_device(layer))
+            return torch.as_tensor(np.array(as_precise_numbers(what, value)), dtype=real, device=_device(layer))
         if value.is_floating_point() and value.dtype != real:
             raise InputError(f"{what} is {value.dtype}, but must be {real}, the simulation's precision.")
         if value.is_complex() or value.dtype == torch.bool or value.layout != torch.strided:
@@ -194,7 +194,8 @@ class TorchBridge:
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """A tensor, or what else it may be, on the host."""
-        return as_numbers(what, value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value)
+        whole = isinstance(value, torch.Tensor) and value.dtype not in (torch.float16, torch.bfloat16)
+        return as_precise_numbers(what, value.detach().cpu().numpy() if whole else value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int

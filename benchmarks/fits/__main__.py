@@ -1,0 +1,61 @@
+"""``python -m benchmarks.fits``: how often error bars hold the truth, what a fit costs beside a search, and what it
+says of a wrong model."""
+
+from functools import partial
+from pathlib import Path
+
+from tyro.extras import SubcommandApp
+
+from cortado.cli.command import Work, command
+from cortado.cli.parsing import Program
+from cortado.cli.process import main
+
+from .coverage import cover, cover_linear
+from .effort import cost_beside_search
+from .wrong import of_another_model
+
+app = SubcommandApp()
+FITS = Program("python -m benchmarks.fits", app, "Measures how right error bars are.")
+
+
+@command(app, answers=True)
+def effort(seed: int = 0) -> Work:
+    """Fit a video, and search the same by L-BFGS-B: what do they cost, in forward runs?
+
+    Args:
+        seed: Of the noise.
+    """
+    return partial(cost_beside_search, seed)
+
+
+@command(app, answers=True)
+def wrong() -> Work:
+    """Fit videos of another solver and of a finer spacing: are the truths within the bars, or does the fit doubt?"""
+    return of_another_model
+
+
+@command(app, answers=True)
+def coverage(case: str = "video", runs: int = 200, out: Path = Path("runs/fits")) -> Work:
+    """Fit one experiment with many kinds of noise, and count how many intervals hold the truth.
+
+    Args:
+        case: "video", "force" or "drop".
+        runs: Number of fits.
+        out: Folder of what is done, a line for each fit; the next call goes on after it.
+    """
+    return partial(cover, case, runs, out)
+
+
+@command(app, answers=True)
+def linear(case: str = "drop", runs: int = 10_000) -> Work:
+    """The same of the experiment's linear model, with the same noise: many more fits, in a minute.
+
+    Args:
+        case: "video", "force" or "drop".
+        runs: Number of fits.
+    """
+    return partial(cover_linear, case, runs)
+
+
+if __name__ == "__main__":
+    main(program=FITS)

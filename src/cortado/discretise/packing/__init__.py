@@ -1,0 +1,1 @@
+"""Particles moved until a body of fluid has its rest density everywhere."""

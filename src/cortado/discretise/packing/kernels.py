@@ -1,0 +1,276 @@
+"""Kernels of the packing, in float64: who is near whom, densities, and products with their derivatives.
+
+Pairs are listed once, with the first of both, and add to what both have: these kernels are launched in one thread, and
+so in a fixed order. They add by reading and writing, as ``+=`` is an atomic addition, which takes longer. Sums over all
+that is around a particle are gathers, which cores may share.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.precision import FLOAT64
+from cortado.discretise.smoothing import SmoothingKernel
+from cortado.discretise.smoothing_functions import smoothing_functions
+
+real, vector = FLOAT64.real, FLOAT64.vector
+grid_type = cell_grid_type(FLOAT64)
+_cells = cell_functions(FLOAT64)
+cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.above
+
+
+@wp.struct
+class Around:
+    """Points that particles see, and what they are in the density."""
+
+    x: wp.array(dtype=vector)
+    """[m]"""
+    weights: wp.array(dtype=real)
+    """What each counts for, a particle being 1 [-]."""
+    air: wp.int32
+    """The first of those that some particles do not see."""
+    behind_air: wp.int32
+    """One behind the last of them."""
+    is_periodic: wp.bool
+    period: vector
+    """[m], 0 along an axis without one"""
+    frequency: vector
+    """1 / period [1 / m], or 0"""
+    per_support: real
+    """1 / h [1 / m]"""
+    normalisation: real
+    """sigma of the kernel [1 / m^d]"""
+
+
+@wp.struct
+class Placed:
+    """The same points in the order of their cells."""
+
+    x: wp.array(dtype=vector)
+    """[m]"""
+    numbers: wp.array(dtype=wp.int32)
+    """Which points they are."""
+
+
+@wp.struct
+class Equations:
+    """Derivatives of densities, and of the distances of pairs that are too near each other. Both are by lists of pairs
+    of which one may move at least; those with particle i as the first begin at ``starts[i]``."""
+
+    starts: wp.array(dtype=wp.int32)
+    others: wp.array(dtype=wp.int32)
+    """The second of each pair within the support."""
+    gradients: wp.array(dtype=vector)
+    """The derivative of the sum of kernels of either by their separation [1 / m^(d + 1)]."""
+    own: wp.array(dtype=vector)
+    """That of a particle's sum by its own place, for what is fixed [1 / m^(d + 1)]."""
+    close_starts: wp.array(dtype=wp.int32)
+    close_others: wp.array(dtype=wp.int32)
+    """The second of each pair that is too near."""
+    directions: wp.array(dtype=vector)
+    """Unit vectors from it to the first."""
+
+
+@wp.func
+def separation(x_i: vector, x_j: vector, around: Around) -> vector:
+    """Of the nearest image."""
+    x_ij = x_i - x_j
+    if around.is_periodic:
+        s = wp.cw_mul(x_ij, around.frequency)
+        x_ij -= wp.cw_mul(vector(wp.rint(s[0]), wp.rint(s[1]), wp.rint(s[2])), around.period)
+    return x_ij
+
+
+@dataclass(frozen=True)
+class PackingKernels:
+    """See `packing_kernels`."""
+
+    look_around: Any
+    count_pairs: Any
+    linearise: Any
+    multiply: Any
+    multiply_back: Any
+    around: Any = Around
+    placed: Any = Placed
+    grid: Any = grid_type
+    equations: Any = Equations
+
+
+@cache
+def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
+    """The kernels for a smoothing kernel."""
+    functions = smoothing_functions(smoothing, FLOAT64)
+    weight, slope = functions.weight, functions.slope
+    module = wp.get_module(f"cortado_packing_{smoothing.name}")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
+    def look_around(
+        first: wp.int32,
+        x: wp.array(dtype=vector),
+        blind: wp.array(dtype=wp.bool),
+        are_own: wp.bool,
+        around: Around,
+        placed: Placed,
+        grid: grid_type,
+        reach: real,
+        most: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        # out
+        counts: wp.array(dtype=wp.int32),
+        sums: wp.array(dtype=real),
+        others: wp.array(dtype=wp.int32),
+    ):
+        """How many of what is ``around`` are within reach of particles at x, no more than ``most``; which they are, as
+        far as there is room from ``starts`` on; and the sum of their weighted kernels. ``blind`` particles do not see
+        air; where they ``are_own``, particle i is the i-th of what is around, and not within its own reach."""
+        i = first + wp.tid()
+        x_i = x[i]
+        c = cell_of(x_i, grid)
+        total = real(0.0)
+        count = int(0)
+        for o_z in range(below(grid.shape[2]), above(grid.shape[2])):
+            for o_y in range(below(grid.shape[1]), above(grid.shape[1])):
+                row = wrap(c[2] + o_z, grid.shape[2]) * grid.shape[1] + wrap(c[1] + o_y, grid.shape[1])
+                for o_x in range(below(grid.shape[0]), above(grid.shape[0])):
+                    cell = row * grid.shape[0] + wrap(c[0] + o_x, grid.shape[0])
+                    for p in range(grid.starts[cell], grid.starts[cell + 1]):
+                        x_ij = separation(x_i, placed.x[p], around)
+                        if wp.length_sq(x_ij) <= reach * reach and count < most:
+                            j = placed.numbers[p]
+                            is_seen = not (blind[i] and j >= around.air and j < around.behind_air)
+                            if is_seen and not (are_own and j <= i):
+                                total += around.weights[j] * weight(x_ij, around.per_support, around.normalisation)
+                                if starts[i] + count < starts[i + 1]:
+                                    others[starts[i] + count] = j
+                                count += 1
+        counts[i] = count
+        sums[i] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def count_pairs(
+        around: Around,
+        free: wp.array(dtype=wp.bool),
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        close: real,
+        # in and out
+        sums: wp.array(dtype=real),
+        # out
+        counts: wp.array(dtype=wp.int32),
+        close_counts: wp.array(dtype=wp.int32),
+    ):
+        """Adds up the weighted kernels of what is ``listed`` between ``starts`` and ``ends``; how many of the pairs
+        with one that is free are within the support, and how many are nearer than ``close`` [m]."""
+        i = wp.tid()
+        particles = free.shape[0]
+        limit = real(1.0) / (around.per_support * around.per_support)
+        x_i = around.x[i]
+        total = real(0.0)
+        count = int(0)
+        close_count = int(0)
+        for k in range(starts[i], ends[i]):
+            j = listed[k]
+            x_ij = separation(x_i, around.x[j], around)
+            square = wp.length_sq(x_ij)
+            if square < limit:
+                w = around.weights[j] * weight(x_ij, around.per_support, around.normalisation)
+                total += w
+                if j < particles:
+                    sums[j] = sums[j] + w
+                    if free[i] or free[j]:
+                        count += 1
+                        if square < close * close:
+                            close_count += 1
+        sums[i] = sums[i] + total
+        counts[i] = count
+        close_counts[i] = close_count
+
+    @wp.kernel(module=module, enable_backward=False)
+    def linearise(
+        around: Around,
+        free: wp.array(dtype=wp.bool),
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        close: real,
+        # out
+        equations: Equations,
+        distances: wp.array(dtype=real),
+    ):
+        """The derivatives, and how far apart pairs are that are too near [m]."""
+        i = wp.tid()
+        particles = free.shape[0]
+        limit = real(1.0) / (around.per_support * around.per_support)
+        x_i = around.x[i]
+        own = vector()
+        place = equations.starts[i]
+        close_place = equations.close_starts[i]
+        for k in range(starts[i], ends[i]):
+            j = listed[k]
+            x_ij = separation(x_i, around.x[j], around)
+            square = wp.length_sq(x_ij)
+            if square < limit:
+                g = (around.weights[j] * slope(x_ij, around.per_support, around.normalisation)) * x_ij
+                if j >= particles:
+                    own += g
+                elif free[i] or free[j]:
+                    equations.others[place] = j
+                    equations.gradients[place] = g
+                    place += 1
+                    if square < close * close:
+                        equations.close_others[close_place] = j
+                        equations.directions[close_place] = wp.normalize(x_ij)  # 0 where both are at one place
+                        distances[close_place] = wp.length(x_ij)
+                        close_place += 1
+        equations.own[i] = own
+
+    @wp.kernel(module=module, enable_backward=False)
+    def multiply(
+        equations: Equations,
+        moves: wp.array(dtype=vector),
+        # in and out
+        changes: wp.array(dtype=real),
+        approaches: wp.array(dtype=real),
+    ):
+        """Adds by how much sums of kernels and distances change with the particles' moves."""
+        i = wp.tid()
+        move = moves[i]
+        change = wp.dot(equations.own[i], move)
+        for k in range(equations.starts[i], equations.starts[i + 1]):
+            j = equations.others[k]
+            both = wp.dot(equations.gradients[k], move - moves[j])
+            change += both
+            changes[j] = changes[j] + both
+        changes[i] = changes[i] + change
+        for k in range(equations.close_starts[i], equations.close_starts[i + 1]):
+            approaches[k] = wp.dot(equations.directions[k], move - moves[equations.close_others[k]])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def multiply_back(
+        equations: Equations,
+        changes: wp.array(dtype=real),
+        approaches: wp.array(dtype=real),
+        # in and out
+        moves: wp.array(dtype=vector),
+    ):
+        """Adds the product with the transpose."""
+        i = wp.tid()
+        change = changes[i]
+        move = change * equations.own[i]
+        for k in range(equations.starts[i], equations.starts[i + 1]):
+            j = equations.others[k]
+            both = (change + changes[j]) * equations.gradients[k]
+            move += both
+            moves[j] = moves[j] - both
+        for k in range(equations.close_starts[i], equations.close_starts[i + 1]):
+            both = approaches[k] * equations.directions[k]
+            move += both
+            moves[equations.close_others[k]] = moves[equations.close_others[k]] - both
+        moves[i] = moves[i] + move
+
+    return PackingKernels(look_around, count_pairs, linearise, multiply, multiply_back)

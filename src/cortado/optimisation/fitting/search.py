@@ -1,0 +1,148 @@
+"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs correct."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+
+NEAR = 1e-6
+"""A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
+GREATEST_LOGARITHM = 1.0
+"""Of one step: a positive number changes by a factor of e at most."""
+FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-4
+"""Relative to the Hessian's diagonal."""
+POOR, GOOD = 0.25, 0.75
+"""Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
+gains more, half as much."""
+
+NEARBY = 9.0
+"""In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
+ENOUGH = 0.01
+"""The same of the end: a tenth of a standard error."""
+ONE_BAR = 1.0
+"""The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
+MOST_JACOBIANS = 4
+"""By tangents."""
+TINY = 1e-300
+"""In the place of 0 below a fraction."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """Where a search ended."""
+
+    at: Linearised
+    """The last point that was run; its Jacobian is an estimate."""
+    next: np.ndarray
+    """(free,) where the next step leads, which was not run."""
+    gain: float
+    """By how much that lowers the sum of squares of the linear model."""
+    converged: bool
+
+
+def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
+    """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found: a search
+    up to where its estimate of the Jacobian serves, tangents, and a search from there with these."""
+    for _ in range(MOST_JACOBIANS):
+        squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
+        found = search(problem, at, weights, trials, NEARBY / squares)
+        try:
+            exact = problem.linearised(found.next)
+        except DivergedError:
+            exact = problem.linearised(found.at.u)
+        found = search(problem, exact, weights, trials, ENOUGH / squares)
+        at, (J, _) = found.at, problem.stacked(exact, weights)
+        is_near = bool(((J @ (found.next - exact.u)) ** 2).sum() <= ONE_BAR)
+        if is_near or not found.converged:
+            break
+    residuals = [r + J @ (found.next - at.u) for r, J in zip(at.residuals, at.jacobians, strict=True)]
+    return Linearised(found.next, residuals, exact.jacobians), found.converged and is_near
+
+
+def search(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    trials: int,
+    enough: float,
+    fixed: Sequence[int] = (),
+) -> Searched:
+    """Lower the sum of the squared residuals, from a point whose Jacobian may be an estimate, until a step is predicted
+    to lower it by a share of at most ``enough``, with the coordinates of some numbers ``fixed``.
+
+    After each trial point, which takes one forward run, the Jacobian is corrected by what the residuals did (Broyden
+    1965). A trial point that is no lower, or where the run diverges, has it estimated anew, and then steps are damped
+    (Levenberg 1944, Marquardt 1963).
+    """
+    fresh, damping, lowest = True, 0.0, problem.sum_of_squares(at.residuals, weights)
+    for _ in range(trials):
+        point, gain = next_point(problem, at, weights, 0.0, fixed)
+        if gain <= enough * lowest or np.abs(point - at.u).max() <= NEAR * (NEAR + np.abs(at.u).max()):
+            return Searched(at, point, gain, True)
+        if damping:
+            point, gain = next_point(problem, at, weights, damping, fixed)
+        try:
+            residuals = problem.residuals(point)
+            squares = problem.sum_of_squares(residuals, weights)
+        except DivergedError:
+            squares = np.inf
+        share = (lowest - squares) / max(gain, TINY)
+        if share > 0.0:
+            at, lowest, fresh = corrected(problem, at, weights, point, residuals), squares, False
+        elif not fresh:
+            at, fresh = problem.estimated(at.u), True
+        if share < POOR:
+            damping = max(10.0 * damping, FIRST_DAMPING)
+        elif share > GOOD:
+            damping = damping / 2.0 if damping > LEAST_DAMPING else 0.0
+    return Searched(at, *next_point(problem, at, weights, 0.0, fixed), False)
+
+
+def next_point(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    damping: float = 0.0,
+    fixed: Sequence[int] = (),
+) -> tuple[np.ndarray, float]:
+    """Where the sum of squares of the linear model is least, within the bounds, and by how much it is lower there."""
+    from scipy.optimize import lsq_linear
+
+    free = np.setdiff1d(np.arange(len(at.u)), fixed)
+    if not len(free):
+        return at.u, 0.0
+    J, r = problem.stacked(at, weights)
+    reduced: Any = np.linalg.qr(np.column_stack([J[:, free], r]), mode="r")
+    R, q = reduced[:, :-1], reduced[:, -1]
+    damped = np.vstack([R, np.diag(np.sqrt(damping) * np.linalg.norm(R, axis=0))])
+    reach = np.where(problem.coordinates.logarithmic[problem.coordinates.free], GREATEST_LOGARITHM, np.inf)
+    lower, upper = problem.coordinates.bounds
+    ends = np.maximum(lower - at.u, -reach)[free], np.minimum(upper - at.u, reach)[free]
+    shift = lsq_linear(damped, np.append(-q, np.zeros(len(free))), ends, method="bvls").x
+    point = at.u.copy()
+    point[free] = np.clip(at.u[free] + shift, lower[free], upper[free])
+    return point, float((q**2).sum() - ((R @ shift + q) ** 2).sum())
+
+
+def corrected(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    u: np.ndarray,
+    residuals: list[np.ndarray],
+) -> Linearised:
+    """At another point, with the Jacobian that is nearest to the old one of those that lead from the old residuals to
+    the new ones: Broyden's update, in the metric of the Hessian, which knows no units of coordinates."""
+    J, _ = problem.stacked(at, weights)
+    shift = u - at.u
+    along = J.T @ (J @ shift)
+    along = along / max(float(shift @ along), TINY)
+    jacobians = [
+        J + (new - old - J @ shift)[..., None] * along
+        for J, old, new in zip(at.jacobians, at.residuals, residuals, strict=True)
+    ]
+    return Linearised(u, residuals, jacobians)

@@ -1,0 +1,116 @@
+"""The search of fits, on a model that takes no simulation: where it ends, in how many runs, and at its bounds."""
+
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from cortado.errors import DivergedError
+from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
+from cortado.optimisation.fitting.search import corrected, least, next_point, search
+
+TIMES = np.linspace(0.0, 2.0, 40)
+SIZE = 0.01
+TRUE = {"size": np.array(2.0), "rate": np.array(1.5), "level": np.array(0.3)}
+
+
+class Decay:
+    """level + size exp(-rate t), in the place of an experiment."""
+
+    start: ClassVar[dict[str, np.ndarray]] = {}
+
+    def __init__(self, measured, greatest_rate=np.inf):
+        self.observations = {"gauge": SimpleNamespace(times=TIMES, measured=measured, noise=SIZE)}
+        self._greatest_rate = greatest_rate
+
+    def predicted(self, values):
+        if values["rate"] > self._greatest_rate:
+            raise DivergedError(3, 0, "a slower rate")
+        return {"gauge": (values["level"] + values["size"] * np.exp(-values["rate"] * TIMES))[:, None]}
+
+    def linearised(self, values, directions):
+        fade = np.exp(-values["rate"] * TIMES)
+        slopes = {"size": fade, "rate": -values["size"] * TIMES * fade, "level": np.ones_like(TIMES)}
+        columns = [sum(slopes[name] * change for name, change in one.items()) for one in directions]
+        return self.predicted(values), {"gauge": np.stack(columns, axis=-1)[:, None, :]}
+
+
+def problem(start, bounds=None, seed=0, wrong=0.0, **settings):
+    noise = SIZE * np.random.default_rng(seed).standard_normal(len(TIMES)) + wrong * np.sin(9.0 * TIMES)
+    experiment = Decay(Decay(noise).predicted(TRUE)["gauge"] + noise[:, None], **settings)
+    return LeastSquares([experiment], Coordinates.of(start, ["size", "rate"], bounds))
+
+
+def the_least(made):
+    """Where SciPy's method of trust regions ends."""
+
+    def residuals(u):
+        return (made.residuals(u)[0] / SIZE).ravel()
+
+    return least_squares(residuals, made.coordinates.start, xtol=1e-14, ftol=1e-14, gtol=None).x
+
+
+WEIGHTS = [Weighting(SIZE)]
+
+
+@pytest.mark.parametrize("off", [1.3, 2.0, 10.0])
+@pytest.mark.parametrize("wrong", [0.0, 0.5])
+def test_it_ends_a_tenth_of_a_bar_from_the_least(off, wrong):
+    made = problem({"size": 2.0 * off, "rate": 1.5 / off, "level": 0.1}, wrong=wrong)
+    at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
+    spent = made.runs, made.tangents
+    J, _ = made.stacked(at, WEIGHTS)
+    bars = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    assert found and (np.abs(at.u - the_least(made)) <= 0.1 * bars).all()
+    assert spent == (9, 4) if (off, wrong) == (1.3, 0.0) else spent <= (50, 12)
+    assert at.residuals[0] == pytest.approx(made.residuals(at.u)[0], abs=0.03 * SIZE)
+
+
+def test_without_residuals_it_stays():
+    made = problem(TRUE)
+    made = LeastSquares([Decay(Decay(None).predicted(TRUE)["gauge"])], made.coordinates)
+    at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
+    assert found and at.u == pytest.approx(made.coordinates.start, abs=1e-12)
+
+
+def test_bounds_are_kept():
+    bounds = {"rate": (0.5, 1.2)}
+    made = problem({"size": 1.0, "rate": 1.0, "level": 0.0}, bounds)
+    at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
+    assert found and made.coordinates.numbers(at.u)[1] == pytest.approx(1.2, rel=1e-12)
+    lower, upper = made.coordinates.bounds
+    point, gain = next_point(made, made.linearised(at.u), WEIGHTS)
+    assert (lower <= point).all() and (point <= upper).all() and gain < 0.01
+
+
+def test_a_step_to_where_the_run_diverges_is_made_shorter():
+    made = problem({"size": 6.0, "rate": 0.2, "level": -3.0}, greatest_rate=1.7)
+    at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
+    assert found and made.coordinates.numbers(at.u) == pytest.approx([2.0, 1.5, 0.3], rel=0.1)
+
+
+def test_a_search_holds_what_is_fixed_and_says_when_it_ran_out_of_trials():
+    made = problem({"size": 4.0, "rate": 0.5, "level": 0.0})
+    begun = made.estimated(made.coordinates.start)
+    ended = search(made, begun, WEIGHTS, 30, 1e-6, fixed=[1])
+    assert ended.converged and ended.next[1] == begun.u[1] and ended.next[0] != begun.u[0]
+    assert not search(made, begun, WEIGHTS, 1, 1e-12).converged
+
+
+def test_a_corrected_jacobian_leads_to_the_new_residuals():
+    made = problem({"size": 4.0, "rate": 0.5, "level": 0.0})
+    at = made.linearised(made.coordinates.start)
+    point = at.u + [0.1, -0.2, 0.05]
+    found = corrected(made, at, WEIGHTS, point, made.residuals(point))
+    led = at.residuals[0] + found.jacobians[0] @ (point - at.u)
+    assert led == pytest.approx(found.residuals[0], abs=1e-12)
+
+
+def test_the_estimate_of_a_jacobian_is_near_tangents():
+    made = problem({"size": 4.0, "rate": 0.5, "level": 0.0})
+    estimated, exact = (one(made.coordinates.start).jacobians[0] for one in (made.estimated, made.linearised))
+    assert np.linalg.norm(estimated - exact) < 0.02 * np.linalg.norm(exact)
+    assert np.array_equal(estimated[..., 2], exact[..., 2])  # not by its logarithm
