@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import cortado
+from cortado.cli.commands.picture import camera_override
 from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
@@ -238,3 +239,11 @@ def test_a_fluid_at_rest_does_not_flicker():
     one, again, other = (artist.image(positions, colours) ** (1.0 / 2.4) for positions in (moved, moved, stirred))
     assert (one == again).all()  # to the bit
     assert (np.abs(one - other).max(axis=2) > 1.0 / 255.0).mean() < 1e-3
+
+
+def test_an_option_says_the_kind_of_a_camera_and_set_the_rest():
+    replaced = scene().replaced(*camera_override("orbit"), "picture.camera_path.turns=0.25")
+    assert replaced.picture.camera_path == Orbit(turns=0.25)
+    assert camera_override(None) == []
+    with pytest.raises(SceneError, match="solid is 'raft', but must be"):
+        scene().replaced(*camera_override("follow:raft"))

@@ -244,10 +244,10 @@ def picture(
         out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
-    from cortado.cli.commands.picture import draw_run, picture_settings
+    from cortado.cli.commands.picture import camera_override, draw_run, picture_settings
 
-    settings = picture_settings(lines, camera, colour)
-    return partial(draw_run, run, frame, film, out, as_text(overrides), device, settings)
+    replaced, settings = camera_override(camera) + as_text(overrides), picture_settings(lines, colour)
+    return partial(draw_run, run, frame, film, out, replaced, device, settings)
 
 
 @command(app)
@@ -256,6 +256,7 @@ def export(
     to: Literal["usd", "glb", "ply", "obj", "vtp"],
     out: Path | None = None,
     every: int = 1,
+    overrides: Overrides = (),
 ) -> Work:
     """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
 
@@ -264,11 +265,12 @@ def export(
         to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
         out: The folder to write, empty or missing; one of that name in the run's folder if left out.
         every: Frames of the run from one that is written to the next.
+        overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
     """
     require_at_least(1, every, "--every")
     from cortado.cli.commands.export import export_run
 
-    return partial(export_run, run, to, out, every)
+    return partial(export_run, run, to, out, every, as_text(overrides))
 
 
 @command(app)

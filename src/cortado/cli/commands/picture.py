@@ -1,5 +1,6 @@
 """``cortado picture``: a shaded picture, or a film, of a run that is there."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,30 @@ from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 
-def picture_settings(lines: int | None, camera: str | None, colour: str | None) -> dict[str, Any]:
+def picture_settings(lines: int | None, colour: str | None) -> dict[str, Any]:
     """Keys of [picture] that are given by options, as those of `Trajectory.film`."""
-    kind, _, solid = (camera or "").partition(":")
-    path = {"kind": kind, **({"solid": solid} if solid else {})} if camera else None
-    given = {"lines": lines, "camera_path": path, "colour": colour}
+    given = {"lines": lines, "colour": colour}
     return {name: value for name, value in given.items() if value is not None}
+
+
+def camera_override(camera: str | None) -> list[str]:
+    """What ``--camera`` replaces in a scene, before ``--set`` does, which may add to it."""
+    kind, _, solid = (camera or "").partition(":")
+    keys = {"kind": kind, **({"solid": solid} if solid else {})}
+    path = ", ".join(f"{name} = {json.dumps(value)}" for name, value in keys.items())
+    return [f"picture.camera_path={{{path}}}"] if camera else []
+
+
+def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
+    """The scene of a run that is there, with other keys of [picture]."""
+    for override in overrides:
+        if not override.startswith("picture."):
+            raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
+    return folder.read_scene(overrides)
 
 
 def draw_run(
@@ -38,10 +54,7 @@ def draw_run(
     """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; returns a sentence
     that says where it is."""
     folder = RunFolder.open(run)
-    for override in overrides:
-        if not override.startswith("picture."):
-            raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
-    scene = shown_as(folder.read_scene(overrides), settings)
+    scene = shown_as(scene_of_run(folder, overrides), settings)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
     trajectory = Trajectory.load(folder.trajectory)
@@ -53,7 +66,8 @@ def draw_run(
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if as_film:
         path = out or folder.figures / "film.mp4"
-        with keeping(lambda: f"what is drawn is in {path}, and the same command goes on with it"):
+        further = "" if path.suffix == ".webp" else ", and the same command goes on with it"
+        with keeping(lambda: f"what is drawn is in {path}{further}"):
             made = film(path, page, range(len(trajectory)), pace_of(trajectory.times, scene.picture or Picture()))
         return f"The film is in {path}: {made.pace}."
     if frame not in range(-len(trajectory), len(trajectory)):
