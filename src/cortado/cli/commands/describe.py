@@ -235,9 +235,12 @@ def _time(found: dict[str, Any]) -> str:
         return f"unknown. {found['diverged']}"
     seconds = found["simulated_time_s"]
     motion = "" if seconds is None else f", {seconds:g} s of motion"
+    slower = "later ones may take more pressure iterations"
+    if found["particles_in_emitter"]:
+        slower = "later ones take longer, as fluid comes out of the emitter"
     return (
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, without what is "
-        f"recorded (mean of the first {found['measured_steps']} steps; later ones may take more pressure iterations); "
+        f"recorded (mean of the first {found['measured_steps']} steps; {slower}); "
         f"{found['steps']} steps{motion}: about {found['expected_seconds']:.2g} s"
     )
 
