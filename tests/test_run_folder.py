@@ -417,3 +417,20 @@ def test_a_run_that_is_there_is_not_warned_of_again(run, cortado_command):
     assert scene.solver.time_step == 0.05 and scene.picture.width == 100
     code, _, err = cortado_command("picture", "a", "--set", "picture.width=96")
     assert code == 0 and "Warning" not in err
+
+
+def test_a_mesh_that_has_changed_since_is_told_of(tmp_path):
+    """Pictures would show another solid than the fluid went around."""
+    mesh = tmp_path / "ball.stl"
+    mesh.write_bytes(b"a ball")
+    made = json.dumps({**json.loads(SCENE), "solid": [{"name": "ball", "shape": "mesh", "file": str(mesh)}]})
+    folder = RunFolder.create(tmp_path / "run", made, COMMAND)
+    folder.require_meshes()
+    mesh.write_bytes(b"a cube")
+    with pytest.raises(InputError, match=r"ball.stl has changed since the run in .* put the former file back"):
+        folder.require_meshes()
+    with pytest.raises(InputError, match="has changed"):
+        RunFolder.resume(folder.path, made, COMMAND)
+    mesh.unlink()
+    with pytest.raises(InputError, match=r"ball.stl is missing, but the run in"):
+        folder.require_meshes()

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.runs.mesh_marks import mesh_marks, require_meshes
 from cortado.runs.run_environment import as_json, plain, require_same, session
 from cortado.runs.run_files import bytes_of, computed, cut_torn_line, finite, in_present_words, read_json
 from cortado.runs.sensors.log import Readings, as_csv, from_csv
@@ -88,7 +89,7 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
-        noted["format"] = _FORMAT
+        noted |= {"format": _FORMAT, "meshes": mesh_marks(scene_json)}
         with sentences(folder.path):
             folder._make_room(kind, overwrite)
             folder.path.mkdir(parents=True, exist_ok=True)
@@ -150,6 +151,11 @@ class RunFolder:
             require_same(computed(read_json(self.scene)), computed(json.loads(scene_json)), self.path)
         if "settings" in noted:
             require_same(noted["settings"], as_json(settings or {}), self.path)
+        self.require_meshes()
+
+    def require_meshes(self) -> None:
+        """Raises `InputError` for a mesh file that has changed since the run began, or is missing."""
+        require_meshes(read_json(self.environment).get("meshes", {}), self.path)
 
     @property
     def scene(self) -> Path:

@@ -52,6 +52,7 @@ def opened(
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
+    folder.require_meshes()
     scene = folder.read_scene()
     simulation = cache(lambda: Simulation(scene, device))
     return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)
