@@ -14,10 +14,13 @@ Tables = dict[str, Any]
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("examples", "docs/figures", "experiments/scenes", "fuzz/scenes")
 SPACINGS = {
+    "baffles": 0.026,
+    "beach": 0.07,
     "dam_break": 0.16,
     "dam_break_large": 0.16,
     "drop": 0.012,
     "drop_large": 0.012,
+    "fountain": 0.014,
     "identify": 0.01,
     "latte_art": 0.006,
     "latte_art_heart": 0.006,
@@ -30,8 +33,13 @@ SPACINGS = {
     "pour": 0.007,
     "recover_gravity": 0.25,
     "recover_gravity_small": 0.25,
+    "ring": 0.014,
+    "rotor": 0.0095,
     "shaken": 0.03,
+    "shear": 0.04,
     "splash_8000": 0.25,
+    "surface_tension": 0.0026,
+    "turned_cup": 0.0065,
     "two_dams": 0.12,
 }
 """Spacing [m] in place of a file's own, for some hundred particles."""
@@ -45,6 +53,9 @@ def _bases() -> Mapping[str, Tables]:
     for folder in FOLDERS:
         for path in sorted((ROOT / folder).glob("*.toml")):
             tables = tomllib.loads(path.read_text(encoding="utf-8"))
+            for table in (*tables.get("solid", ()), *tables.get("fluid", ())):
+                if "file" in table:
+                    table["file"] = str(path.parent / table["file"])
             found[path.stem] = _small(tables, SPACINGS.get(path.stem))
     return found
 
