@@ -21,6 +21,8 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise InputError(f"{path} cannot be read: {reason(problem)}.") from None
     names = [name.strip() for name in lines[0]] if lines else []
+    if len(names) == 1 and ";" in names[0]:
+        raise InputError(f"{path} has semicolons between its columns, but must have commas, and points in numbers.")
     if len(lines) < 2 or not all(names) or len(set(names)) < len(names):
         raise InputError(f"{path} must have a line of different names, such as time,force_x, and lines of numbers.")
     rows = []

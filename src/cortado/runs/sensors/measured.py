@@ -54,9 +54,10 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
     columns = read_columns(path)
     named = {_name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))
-    if times is None:
-        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {TIME}.")
     known = {f"{name}.{column}": (own, column) for name, own in readings.items() for column in own.units}
+    if times is None:
+        wanted = f"{TIME}, and some of {', '.join(known)}"
+        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {wanted}.")
     found = []
     for (name, unit), values in named.items():
         if name == "time":
