@@ -97,30 +97,67 @@ def lost_kernel(precision: Precision) -> Any:
         return y - wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), solids.period)
 
     @wp.func
-    def is_free(
+    def seen_from(
         x: vector,
+        k: int,
         member: int,
         positions: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
         solids: solids_struct,
-    ) -> bool:
-        """Whether x is not deep in any solid; what is far from all surfaces is."""
+    ) -> vector:
+        """Where x is for the mesh of solid k."""
+        if k < solids.still:
+            return nearest_image(x - solids.middles[k], solids)
+        away = nearest_image(x - positions[member, k - solids.still], solids)
+        scale = solids.scales[member, k - solids.still]
+        return wp.transpose(turns[member, k - solids.still]) * away / scale - solids.middles[k]
+
+    @wp.func
+    def scale_of(k: int, member: int, solids: solids_struct) -> real:
+        scale = real(1.0)
+        if k >= solids.still:
+            scale = solids.scales[member, k - solids.still]
+        return scale
+
+    @wp.func
+    def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
+        """Whether a place of the mesh of solid k is deeper in the solid than it may be; what is far from the surface is
+        not."""
+        place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
+        found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
+        depth = real(0.0)
+        if found.result:
+            surface = wp.mesh_eval_position(solids.meshes[k], found.face, found.u, found.v)
+            depth = -real(found.sign) * solids.sides[k] * scale * real(wp.length(place - surface))
+        return depth > solids.tolerances[k]
+
+    @wp.func
+    def is_free(x: vector, member: int, solids: solids_struct) -> bool:
+        """Whether x was not deep in any solid before the step."""
         for k in range(solids.meshes.shape[0]):
-            y, scale = x - solids.middles[k], real(1.0)
-            if k < solids.still:
-                y = nearest_image(y, solids)
-            else:
-                away = nearest_image(x - positions[member, k - solids.still], solids)
-                scale = solids.scales[member, k - solids.still]
-                y = wp.transpose(turns[member, k - solids.still]) * away / scale - solids.middles[k]
+            y = seen_from(x, k, member, solids.before, solids.turns_before, solids)
+            if is_deep(y, k, scale_of(k, member, solids), solids):
+                return False
+        return True
+
+    @wp.func
+    def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
+        """Whether x is deep in a solid, and was not in any before the step. Depths change by no more than the way that
+        was gone, so that what is further from the surface than that and the tolerance need not be looked at: which side
+        it is on takes long to find out."""
+        for k in range(solids.meshes.shape[0]):
+            y = seen_from(x, k, member, solids.after, solids.turns, solids)
+            gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
+            scale = scale_of(k, member, solids)
+            furthest = wp.float32(real(1.001) * (solids.tolerances[k] / scale + gone))
             place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
-            found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
+            found = wp.mesh_query_point_no_sign(solids.meshes[k], place, wp.min(furthest, solids.reach))
             if found.result:
                 surface = wp.mesh_eval_position(solids.meshes[k], found.face, found.u, found.v)
-                depth = -real(found.sign) * solids.sides[k] * scale * real(wp.length(place - surface))
-                if depth > solids.tolerances[k]:
-                    return False
-        return True
+                if scale * real(wp.length(place - surface)) > solids.tolerances[k]:  # noqa: SIM102, as Warp reads both
+                    if is_deep(y, k, scale, solids):
+                        return is_free(before, member, solids)
+        return False
 
     @wp.func
     def below_rim(x: vector, b: bounds_struct) -> bool:
@@ -163,7 +200,6 @@ def lost_kernel(precision: Precision) -> Any:
             let_go = x[order[i]] == x_i
             x_i = x[order[i]]
         before = x_before[i]
-        was_free = is_free(before, member, solids.before, solids.turns_before, solids)
         good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v_free[i]) and rho_0[i] > real(0.0)
         escaped = (
             let_go
@@ -172,7 +208,9 @@ def lost_kernel(precision: Precision) -> Any:
             and below_rim(before, bounds)
             and below_rim(x_i, bounds)
         )
-        entered = let_go and good and was_free and not is_free(x_i, member, solids.after, solids.turns, solids)
+        entered = bool(False)
+        if let_go and good:
+            entered = has_entered(before, x_i, member, solids)
         if escaped or entered or not good:
             wp.atomic_min(bad, member, p)
             wp.atomic_add(count, member, 1)
