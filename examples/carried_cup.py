@@ -48,7 +48,7 @@ problem = cortado.Problem(simulation, STEPS, loss)
 search = Transformed(problem, {"cup.displacement": path})
 optimiser, gradient = cortado.optimisers.LineSearch(), cortado.gradients.AdjointViscosity()
 start, bounds = {"cup.displacement": np.zeros(BLOCKS)}, {"cup.displacement": (-1.0, 1.0)}
-found = cortado.optimise(search, start, optimiser, 8, bounds, gradient=gradient)
+found = cortado.optimise(search, start, optimiser, 12, bounds, gradient=gradient)
 
 for name, u in (("full throttle", start), ("found", found.parameters)):
     water = problem.end(search.parameters(u)).positions
