@@ -97,6 +97,13 @@ def lost_kernel(precision: Precision) -> Any:
         return y - wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), solids.period)
 
     @wp.func
+    def scale_of(k: int, member: int, solids: solids_struct) -> real:
+        scale = real(1.0)
+        if k >= solids.still:
+            scale = solids.scales[member, k - solids.still]
+        return scale
+
+    @wp.func
     def seen_from(
         x: vector,
         k: int,
@@ -109,15 +116,7 @@ def lost_kernel(precision: Precision) -> Any:
         if k < solids.still:
             return nearest_image(x - solids.middles[k], solids)
         away = nearest_image(x - positions[member, k - solids.still], solids)
-        scale = solids.scales[member, k - solids.still]
-        return wp.transpose(turns[member, k - solids.still]) * away / scale - solids.middles[k]
-
-    @wp.func
-    def scale_of(k: int, member: int, solids: solids_struct) -> real:
-        scale = real(1.0)
-        if k >= solids.still:
-            scale = solids.scales[member, k - solids.still]
-        return scale
+        return wp.transpose(turns[member, k - solids.still]) * away / scale_of(k, member, solids) - solids.middles[k]
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
