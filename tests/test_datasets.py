@@ -13,6 +13,7 @@ import pytest
 import cortado
 from cortado import DivergedError, InputError, SceneError, Simulation
 from cortado.cli.commands import dataset as command
+from cortado.discretise.pairs import wrapped
 from cortado.optimisation.datasets import one_run as runs_of
 from cortado.optimisation.datasets.one_run import one_run
 from cortado.optimisation.datasets.sample import Sample
@@ -146,10 +147,10 @@ def test_kinds_walls_and_statistics():
 def test_what_crosses_a_period_moves_the_shorter_way():
     positions = np.array([[[0.9, 0.0]], [[1.1, 0.1]], [[-0.5, 0.3]]])
     origin, periods = np.array([-0.5, 0.0]), np.array([2.0, 0.0])
-    wrapped = runs_of._wrapped(positions, origin, periods)
-    np.testing.assert_allclose(wrapped[:, 0, 0], [1.4, 1.6, 0.0], atol=1e-15)
-    np.testing.assert_array_equal(wrapped[:, 0, 1], positions[:, 0, 1])
-    for one in (positions, wrapped):
+    places = wrapped(positions - origin, periods)
+    np.testing.assert_allclose(places[:, 0, 0], [1.4, 1.6, 0.0], atol=1e-15)
+    np.testing.assert_array_equal(places[:, 0, 1], positions[:, 0, 1])
+    for one in (positions, places):
         found = runs_of._statistics(one, periods)
         np.testing.assert_allclose(found["vel"][1], [0.6, 0.3], atol=1e-12)
         np.testing.assert_allclose(found["acc"][1], [0.2, 0.1], atol=1e-12)

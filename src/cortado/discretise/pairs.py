@@ -71,7 +71,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> NDAr
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
-    """(n, d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
+    """(..., d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
     if not lengths.any():
         return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.discretise.pairs import wrapped
 from cortado.losses import FinalPositions
 from cortado.optimisation.datasets.sample import Sample
 from cortado.particles.state import State
@@ -42,7 +43,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
     kinds = np.where(phases == 0, FLUID, MORE_FLUID - 1 + phases)
     real = simulation.precision.numpy
     arrays = {
-        "position": _wrapped(every, origin, periods).astype(real),
+        "position": wrapped(every - origin, periods).astype(real),
         "particle_type": np.concatenate([kinds, np.full(len(walls), WALL)]).astype(np.int64),
         "velocity": np.asarray(trajectory.velocities, dtype=real),
         **{f"vary/{key}": np.array(value) for key, value in sample.values.items()},
@@ -58,12 +59,6 @@ def periods_of(scene: Any) -> tuple[np.ndarray, np.ndarray]:
     ends, (_, lengths) = scene.container.extent(), scene.container.periods(scene.dimension)
     lower = np.zeros(scene.dimension) if ends is None else np.asarray(ends[0], dtype=np.float64)
     return np.where(lengths > 0.0, lower, 0.0), np.asarray(lengths, dtype=np.float64)
-
-
-def _wrapped(positions: np.ndarray, origin: np.ndarray, periods: np.ndarray) -> np.ndarray:
-    """Positions from 0 to the period along periodic axes, as they are along others."""
-    shifted = positions - origin
-    return np.where(periods > 0.0, shifted % np.where(periods > 0.0, periods, 1.0), shifted)
 
 
 def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
