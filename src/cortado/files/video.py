@@ -21,6 +21,9 @@ QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
 BITS = 1.2e6
 """A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
+THREADS = 4
+"""Of the encoder, each with a part of every frame; more of them than that make a file larger, and gain little. As many
+on every machine, so that it writes the same file."""
 TICKS = 90_000
 """Of a second, in which times of frames are counted."""
 
@@ -29,7 +32,7 @@ class Video:
     """A video that grows by a frame at a time; see `writing`."""
 
     def __init__(self, container: Any, frames_per_second: float):
-        self._container, self._rate = container, frames_per_second
+        self._container, self._rate, self._colours = container, frames_per_second, _Colours()
         self._stream: Any = None
         self._shape: tuple[int, ...] | None = None
         self.frames = 0
@@ -43,9 +46,8 @@ class Video:
         if pixels.shape != self._shape:
             found = f"Frame {self.frames} of the video has shape {pixels.shape}"
             raise InputError(f"{found}, but those before it {self._shape}.")
-        rows, columns = self._shape[:2]
-        even = np.pad(pixels, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")  # yuv420p: a colour for 2 x 2
-        frame, stream = _frame(even), self._stream_of(even.shape[1], even.shape[0])
+        even = _even(pixels)
+        frame, stream = self._colours.frame(even), self._stream_of(even.shape[1], even.shape[0])
         frame.pts, frame.duration, frame.time_base = round(time * TICKS), round(TICKS / self._rate), stream.time_base
         with held():
             self._container.mux(stream.encode(frame))
@@ -76,8 +78,10 @@ class Video:
             rate = Fraction(self._rate).limit_denominator(1001)
             self._stream = self._container.add_stream("libx264", rate=rate, options=options)
             self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
-            self._stream.time_base = self._stream.codec_context.time_base = Fraction(1, TICKS)
-            _describe_colours(self._stream.codec_context)
+            context = self._stream.codec_context
+            self._stream.time_base = context.time_base = Fraction(1, TICKS)
+            context.thread_count = THREADS
+            _describe_colours(context)
         return self._stream
 
 
@@ -164,12 +168,26 @@ def pyav() -> Any:
     return av
 
 
-def _frame(image: NDArray[np.uint8]) -> Any:
-    """The image as luma and chroma of ITU-R BT.709, which `_describe_colours` tells the player."""
-    import av
+def _even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """With even sides, as yuv420p has a colour for 2 x 2 pixels."""
+    rows, columns = (side % 2 for side in pixels.shape[:2])
+    return np.pad(pixels, ((0, rows), (0, columns), (0, 0)), mode="edge") if rows or columns else pixels
 
-    frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-    return frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+
+class _Colours:
+    """From pixels to luma and chroma of ITU-R BT.709, which `_describe_colours` tells the player."""
+
+    def __init__(self) -> None:
+        from av.video.reformatter import VideoReformatter
+
+        self._reformatter = VideoReformatter()
+
+    def frame(self, image: NDArray[np.uint8]) -> Any:
+        """Of an image with even sides; in this thread alone, as to start others for each frame takes longer."""
+        from av import VideoFrame
+
+        colours: dict[str, Any] = {"format": "yuv420p", "dst_colorspace": "ITU709", "dst_color_range": "MPEG"}
+        return self._reformatter.reformat(VideoFrame.from_ndarray(image, format="rgb24"), **colours, threads=1)
 
 
 def _describe_colours(context: Any) -> None:

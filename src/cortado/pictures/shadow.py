@@ -38,24 +38,25 @@ def cast(
     cell: wp.float32,
     slope: wp.vec2,
     fading: wp.float32,
+    begin: wp.vec2i,
     thickness: wp.array2d(dtype=wp.vec4),
 ):
     """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
-    and its thickness; the less the higher it is, by ``fading`` [1/m]."""
+    and its thickness; the less the higher it is, by ``fading`` [1/m]. ``begin``: the first node that is there."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
     z = (places[i][2] - height * slope[1] - corner[2]) / cell
-    u = int(wp.floor(x))
-    v = int(wp.floor(z))
+    u = int(wp.floor(x)) - begin[0]
+    v = int(wp.floor(z)) - begin[1]
     if u >= 0 and v >= 0 and u + 1 < thickness.shape[0] and v + 1 < thickness.shape[1]:
         c = looks[i]
         above = volumes[i] * wp.exp(-fading * height) / (cell * cell) * wp.vec4(c[0], c[1], c[2], 1.0)
         for n in range(4):
             m = n & 1
             k = n >> 1
-            a = 1.0 - wp.abs(x - float(u + m))
-            b = 1.0 - wp.abs(z - float(v + k))
+            a = 1.0 - wp.abs(x - float(begin[0] + u + m))
+            b = 1.0 - wp.abs(z - float(begin[1] + v + k))
             wp.atomic_add(thickness, u + m, v + k, a * b * above)
 
 
@@ -98,14 +99,18 @@ def darken(
     layer: wp.float32,
     opacity: wp.float32,
     tinted: wp.float32,
+    begin: wp.vec2i,
     light: wp.array2d(dtype=wp.vec3),
 ):
-    """What the lamp's light and the sky's leave, of so much ``strength`` each."""
+    """What the lamp's light and the sky's leave, of so much ``strength`` each, of the nodes from ``begin`` on."""
     n = first + wp.tid()
-    i = n / light.shape[1]
-    j = n % light.shape[1]
+    i = n / key.shape[1]
+    j = n % key.shape[1]
     left = wp.vec3(1.0) - strength[0] * kept_off(key[i, j], layer, opacity, tinted)
-    light[i, j] = wp.min(light[i, j], left - strength[1] * kept_off(around[i, j], layer, opacity, tinted))
+    left -= strength[1] * kept_off(around[i, j], layer, opacity, tinted)
+    u = begin[0] + i
+    v = begin[1] + j
+    light[u, v] = wp.min(light[u, v], left)
 
 
 @dataclass(frozen=True)
@@ -158,27 +163,49 @@ class FloorShadow:
         self._add(Caster(parts, to_lamp, to_sky, opacity=1.0 - shown.transparency), 0.0, stage.spacing)
 
     def _add(self, caster: Caster, least: float, layer: float) -> None:
+        if not len(caster.parts):
+            return
         stage = self._stage
-        slope = wp.vec2(*(stage.sun[::2] / stage.sun[1]))
-        key = self._thickness(caster, caster.to_lamp, slope, 0.0, max(KEY * stage.size, least))
+        slope = stage.sun[::2] / stage.sun[1]
+        soft = [max(part * stage.size, least) / self.cell for part in (KEY, AROUND)]
+        bells = [_bell(sigma) for sigma in soft]
+        begin, shape = self._reached(caster.parts, slope, max(map(len, bells)))
+        seen = {"begin": wp.vec2i(*begin), "corner": wp.vec3(*self.corner), "cell": self.cell}
         fading = 1.0 / (CLOSE * stage.size)
-        around = self._thickness(caster, caster.to_sky, wp.vec2(0.0, 0.0), fading, max(AROUND * stage.size, least))
+        key = self._thickness(caster, caster.to_lamp, bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
+        own = {"slope": wp.vec2(0.0, 0.0), "fading": fading}
+        around = self._thickness(caster, caster.to_sky, bells[1], shape, **own, **seen)
         strength = wp.vec2(stage.picture.sun_and_sky.shadow, SKY)
         how = {"strength": strength, "layer": layer, "opacity": caster.opacity, "tinted": caster.tinted}
-        self._launch(darken, NODES * NODES, key=key, around=around, **how, light=self.light)
+        self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
-    def _thickness(self, caster: Caster, volumes: wp.array, slope: Any, fading: float, soft: float) -> wp.array:
-        """(nodes, nodes) of vec4, as `cast` adds it up, blurred by ``soft`` [m]."""
-        sharp = wp.zeros((NODES, NODES), dtype=wp.vec4, device=self._device)
-        where = {"corner": wp.vec3(*self.corner), "cell": self.cell, "slope": slope, "fading": fading}
+    def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
+        """The first of the nodes that the shadow of parts may reach, with so many ``around`` it, and how many there are
+        along each side: those elsewhere stay light, and take no time."""
+        lower, upper = (end - self.corner for end in parts.ends(self._launch))
+        shifts = np.outer((0.0, lower[1], upper[1]), slope)
+        first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
+        last = np.ceil((upper[::2] - shifts.min(axis=0)) / self.cell) + around
+        first, last = (np.clip(end, 0, NODES - 2).astype(int) for end in (first, last))
+        rows, columns = (last - first + 2).tolist()
+        return first.tolist(), (rows, columns)
+
+    def _thickness(self, caster: Caster, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any) -> Any:
+        """Of vec4, as `cast` adds it up at nodes of this shape, blurred by a bell."""
+        sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": caster.parts.places, "looks": caster.parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
-        sigma = soft / self.cell
-        bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
-        weights, other = self._array(bell / (2.0 * bell.sum() - 1.0)), wp.empty_like(sharp)
-        self._launch(blur, NODES * NODES, across=0, weights=weights, sharp=sharp, found=other)
-        self._launch(blur, NODES * NODES, across=1, weights=weights, sharp=other, found=sharp)
+        weights, other = self._array(bell), wp.empty_like(sharp)
+        self._launch(blur, sharp.size, across=0, weights=weights, sharp=sharp, found=other)
+        self._launch(blur, sharp.size, across=1, weights=weights, sharp=other, found=sharp)
         return sharp
 
     def _array(self, values: Points) -> wp.array:
         return wp.array(values.astype(np.float32), dtype=wp.float32, device=self._device)
+
+
+def _bell(sigma: float) -> Points:
+    """The weights of a place and of those so many nodes beside it, by a Gaussian that is ``sigma`` nodes wide."""
+    bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
+    found: Points = bell / (2.0 * bell.sum() - 1.0)
+    return found
