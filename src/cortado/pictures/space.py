@@ -7,15 +7,20 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
+from cortado.device.cells import cell_kernels
+from cortado.device.compiling import compile_ahead
+from cortado.device.precision import FLOAT32
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lighting import illuminate_kernel
-from cortado.pictures.marked import marked
+from cortado.pictures.marked import list_marked, marked
 from cortado.pictures.scenery import Scenery, State, scenery
+from cortado.pictures.shadow import cast
 from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.trace import Eye, find_contrast, trace_kernel
+from cortado.pictures.wetting import turn
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -41,6 +46,16 @@ class SpacePainter:
         self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
         kinds = self._solids.kinds if self._solids is not None else (False, False)
         self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
+        self._kernels = (
+            self._trace,
+            self._illuminates,
+            find_contrast,
+            list_marked,
+            turn,
+            cast,
+            cell_kernels(FLOAT32).count,
+        )
+        """One of each module that a picture needs: they are compiled side by side before the first."""
         self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
         self._lamps_of_solids = self._rays_to_light(*SOLID_RAYS)
         self._pixels = wp.array(_in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device)
@@ -49,6 +64,7 @@ class SpacePainter:
     def image(self, *state: Any) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
         with WARP:
+            compile_ahead(self, self.device)
             return self._rays(scenery(self.stage, State(*state), self._launch))
 
     def images(self, states: Iterable[State]) -> Iterator[Points]:
