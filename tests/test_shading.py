@@ -384,11 +384,13 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
 
 def test_words_and_panels():
     image = np.full((40, 60, 3), 0.8)
-    word = labelled(image, "found")
+    word = labelled(image.copy(), "found")
     changed = np.nonzero((word != image).any(axis=2))
     assert changed[0].size and changed[0].max() < 30 and changed[1].min() > 5
     page = side_by_side([image * k / 3 for k in (1, 2, 3)], 2)
     assert page.shape == (80, 120, 3)
+    named = side_by_side([image] * 3, 2, ["found", "b", "c"])
+    np.testing.assert_array_equal(named[:39, :59], word[:39, :59])
     np.testing.assert_allclose(page[[20, 20, 60, 60], [30, 90, 30, 90], 0], [0.8 / 3, 1.6 / 3, 0.8, 1.0])
 
 

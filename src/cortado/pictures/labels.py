@@ -1,7 +1,7 @@
 """Words on pictures, and pictures side by side."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +18,31 @@ INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 
 
 def labelled(image: Points, text: str) -> Points:
-    """A picture (rows, columns, 3), linear, with a word at its top, on the left."""
+    """A picture (rows, columns, 3), linear, on which a word is then written, at its top, on the left."""
     size = max(round(0.042 * image.shape[0]), 11)
     return written(image, [((round(0.9 * size), round(0.7 * size)), text, "la")], size)
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """A picture (rows, columns, 3), linear, with texts on it, whose letters are so many pixels high."""
+    """A picture (rows, columns, 3), linear, on which texts are then written, in letters that are so many pixels high;
+    it is not copied, which takes longer than to write."""
+    where, cover = _covered(image.shape[:2], tuple(texts), size)
+    image[where] = image[where] * (1.0 - cover) + INK * cover
+    return image
+
+
+@lru_cache(maxsize=32)
+def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
+    """The part of a picture of a shape that texts are on, and how much of each of its pixels they cover: the same in
+    all frames of a film."""
     from PIL import Image, ImageDraw
 
-    mask = Image.new("L", image.shape[1::-1])
+    mask = Image.new("L", shape[::-1])
     for place, text, anchor in texts:
         ImageDraw.Draw(mask).text(place, text, fill=255, font=_font(size), anchor=anchor)
     left, upper, right, lower = mask.getbbox() or (0, 0, 0, 0)
-    found, where = image.copy(), (slice(upper, lower), slice(left, right))
-    cover = (np.asarray(mask)[where] / 255.0)[..., None]
-    found[where] = image[where] * (1.0 - cover) + INK * cover
-    return found
+    where = slice(upper, lower), slice(left, right)
+    return where, (np.asarray(mask)[where] / 255.0)[..., None]
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
@@ -51,14 +59,18 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
     return image * (1.0 - cover) + colour * cover
 
 
-def side_by_side(images: Sequence[Points], across: int) -> Points:
-    """Pictures of one size in rows of so many, a thin light line between them; the end of the last row may be empty."""
+def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
+    """Pictures of one size in rows of so many, a thin light line between them, each with its name on it if it has one;
+    the end of the last row may be empty."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
     for k, image in enumerate(images):
         row, column = divmod(k, across)
-        page[row * rows : (row + 1) * rows, column * columns : (column + 1) * columns] = image
+        panel = page[row * rows : (row + 1) * rows, column * columns : (column + 1) * columns]
+        panel[:] = image
+        if names:
+            labelled(panel, names[k])
     page[[row * rows for row in range(1, down)]] = 1.0
     page[:, [column * columns for column in range(1, across)]] = 1.0
     return page

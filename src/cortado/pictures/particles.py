@@ -36,10 +36,12 @@ class Particles:
     ) -> "Particles":
         """Those of arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and absorption
         [1/m]. Raises `ComputationError` for places that are not finite."""
-        astray = len(places) - int(np.isfinite(places).all(axis=1).sum())
-        if astray:
+        finite = np.isfinite(places)
+        if not finite.all():
+            astray = len(places) - int(finite.all(axis=1).sum())
             raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
-        looks = np.hstack([colours, np.broadcast_to(media, (len(places), 2))]).astype(np.float32)
+        looks = np.empty((len(places), 5), dtype=np.float32)
+        looks[:, :3], looks[:, 3:] = colours, media
         return cls(
             wp.array(np.asarray(places, dtype=np.float32), dtype=wp.vec3, device=device),
             wp.array(looks, dtype=Look, device=device),

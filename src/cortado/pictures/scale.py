@@ -1,6 +1,7 @@
 """Colours that stand for numbers, with the scale that says which."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,14 @@ class Scale:
 
 def _colours(shares: NDArray) -> Points:
     """(n, 3) linear, of numbers from 0 to 1."""
+    found: Points = _palette()[np.minimum((len(_palette()) * shares).astype(int), len(_palette()) - 1)]
+    return found
+
+
+@cache
+def _palette() -> Points:
+    """(256, 3) the colours, linear."""
     from matplotlib import colormaps
 
-    return from_srgb((255.0 * colormaps[PALETTE](shares)[..., :3]).round().astype(np.uint8))
+    palette = colormaps[PALETTE]
+    return from_srgb((255.0 * palette(np.arange(palette.N))[:, :3]).round().astype(np.uint8))

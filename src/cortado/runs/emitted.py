@@ -19,6 +19,11 @@ def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.
     return found
 
 
+def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
+    """What takes from arrays (n, ...) the particles that are out (n,): all of them without a copy, where all are."""
+    return slice(None) if out.all() else out
+
+
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
     """(frames, n) [s] how long particles are out of the emitter, between frames as if its speed were even; of others
     the time since the run began, and 0 of what still waits."""

@@ -21,7 +21,7 @@ from cortado.pictures.scene_view import scene_view
 from cortado.pictures.scenery import State
 from cortado.pictures.space import SpacePainter
 from cortado.pictures.stage import upright
-from cortado.runs.emitted import is_out
+from cortado.runs.emitted import is_out, those
 from cortado.runs.report import Figures
 from cortado.runs.solid_motion import SolidMotion, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
@@ -66,7 +66,7 @@ def run_page(
     draws = painter(sized(scene, motions), _places(trajectory, out), device, poses)
 
     def state(k: int) -> State:
-        frame, shown = trajectory[k], out[k]
+        frame, shown = trajectory[k], those(out[k])
         colours = colours_of(scene, frame.mass_fractions, trajectory.particles)
         if scale is not None and values is not None:
             colours = scale.colours(values[k])

@@ -15,12 +15,12 @@ from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.labels import labelled, side_by_side
+from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
-from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.painter import colours_of, painter, spread
 from cortado.pictures.scenery import State
-from cortado.runs.emitted import is_out
+from cortado.runs.emitted import is_out, those
 from cortado.runs.report import Figures
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -82,11 +82,11 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
     picture, half = scene.picture or Picture(), len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
     panel = picture.model_copy(update=size)
-    places = np.stack([run[step].positions for run in runs for step in run])
+    places = spread([run[step].positions for run in runs for step in run])
     artist = painter(scene.model_copy(update={"picture": panel}), places, device)
 
     def composed(images: list[Points]) -> Points:
-        return side_by_side([labelled(*one) for one in zip(images, names, strict=True)], across)
+        return side_by_side(images, across, names)
 
     return Page(artist, [partial(_state, made, run) for run in runs], composed)
 
@@ -95,6 +95,6 @@ def _state(made: Setup, run: Run, step: int) -> State:
     state = run[step]
     colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
     emitted = state.state["emitted"].numpy() if "emitted" in state.state.names else None
-    out = is_out(made.task.scene, emitted, len(colours))
+    out = those(is_out(made.task.scene, emitted, len(colours)))
     fractions = None if state.mass_fractions is None else state.mass_fractions[out]
     return State(state.positions[out], colours[out], fractions=fractions)
