@@ -1,5 +1,6 @@
 """Linear light and what files and screens hold: eight bits of sRGB (IEC 61966-2-1)."""
 
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
@@ -29,8 +30,9 @@ def check_light(what: str, image: ArrayLike) -> None:
         raise InputError(f"{what} has a value of {furthest:g}, but must be {LIGHT}.")
 
 
-def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
-    """(rows, columns, 3) in 0..255, of a linear image of that shape; light below 0 and above 1 is clipped.
+def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
+    """(rows, columns, 3) in 0..255, of a linear image of that shape; light below 0 and above 1 is clipped. ``each``:
+    what does something for each of many parts, such as ``map`` of an executor, whose threads share them.
 
     Raises:
         InputError: another shape, or values that are not finite.
@@ -39,8 +41,12 @@ def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
     if light.ndim != 3 or light.shape[2] != 3 or not light.size:
         raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
     found = np.empty(light.shape, dtype=np.uint8)
-    for row in range(0, len(light), ROWS):
+
+    def convert(row: int) -> None:
         found[row : row + ROWS] = _values(light[row : row + ROWS])
+
+    for _ in each(convert, range(0, len(light), ROWS)):
+        pass
     return found
 
 

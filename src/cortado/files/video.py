@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -21,9 +22,11 @@ QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
 BITS = 1.2e6
 """A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
-THREADS = 4
-"""Of the encoder, each with a part of every frame; more of them than that make a file larger, and gain little. As many
-on every machine, so that it writes the same file."""
+THREADS = 8
+"""Of the encoder, which work at frames one after the other while others are drawn: as many on every machine, so that it
+writes the same file."""
+HELPERS = 4
+"""Threads that convert the parts of a frame."""
 TICKS = 90_000
 """Of a second, in which times of frames are counted."""
 
@@ -33,6 +36,7 @@ class Video:
 
     def __init__(self, container: Any, frames_per_second: float):
         self._container, self._rate, self._colours = container, frames_per_second, _Colours()
+        self._helpers = ThreadPoolExecutor(HELPERS, thread_name_prefix="cortado-video")
         self._stream: Any = None
         self._shape: tuple[int, ...] | None = None
         self.frames = 0
@@ -41,7 +45,7 @@ class Video:
     def add(self, image: ArrayLike, time: float) -> None:
         """One more frame, shown from a time [s] on: a linear image (rows, columns, 3), of which the last row or column
         is repeated where a side is odd."""
-        pixels = to_srgb(image)
+        pixels = to_srgb(image, self._helpers.map)
         self._shape = self._shape or pixels.shape
         if pixels.shape != self._shape:
             found = f"Frame {self.frames} of the video has shape {pixels.shape}"
@@ -67,6 +71,7 @@ class Video:
 
     def finish(self) -> None:
         """Write what the encoder still holds."""
+        self._helpers.shutdown()
         if self._stream is not None:
             self._container.mux(self._stream.encode())
 
@@ -80,7 +85,7 @@ class Video:
             self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
             context = self._stream.codec_context
             self._stream.time_base = context.time_base = Fraction(1, TICKS)
-            context.thread_count = THREADS
+            context.thread_count, context.thread_type = THREADS, "FRAME"
             _describe_colours(context)
         return self._stream
 
@@ -183,11 +188,11 @@ class _Colours:
         self._reformatter = VideoReformatter()
 
     def frame(self, image: NDArray[np.uint8]) -> Any:
-        """Of an image with even sides; in this thread alone, as to start others for each frame takes longer."""
+        """Of an image with even sides."""
         from av import VideoFrame
 
         colours: dict[str, Any] = {"format": "yuv420p", "dst_colorspace": "ITU709", "dst_color_range": "MPEG"}
-        return self._reformatter.reformat(VideoFrame.from_ndarray(image, format="rgb24"), **colours, threads=1)
+        return self._reformatter.reformat(VideoFrame.from_ndarray(image, format="rgb24"), **colours, threads=HELPERS)
 
 
 def _describe_colours(context: Any) -> None:
