@@ -3,6 +3,7 @@
 import os
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -94,6 +95,8 @@ def test_the_curve_of_srgb():
     curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     np.testing.assert_array_equal(to_srgb(light), np.rint(255.0 * curved))
     assert to_srgb([[[-1.0, 0.0, 2.0]]]).tolist() == [[[0, 0, 255]]]
+    with ThreadPoolExecutor(2) as helpers:
+        np.testing.assert_array_equal(to_srgb(light, helpers.map), to_srgb(light))
 
 
 def test_a_picture_comes_back_as_it_was_written(tmp_path):

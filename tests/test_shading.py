@@ -18,6 +18,7 @@ from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.srgb import to_srgb
 from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
+from cortado.pictures import painter as artists
 from cortado.pictures.environment import environment_of
 from cortado.pictures.film import film, lacking
 from cortado.pictures.labels import labelled, side_by_side
@@ -25,7 +26,7 @@ from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scenery import State, scenery
-from cortado.pictures.shadow import FloorShadow
+from cortado.pictures.shadow import NODES, FloorShadow
 from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.surface import spheres
 from cortado.pictures.trace import find_contrast
@@ -227,6 +228,21 @@ def test_fluid_casts_a_shadow_on_the_floor():
     assert light[i, j].max() < 0.95 and light[0, 0].min() > 0.999
 
 
+@pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (0.7, 0.2, -0.3), (2.0, 0.0, 0.0), (-9.0, 5.0, 9.0)])
+def test_a_shadow_is_looked_for_wherever_it_falls(where, monkeypatch):
+    """Also at the ends of the floor and beyond, in the same bits as on all of it."""
+    stage, (x, c) = Stage.of(scene_of(), FILLED), first_state(scene_of())
+
+    def light():
+        shadow = FloorShadow(stage, CPU)
+        shadow.of_fluid(particles_of(stage, x + np.array(where) * stage.size, c, CPU))
+        return shadow.light.numpy()
+
+    found = light()
+    monkeypatch.setattr(FloorShadow, "_reached", lambda *_: ([0, 0], (NODES, NODES)))
+    np.testing.assert_array_equal(found, light())
+
+
 def test_spheres_have_their_size_and_look_outwards():
     surface = spheres(np.array([[1.0, 2.0, 3.0]]), np.array([RED]), 0.5)
     off = surface.points - (1.0, 2.0, 3.0)
@@ -380,6 +396,14 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
     with pytest.raises(AssertionError, match="Shaded pictures need PyAV, which is not installed: " + advice):
         raise AssertionError(lacking(scene_of()))
     assert lacking(scene_of(picture={"film_frames": 0})) is None
+
+
+@pytest.mark.parametrize("enough", [1, 40, 90, 1000])
+def test_a_painter_looks_at_every_so_many_positions_of_all_states(enough, monkeypatch):
+    monkeypatch.setattr(artists, "ENOUGH", enough)
+    states = np.random.default_rng(0).random((9, 13, 3))
+    every = states.reshape(-1, 3)
+    np.testing.assert_array_equal(artists.spread(list(states)), every[:: max(len(every) // enough, 1)])
 
 
 def test_words_and_panels():

@@ -51,6 +51,7 @@ def test_odd_sides_are_made_even(tmp_path):
     [
         ("a.mp4", [], 25, "no frames"),
         ("a.mp4", [heart(16), heart(18)], 25, "Frame 1 of the video has shape"),
+        ("a.mp4", [heart(16), np.full((70, 16, 3), np.nan)], 25, "not finite"),
         ("a.mp4", [heart(16)], 0, "positive"),
         ("a.avi", [heart(16)], 25, "must end in .mp4"),
         ("absent/a.mp4", [heart(16)], 25, "cannot be written"),
