@@ -315,7 +315,8 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
     assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
 
 
-def test_a_picture_is_drawn_while_the_one_before_is_used():
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_picture_is_drawn_while_the_one_before_is_used(count):
     """Also where the caller holds what the painter needs; what it raises comes when its picture is due."""
     begun, free = [], threading.Event()
 
@@ -328,14 +329,14 @@ def test_a_picture_is_drawn_while_the_one_before_is_used():
             yield np.full((2, 2, 3), k)
         raise InputError("nothing more")
 
-    drawn_ahead = shading_film._ahead(images())
+    drawn_ahead = shading_film._ahead(count, images())
     assert next(drawn_ahead)[0, 0, 0] == 0 and free.wait(10.0)
     with WARP:
         assert [next(drawn_ahead)[0, 0, 0] for _ in range(2)] == [1, 2]
         with pytest.raises(InputError, match="nothing more"):
             next(drawn_ahead)
     with WARP:
-        left = shading_film._ahead(images())
+        left = shading_film._ahead(count, images())
         next(left)
         left.close()  # does not wait for ever
 

@@ -9,13 +9,13 @@ from typing import Any
 import warp as wp
 
 from cortado.device.cores import usable_cores
-from cortado.device.launching import launch
+from cortado.device.launching import launch, recorded
 from cortado.device.threads import MOST_CORES, helpers
 
 BANDS = 8
 """Bands for each core: one may take longer than another."""
-LEAST_SHARED = 10_000
-"""Threads of a launch that is cut."""
+LEAST_SHARED, LEAST_SHARED_OFTEN = 10_000, 50_000
+"""Threads of a launch that is cut, and of one of many that take little time each."""
 
 
 class BandLauncher:
@@ -39,6 +39,20 @@ class BandLauncher:
             self._compiled.add(kernel)
             begin = 1
         _shared(partial(map, work), range(begin, bands), cores)
+
+    def to_and_fro(
+        self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
+    ) -> wp.array:
+        """Launch a kernel with a thread for each of the ``values`` so many times: it computes ``found`` of ``values``,
+        and of that the next; ``values`` and ``other`` are written to in turn. Returns that which was found last."""
+        count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
+        if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
+            ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]
+        else:
+            ways = [recorded(kernel, count, self.device, first=0, **arguments, **one) for one in both]
+        for k in range(rounds):
+            ways[k % 2]()
+        return other if rounds % 2 else values
 
 
 def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:

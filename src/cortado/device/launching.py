@@ -65,6 +65,13 @@ def launch(
     _perform(kernel.key, threads, inputs, work)
 
 
+def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> Callable[[], None]:
+    """What launches a kernel as `launch` does, again and again with the same arguments, which are packed once."""
+    inputs = bound(kernel, (), arguments, Bundles())
+    command = wp.launch(kernel, threads, inputs=inputs, device=device, record_tape=False, record_cmd=True)
+    return partial(_perform, kernel.key, threads, inputs, command.launch)
+
+
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
     """Do work that launches several kernels, none of which may be repeated without the others: watchers see one
     launch."""

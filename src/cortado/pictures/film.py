@@ -1,8 +1,10 @@
 """Films of shaded pictures."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -56,24 +58,25 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            for image, time in zip(_ahead(page.images(shown[there:])), pace.times[there:], strict=True):
+            images = page.images(shown[there:], partial(_ahead, len(page.states)))
+            for image, time in zip(images, pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()
     return Film(path, pace)
 
 
-def _ahead(images: Iterator[Points]) -> Iterator[Points]:
-    """The same images, each of which is drawn while the one before is used."""
+def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
+    """The same images, of which so many are drawn while those before are used."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
-        coming = painter.submit(next, images, None)
+        coming = deque(painter.submit(next, images, None) for _ in range(count))
         while True:
             with WARP.lent():  # the painter needs it
-                image = coming.result()
+                image = coming.popleft().result()
             if image is None:
                 return
-            coming = painter.submit(next, images, None)
+            coming.append(painter.submit(next, images, None))
             yield image
     finally:
         with WARP.lent():
-            painter.shutdown()
+            painter.shutdown(cancel_futures=True)

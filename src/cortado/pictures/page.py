@@ -8,6 +8,8 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.painter import Painter
 from cortado.pictures.scenery import State
 
+Ahead = Callable[[Iterator[Points]], Iterator[Points]]
+
 
 def alone(images: list[Points]) -> Points:
     """The one picture that there is."""
@@ -31,7 +33,9 @@ class Page:
         """(rows, columns, 3), linear from 0 to 1."""
         return self.composed([self.painter.image(*state(frame)) for state in self.states])
 
-    def images(self, frames: Sequence[int]) -> Iterator[Points]:
-        """The `image` of each frame in their order."""
-        drawn = self.painter.images(state(frame) for frame in frames for state in self.states)
+    def images(
+        self, frames: Sequence[int], ahead: Callable[[Iterator[Points]], Iterator[Points]] = iter
+    ) -> Iterator[Points]:
+        """The `image` of each frame in their order; ``ahead``: from the pictures that they are made of to the same."""
+        drawn = ahead(self.painter.images(state(frame) for frame in frames for state in self.states))
         return (self.composed(list(islice(drawn, len(self.states)))) for _ in frames)

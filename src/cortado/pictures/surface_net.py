@@ -224,13 +224,13 @@ def find_normals(
 def smooth_normals(
     first: wp.int32,
     neighbours: wp.array(dtype=Neighbours),
-    normals: wp.array(dtype=wp.vec3),
+    values: wp.array(dtype=wp.vec3),
     found: wp.array(dtype=wp.vec3),
 ):
     v = first + wp.tid()
-    total, _count = sum_beside(neighbours[v], normals)
+    total, _count = sum_beside(neighbours[v], values)
     if wp.length_sq(total) == 0.0:
-        total = normals[v]
+        total = values[v]
     found[v] = wp.normalize(total)
 
 
@@ -269,11 +269,8 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
 
 def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
     """Values (p,) of vec3, moved towards the means of their neighbours so many times, by weights (p,) from 0 to 1."""
-    found, other = wp.clone(values), wp.empty_like(values)
-    for _ in range(rounds):
-        launch(smooth, len(values), neighbours=neighbours, weights=weights, values=found, found=other)
-        found, other = other, found
-    return found
+    own = {"neighbours": neighbours, "weights": weights}
+    return launch.to_and_fro(smooth, rounds, wp.clone(values), wp.empty_like(values), **own)
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
@@ -281,10 +278,7 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
     normals, other = wp.empty_like(points), wp.empty_like(points)
     own = {"signs": net.signs, "neighbours": net.neighbours}
     launch(find_normals, len(points), **own, points=points, normals=normals)
-    for _ in range(ROUNDS_OF_NORMALS):
-        launch(smooth_normals, len(points), neighbours=net.neighbours, normals=normals, found=other)
-        normals, other = other, normals
-    return normals
+    return launch.to_and_fro(smooth_normals, ROUNDS_OF_NORMALS, normals, other, neighbours=net.neighbours)
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
