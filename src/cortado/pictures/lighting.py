@@ -69,8 +69,7 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
         if cosine > 0.0:
             for k in range(sun_directions.shape[0]):
                 arriving_sun = wp.float32(1.0)
-                hit = wp.mesh_query_ray(surface.mesh, p, sun_directions[k], FAR)
-                if hit.result:
+                if wp.mesh_query_ray_anyhit(surface.mesh, p, sun_directions[k], FAR):
                     arriving_sun = clearness
                 if has_opaque:
                     solid = wp.mesh_query_ray(s.solids.opaque, p, sun_directions[k], FAR)
