@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from scipy.spatial import cKDTree
 
+from cortado.device import bands
+from cortado.device.bands import BandLauncher
 from cortado.errors import ComputationError
 from cortado.pictures import liquid as liquid_module
 from cortado.pictures.surface import liquid
+from cortado.pictures.surface_net import Neighbours, smoothed
 
 SPACING = 0.1
 
@@ -97,3 +101,20 @@ def test_what_is_very_far_away_is_left_out():
 def test_positions_that_are_not_numbers_are_a_sentence():
     with pytest.raises(ComputationError, match="2 particles cannot be drawn, whose positions are not finite"):
         surface_of(np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]))
+
+
+@pytest.mark.parametrize("rounds", [0, 1, 2, 5])
+def test_values_are_smoothed_to_and_fro_however_launches_are_made(rounds, monkeypatch):
+    """Towards the mean of neighbours on a ring, as NumPy does; what is given stays as it is."""
+    launch, given = BandLauncher(wp.get_device("cpu")), np.random.default_rng(0).random((50, 3)).astype(np.float32)
+    ring = np.full((50, 6), -1, dtype=np.int32)
+    ring[:, 0], ring[:, 3] = np.roll(np.arange(50), 1), np.roll(np.arange(50), -1)
+    neighbours, halves = wp.array(ring, dtype=Neighbours), wp.full(50, 0.5, dtype=wp.float32)
+    wanted = given
+    for _ in range(rounds):
+        wanted = 0.5 * wanted + 0.25 * (np.roll(wanted, 1, axis=0) + np.roll(wanted, -1, axis=0))
+    for least in (0, 1000):
+        monkeypatch.setattr(bands, "LEAST_SHARED_OFTEN", least)
+        values = wp.array(given, dtype=wp.vec3)
+        np.testing.assert_allclose(smoothed(values, neighbours, halves, rounds, launch).numpy(), wanted, atol=1e-6)
+        np.testing.assert_array_equal(values.numpy(), given)
