@@ -10,7 +10,7 @@ from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import Points
 from cortado.pictures.marked import last_of
 from cortado.pictures.mirrored import mirrored
-from cortado.pictures.particles import MODULE, Look, Particles
+from cortado.pictures.particles import MODULE, Look, Particles, mixed
 from cortado.pictures.stage import Stage
 from cortado.pictures.surroundings import GLASS_BOX, Environment
 
@@ -30,7 +30,7 @@ def particles_of(
 ) -> Particles:
     """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3) and mass fractions (n, phases), even
     ones if left out."""
-    media = stage.media.mean(axis=0) if fractions is None else np.clip(fractions, 0.0, 1.0) @ stage.media
+    media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     found = Particles.on(launch.device, np.subtract(positions, stage.origin), colours, media)
     launch(turn, len(found), frame=wp.mat33(*stage.frame.ravel()), places=found.places)
     return found
