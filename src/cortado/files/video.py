@@ -23,8 +23,8 @@ QUALITY = "18"
 BITS = 1.2e6
 """A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
 THREADS = 8
-"""Of the encoder, which work at frames one after the other while others are drawn: as many on every machine, so that it
-writes the same file."""
+"""Of the encoder, each at a frame of its own while others are drawn; however many cores there are, as the file depends
+on it."""
 HELPERS = 4
 """Threads that convert the parts of a frame."""
 TICKS = 90_000
