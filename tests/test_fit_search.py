@@ -62,11 +62,11 @@ WEIGHTS = [Weighting(SIZE)]
 def test_it_ends_a_tenth_of_a_bar_from_the_least(off, wrong):
     made = problem({"size": 2.0 * off, "rate": 1.5 / off, "level": 0.1}, wrong=wrong)
     at, found = least(made, made.estimated(made.coordinates.start), WEIGHTS, 50)
-    spent = made.runs, made.tangents
+    spent = made.runs + 2.3 * made.tangents
     J, _ = made.stacked(at, WEIGHTS)
     bars = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     assert found and (np.abs(at.u - the_least(made)) <= 0.1 * bars).all()
-    assert spent == (9, 4) if (off, wrong) == (1.3, 0.0) else spent <= (50, 12)
+    assert spent == pytest.approx(18.2) if (off, wrong) == (1.3, 0.0) else spent <= 70.0
     assert at.residuals[0] == pytest.approx(made.residuals(at.u)[0], abs=0.03 * SIZE)
 
 

@@ -19,7 +19,7 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-4
 POOR, GOOD = 0.25, 0.75
 """Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
 gains more, half as much."""
-MOST_FAILURES = 2
+MOST_FAILURES = 3
 """Trial points in succession that are no lower: then the Jacobian is estimated anew."""
 
 NEARBY = 9.0
