@@ -10,6 +10,7 @@ from cortado.cli.command import Work, command
 from cortado.cli.parsing import Program
 from cortado.cli.process import main
 
+from .cases import CaseName
 from .coverage import cover, cover_linear
 from .effort import cost_beside_search
 from .wrong import of_another_model
@@ -35,23 +36,24 @@ def wrong() -> Work:
 
 
 @command(app, answers=True)
-def coverage(case: str = "video", runs: int = 200, out: Path = Path("runs/fits")) -> Work:
+def coverage(case: CaseName = "video", runs: int = 200, processes: int = 1, out: Path = Path("runs/fits")) -> Work:
     """Fit one experiment with many kinds of noise, and count how many intervals hold the truth.
 
     Args:
-        case: "video", "force" or "drop".
+        case: What is measured.
         runs: Number of fits.
+        processes: That fit at the same time. Set CORTADO_CORES=1 besides, so that each has one core.
         out: Folder of what is done, a line for each fit; the next call goes on after it.
     """
-    return partial(cover, case, runs, out)
+    return partial(cover, case, runs, processes, out)
 
 
 @command(app, answers=True)
-def linear(case: str = "drop", runs: int = 10_000) -> Work:
+def linear(case: CaseName = "drop", runs: int = 10_000) -> Work:
     """The same of the experiment's linear model, with the same noise: many more fits, in a minute.
 
     Args:
-        case: "video", "force" or "drop".
+        case: What is measured.
         runs: Number of fits.
     """
     return partial(cover_linear, case, runs)

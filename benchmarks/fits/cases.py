@@ -1,8 +1,9 @@
 """Experiments with known parameters, in the plane with some 125 particles and 20 steps, and noise that is correlated
 within a frame and over time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -114,4 +115,5 @@ def drop() -> Case:
     return Case(experiment, true, start, {}, {"tracers": first.shape}, {"tracers": 2e-6})
 
 
-CASES = {"video": video, "force": force, "drop": drop}
+CaseName = Literal["video", "force", "drop"]
+CASES: dict[CaseName, Callable[[], Case]] = {"video": video, "force": force, "drop": drop}

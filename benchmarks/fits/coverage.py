@@ -1,7 +1,10 @@
 """How often intervals hold the truth: fits of one experiment with other noise each, and of its linear model."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +13,13 @@ from scipy.stats import binomtest
 from scipy.stats import t as student
 
 import cortado
+from cortado.arrays import whole_number
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.fitted import Fit
 from cortado.optimisation.fitting.least_squares import LeastSquares
 from cortado.optimisation.fitting.noise import correlation_time, independent_frames, score_covariance, whitened
 
-from .cases import CASES, Case
+from .cases import CASES, Case, CaseName
 
 
 def share(found: Sequence[bool]) -> str:
@@ -45,14 +49,35 @@ def record(case: Case, fitted: Fit) -> dict[str, Any]:
     }
 
 
-def cover(case: str, runs: int, out: Path) -> str:
+@cache
+def case_of(name: CaseName) -> Case:
+    """Made once in a process."""
+    return CASES[name]()
+
+
+def fitted_line(name: CaseName, seed: int) -> str:
+    """The record of the fit with the noise of a seed."""
+    case = case_of(name)
+    return json.dumps(record(case, cortado.fit(case.noisy(seed), case.start, case.bounds)))
+
+
+def fitted_lines(name: CaseName, seeds: range, processes: int) -> Iterator[str]:
+    """The records of many, in the order of their seeds."""
+    fit_one = partial(fitted_line, name)
+    if processes == 1:
+        yield from map(fit_one, seeds)
+        return
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        yield from pool.map(fit_one, seeds)
+
+
+def cover(case: CaseName, runs: int, processes: int, out: Path) -> str:
     """A table of how many intervals held the truth."""
+    runs, processes = whole_number("runs", runs, 1), whole_number("processes", processes, 1)
     out.mkdir(parents=True, exist_ok=True)
-    path, made = out / f"{case}.jsonl", CASES[case]()
+    path = out / f"{case}.jsonl"
     done = path.read_text().splitlines() if path.exists() else []
-    for seed in range(len(done), runs):
-        fitted = cortado.fit(made.noisy(seed), made.start, made.bounds)
-        line = json.dumps(record(made, fitted))
+    for line in fitted_lines(case, range(len(done), runs), processes):
         with path.open("a") as file:
             file.write(line + "\n")
         done.append(line)
@@ -72,9 +97,9 @@ def cover(case: str, runs: int, out: Path) -> str:
     return "\n".join(text)
 
 
-def cover_linear(case: str, runs: int) -> str:
+def cover_linear(case: CaseName, runs: int) -> str:
     """The same of the experiment's linear model at the truth, with the noise of the same seeds: no run for a fit."""
-    made = CASES[case]()
+    made = case_of(case)
     coordinates = Coordinates.of(made.true, made.true, made.bounds)
     problem = LeastSquares([made.experiment], coordinates)
     (J,) = problem.linearised(coordinates.start).jacobians

@@ -123,6 +123,16 @@ def check_steps(steps: int, least: int = 1) -> int:
     return whole_number("steps", steps, least)
 
 
+def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
+    """A list of numbers of steps from 0 to ``most``, or an `InputError` in a sentence."""
+    if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
+        raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
+    found = [whole_number("a number of steps", step, 0) for step in steps]
+    for step in found:
+        require_at_most("a number of steps", step, most)
+    return found
+
+
 def _is_masked(value: Any) -> bool:
     """Whether entries are masked, of a masked array or of a list with masked arrays in it."""
     if isinstance(value, np.ma.MaskedArray):

@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_steps, require_at_most, require_function, require_methods, whole_number
+from cortado.arrays import check_step_numbers, check_steps, require_function, require_methods, whole_number
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, DivergedError, InputError, shown
+from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.fingerprint import fingerprint_of
 from cortado.fixed import fixed
 from cortado.forward_pass import ProblemForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotBatch
+from cortado.losses.along_tangents import derivative_along
 from cortado.losses.by_step import LossesByStep
 from cortado.losses.loss import moment_of
 from cortado.particles.state import State
@@ -108,7 +109,7 @@ class Problem:
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
         """States of the rollout under these parameters, by the number of steps before them, from 0 on."""
-        return self._ends(self._checked(parameters), self._checked_steps(steps), keep=False)
+        return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
@@ -177,21 +178,10 @@ class Problem:
 
         ends = self.tangents(parameters, directions, observe, self._losses)
         loss, bars = self._losses.total_and_adjoints(ends, self._going)
-        leading = np.shape(loss)
-
-        def product(bar: np.ndarray, dot: np.ndarray) -> np.ndarray:
-            return (bar.astype(np.float64) * dot).reshape(*leading, -1).sum(axis=-1)
-
-        terms = []
-        if "colours" in directions:
-            colours_dot = np.asarray(directions["colours"], dtype=np.float64)
-            terms = [product(bar.colours, colours_dot) for bar in bars.values()]
-        for step in sorted(dots):
-            bar = bars[step].state.numpy(3)
-            terms += [product(bar[name], d) for name, d in dots[step].items()]
-            more = self.along(ends[step], bars[step].quantities, dots[step], parameters, directions)
-            terms += [product(bars[step].quantities[name], d) for name, d in more.items()]
-        return sum(terms) + 0.0 * loss if leading else float(sum(terms))
+        for step, dot in dots.items():
+            dot |= self.along(ends[step], bars[step].quantities, dot, parameters, directions)
+        slope = derivative_along(bars, dots, directions.get("colours"), np.shape(loss))
+        return slope + 0.0 * loss if slope.ndim else float(slope)
 
     @in_turn
     def tangents(
@@ -212,7 +202,7 @@ class Problem:
             require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
             along.append((self._space.checked(directions, "direction"), observe))
         varied = {name for directions, _ in along for name in directions}
-        ends = self._ends(values, self._checked_steps(steps), keep=False, varied=varied)
+        ends = self._ends(values, check_step_numbers(steps, self.steps), keep=False, varied=varied)
         for directions, observe in along:
             self._rollout.tangent(*self._space.direction(self._rollout, values, directions), observe)
         return ends
@@ -289,15 +279,6 @@ class Problem:
     def diagnostics(self) -> Mapping[str, np.ndarray]:
         """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
         return self._rollout.diagnostics
-
-    def _checked_steps(self, steps: Iterable[int]) -> list[int]:
-        """Numbers of steps that the problem has; raises `InputError` for anything else."""
-        if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
-            raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
-        found = [whole_number("a number of steps", step, 0) for step in steps]
-        for step in found:
-            require_at_most("a number of steps", step, self.steps)
-        return found
 
     def _checked(self, parameters: Values) -> Arrays:
         """The parameters as arrays; they go with the state, if one is given."""

@@ -1,4 +1,4 @@
-"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs correct."""
+"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs tell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 
 from cortado.errors import DivergedError
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.trial_points import TINY, TrialPoints
 
 NEAR = 1e-6
 """A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
@@ -18,6 +19,8 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-2, 1e-4
 POOR, GOOD = 0.25, 0.75
 """Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
 gains more, half as much."""
+MOST_FAILURES = 3
+"""Trial points in succession that are no lower: then the Jacobian is estimated anew."""
 
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
@@ -27,8 +30,6 @@ ONE_BAR = 1.0
 """The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
 MOST_JACOBIANS = 4
 """By tangents."""
-TINY = 1e-300
-"""In the place of 0 below a fraction."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,12 @@ def search(
     """Lower the sum of the squared residuals, from a point whose Jacobian may be an estimate, until a step is predicted
     to lower it by a share of at most ``enough``, with the coordinates of some numbers ``fixed``.
 
-    After each trial point, which takes one forward run, the Jacobian is corrected by what the residuals did (Broyden
-    1965). A trial point that is no lower, or where the run diverges, has it estimated anew, and then steps are damped
-    (Levenberg 1944, Marquardt 1963).
+    A trial point takes one forward run, also one that is no lower, and the Jacobian follows from all of them, see
+    `trial_points`. After one that is no lower, or where the run diverges, steps are damped (Levenberg 1944, Marquardt
+    1963); after several the Jacobian is estimated anew.
     """
-    fresh, damping, lowest = True, 0.0, problem.sum_of_squares(at.residuals, weights)
+    points, base = TrialPoints(problem, weights, at), 0
+    failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
     for _ in range(trials):
         point, gain = next_point(problem, at, weights, 0.0, fixed)
         if gain <= enough * lowest or np.abs(point - at.u).max() <= NEAR * (NEAR + np.abs(at.u).max()):
@@ -90,11 +92,16 @@ def search(
             squares = problem.sum_of_squares(residuals, weights)
         except DivergedError:
             squares = np.inf
+        number = points.add(point, residuals) if np.isfinite(squares) else base
         share = (lowest - squares) / max(gain, TINY)
         if share > 0.0:
-            at, lowest, fresh = corrected(problem, at, weights, point, residuals), squares, False
-        elif not fresh:
-            at, fresh = problem.estimated(at.u), True
+            lowest, base, failures = squares, number, 0
+        else:
+            failures += 1
+        has_failed = failures == MOST_FAILURES
+        at = problem.estimated(at.u) if has_failed else points.linearised(base)
+        if has_failed or points.are_many:
+            points, base, failures = TrialPoints(problem, weights, at), 0, 0
         if share < POOR:
             damping = max(10.0 * damping, FIRST_DAMPING)
         elif share > GOOD:
@@ -126,23 +133,3 @@ def next_point(
     point = at.u.copy()
     point[free] = np.clip(at.u[free] + shift, lower[free], upper[free])
     return point, float((q**2).sum() - ((R @ shift + q) ** 2).sum())
-
-
-def corrected(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    u: np.ndarray,
-    residuals: list[np.ndarray],
-) -> Linearised:
-    """At another point, with the Jacobian that is nearest to the old one of those that lead from the old residuals to
-    the new ones: Broyden's update, in the metric of the Hessian, which knows no units of coordinates."""
-    J, _ = problem.stacked(at, weights)
-    shift = u - at.u
-    along = J.T @ (J @ shift)
-    along = along / max(float(shift @ along), TINY)
-    jacobians = [
-        J + (new - old - J @ shift)[..., None] * along
-        for J, old, new in zip(at.jacobians, at.residuals, residuals, strict=True)
-    ]
-    return Linearised(u, residuals, jacobians)

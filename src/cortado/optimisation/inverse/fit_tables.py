@@ -2,7 +2,8 @@
 
 from typing import Annotated
 
-from cortado.optimisation.inverse.tables import ProblemTable, Values
+from cortado.optimisation.inverse.named_values import Values
+from cortado.optimisation.inverse.tables import ProblemTable
 from cortado.scene.fields import count
 from cortado.scene.tables import Table
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.inverse.tables import DISTANCES, RANDOM
+from cortado.optimisation.inverse.named_values import RANDOM
+from cortado.optimisation.inverse.tables import DISTANCES
 from cortado.optimisation.inverse.task import Task
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.pictures.image_files import heart, read_picture, rosetta

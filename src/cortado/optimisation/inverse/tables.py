@@ -1,19 +1,14 @@
-"""The tables [problem] and [optimise] of a task, with the field types that only they have."""
+"""The tables [problem] and [optimise] of a task."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import (
-    BeforeValidator,
     ValidationError,
-    ValidationInfo,
     ValidatorFunctionWrapHandler,
-    WithJsonSchema,
     WrapValidator,
     model_validator,
 )
@@ -31,10 +26,10 @@ from cortado.gradients import (
 )
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.inverse.measured_tables import AnyMeasured
+from cortado.optimisation.inverse.named_values import VALUES, ParameterName, Start, Values
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
-from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
-from cortado.scene.parameters.values import NAMES, UNITS
+from cortado.scene.fields import MISSING, OneOf, Several, Text, count, field_error, quantity
 from cortado.scene.sentences import wanted
 from cortado.scene.tables import Table
 
@@ -53,65 +48,6 @@ ESTIMATORS: dict[str, AdjointEstimator] = {
     "adjoint_viscosity": AdjointViscosity(),
     "implicit_pressure": ImplicitPressure(),
 }
-RANDOM = "random"
-CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
-
-
-def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
-    if not isinstance(values, Mapping) or not values:
-        raise field_error((), Words("empty") if values == {} else values, wanted(_VALUES))
-    found = {}
-    names = _names(info)
-    for name, value in _flat(values, names).items():
-        if name not in names:
-            raise field_error((name,), Words("unknown"), _offered(info))
-        is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
-        found[name] = value if is_word else _array(name, value)
-    return found
-
-
-def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Values by name, where ``drag.k = 2.0`` is a table in a table."""
-    found = {}
-    for name, value in values.items():
-        deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
-        found.update({f"{name}.{key}": entry for key, entry in value.items()} if deeper else {name: value})
-    return found
-
-
-def _names(info: ValidationInfo) -> Collection[str]:
-    """Of all parameters, those of parts of packages among them where whoever reads the tables says which."""
-    return (*NAMES, *(info.context or {}).get("names", ()))
-
-
-def _offered(info: ValidationInfo) -> str:
-    """Which names are right: of parameters that the scene has, where whoever reads the tables says which."""
-    return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
-
-
-def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """The name of a parameter; raises a `field_error` where whoever reads the tables says which names are right."""
-    if info.context and name not in _names(info):
-        raise field_error((), name, _offered(info))
-    return name if info.context else check(name)
-
-
-def _array(name: str, value: Any) -> Any:
-    finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
-    if not _is_numeric(value):
-        raise field_error((name,), value, finite)
-    try:
-        return np.array(value, dtype=np.float64)
-    except ValueError:
-        raise field_error((name,), value, finite) from None
-
-
-def _is_numeric(value: Any) -> bool:
-    """Whether there is a finite number, or nothing else in a list that is not empty."""
-    if isinstance(value, list):
-        return bool(value) and all(map(_is_numeric, value))
-    return as_number(value) is not None
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
@@ -124,28 +60,6 @@ def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ..
     raise field_error((), value, words)
 
 
-_NUMBERS: list[Any] = [{"type": "number"}, {"type": "array"}]
-
-
-def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The JSON schema of values by name; parameters that can be random may be one of the words too."""
-    allowed = [{"enum": list(words)}] if words else []
-    properties = {
-        name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
-        for name, unit in UNITS.items()
-    }
-    dotted = {r"\.": {"anyOf": _NUMBERS, "unit": "-"}}  # of parts of packages, also written as tables
-    others = {"patternProperties": dotted, "additionalProperties": {"type": "object"}}
-    return {"type": "object", "minProperties": 1, "properties": properties, **others}
-
-
-_VALUES = _schema()
-Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VALUES)]
-"""Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
-Start = Annotated[
-    dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
-]
-"""Values, of which some may be the word "random"."""
 Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
 """A continuation schedule: factors that grow to 1."""
 
@@ -191,7 +105,7 @@ class ProblemTable(Table):
         if self.measured:
             return self
         if self.picture is None and self.target is None:
-            raise field_error(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
+            raise field_error(("target",), MISSING, f"{wanted(VALUES)}, as there is no picture")
         if self.picture is not None and self.target is not None:
             raise field_error(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
@@ -284,7 +198,7 @@ class OptimiseTable(Table):
     word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Number of free rows between which parameters over time are interpolated; if left out, one row for each step."""
-    logarithmic: tuple[Annotated[str, OneOf(NAMES), WrapValidator(_known)], ...] = ()
+    logarithmic: tuple[ParameterName, ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
     """By the name of a parameter the lower and the upper bound; viscosity, mobility and fractions never go below 0
