@@ -1,35 +1,70 @@
 """What `make test` runs of all tests, which are those of `make test-all`.
 
 Of a test with several parameters it runs so many cases that every value of each parameter is in one of them, not all
-combinations; and in the place of a test that takes more than 20 s it runs one that is shorter (`LONG`).
+combinations; and of cases that take at least 3 s those in `KEPT` alone. `tests/seconds.csv` has what cases take:
+
+    pytest --short --junitxml=suite.xml; python tests/short.py suite.xml
 """
 
-from collections import Counter
+import csv
+import sys
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
 
-LONG = {
-    "test_examples": {
-        "test_an_example_ends_well[flipped_bottle.py]",
-        "test_an_example_ends_well[poured_jug.py]",
-        "test_an_example_ends_well[steered_raft.py]",
-        "test_an_example_ends_well[stirred_tank.py]",
-        "test_an_example_ends_well[struck_pillar.py]",
-        "test_its_check_can_fail[carried_cup.py]",
+SECONDS = Path(__file__).with_name("seconds.csv")
+SLOW = 3.0
+"""[s]"""
+KEPT = {
+    "test_cli": {"test_run_writes_its_folder"},
+    "test_examples": {"test_an_example_ends_well[first_gradient.py]", "test_its_check_can_fail[first_gradient.py]"},
+    "test_free_bodies": {"test_derivatives_of_bodies[plane]"},
+    "test_held_water": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
+    "test_image_loss": {"test_the_whole_chain_from_gravity_to_the_picture[True]"},
+    "test_implicit_pressure": {"test_at_the_fixed_point_it_is_the_exact_gradient[three phases-1e-05]"},
+    "test_notebooks": {"test_all_cells_run[first_steps]"},
+    "test_projection": {
+        "test_a_step_is_that_of_the_twin[space]",
+        "test_reverse_mode_is_forward_mode_is_the_limit_of_differences[plane]",
     },
-    "test_plants": {
-        "test_every_kernel_on_the_way_back_is_planted",
-        "test_every_plant_is_found",
-        "test_the_copy_without_a_plant_is_right",
+    "test_ranges": {"test_any_number_of_ranges_gives_the_same_bits[the projection]"},
+    "test_readme": {"test_the_code_runs_as_printed"},
+    "test_solid_loads": {"test_loads_have_derivatives[projection]"},
+    "test_validation_projection": {
+        "test_a_dam_break_makes_no_energy_and_is_not_compressed[0.001]",
+        "test_a_jet_that_falls_is_drawn_out_and_keeps_together[0.0]",
+        "test_vortices_decay_as_they_must[32-100.0-1.0-0.035]",
     },
+    "test_validation_rheology": {"test_a_carreau_fluid_flows_between_plates_as_it_should"},
+    "test_validation_surface_tension": {"test_a_drop_in_space"},
 }
-"""Tests of files, or cases of them, that only `make test-all` runs. In their place `make test` runs the same examples
-with one update, to a check that fails, or to their end without a mistake, and plants in the adjoints of one scene."""
+"""Slow cases of files that `make test` runs, as nothing quicker guards the same."""
 Value = tuple[str, tuple[int, ...]]
 """Names of parameters that are set together, and the identities of their values."""
 
 
-def is_long(item) -> bool:
-    return not LONG.get(item.path.stem, set()).isdisjoint((item.name, getattr(item, "originalname", item.name)))
+def _measured() -> dict[tuple[str, str], float]:
+    with SECONDS.open(newline="") as file:
+        return {(row["file"], row["test"]): float(row["seconds"]) for row in csv.DictReader(file)}
+
+
+MEASURED = _measured()
+
+
+def seconds_of(item) -> float:
+    """What a case takes, and 0 where it is less than `SLOW`. A row of a whole test is about each case of it."""
+    file = item.path.stem
+    return MEASURED.get((file, item.name)) or MEASURED.get((file, getattr(item, "originalname", item.name)), 0.0)
+
+
+def is_slow(item) -> bool:
+    return seconds_of(item) > 0.0
+
+
+def short(items: Iterable) -> list:
+    """What `make test` runs."""
+    return [item for item in with_each_value(items) if not is_slow(item) or item.name in KEPT.get(item.path.stem, ())]
 
 
 def values_of(item) -> set[Value]:
@@ -70,3 +105,29 @@ def with_each_value(items: Iterable) -> list:
         some = chosen([values_of(item) for item in cases]) if together else range(len(cases))
         kept |= {id(cases[k]) for k in some}
     return [item for item in items if id(item) in kept]
+
+
+def write_seconds(report: Path) -> None:
+    """The table from a report of pytest: a test all of whose cases are slow has one row."""
+    tests: dict[tuple[str, str], dict[str, float]] = defaultdict(dict)
+    for case in ElementTree.parse(report).getroot().iter("testcase"):
+        if len(case) == 0 and case.get("classname"):  # passed
+            file, name = case.get("classname").rpartition(".")[2], case.get("name")
+            tests[file, name.partition("[")[0]][name] = float(case.get("time"))
+    found = dict(MEASURED)
+    for (file, test), cases in tests.items():
+        found = {
+            key: value for key, value in found.items() if key != (file, test) and key not in {(file, c) for c in cases}
+        }
+        if min(cases.values()) >= SLOW:
+            found[file, test] = max(cases.values())
+        else:
+            found |= {(file, case): time for case, time in cases.items() if time >= SLOW}
+    with SECONDS.open("w", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("file", "test", "seconds"))
+        rows.writerows((*key, f"{value:.0f}") for key, value in sorted(found.items()))
+
+
+if __name__ == "__main__":
+    write_seconds(Path(sys.argv[1]))

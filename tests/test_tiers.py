@@ -5,14 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from conftest import SLOW, SLOW_TESTS, VALIDATION, tier
-from short import LONG, chosen, values_of
+from conftest import VALIDATION, tier
+from short import KEPT, MEASURED, SLOW, chosen, short, values_of, write_seconds
 
 TESTS = Path(__file__).parent
-
-
-def test_a_file_is_in_one_tier():
-    assert not VALIDATION & SLOW and not (VALIDATION | SLOW) & SLOW_TESTS.keys()
 
 
 def names_in(file):
@@ -20,25 +16,52 @@ def names_in(file):
     return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-@pytest.mark.parametrize("file", LONG)
-def test_in_the_place_of_what_is_long_something_is_left(file):
-    listed = {name.partition("[")[0] for name in LONG[file]}
-    assert listed < names_in(file)
-
-
-@pytest.mark.parametrize("file", sorted({*VALIDATION, *SLOW, *SLOW_TESTS}))
+@pytest.mark.parametrize("file", sorted({*VALIDATION, *KEPT, *(file for file, _ in MEASURED)}))
 def test_what_is_listed_is_there(file):
-    listed, there = SLOW_TESTS.get(file, set()), names_in(file)
-    assert listed <= there, listed - there
-    assert all(tier(file, test) == "slow" for test in listed)
+    listed = KEPT.get(file, set()) | {test for of, test in MEASURED if of == file}
+    missing = {test.partition("[")[0] for test in listed} - names_in(file)
+    assert not missing
+
+
+def test_only_what_is_slow_has_to_be_kept():
+    slow = {*MEASURED, *((file, test.partition("[")[0]) for file, test in MEASURED)}
+    assert {(file, test.partition("[")[0]) for file, tests in KEPT.items() for test in tests} <= slow
 
 
 def test_the_marks_are_set(request):
     """Of all tests of this run."""
     for item in request.session.items:
-        found = tier(item.path.stem, getattr(item, "originalname", item.name))
         marks = {mark.name for mark in item.iter_markers()} & {"slow", "validation"}
-        assert marks == ({found} - {"unit"}), item.nodeid
+        assert marks == ({tier(item)} - {"unit"}), item.nodeid
+
+
+def test_what_is_slow_is_left_out_of_what_is_short():
+    class Item:
+        def __init__(self, file, name):
+            self.path, self.name, self.originalname = TESTS / f"{file}.py", name, name.partition("[")[0]
+
+    kept, quick = Item("test_readme", "test_the_code_runs_as_printed"), Item("test_kernels", "test_of_a_second")
+    whole, case = (
+        Item("test_plants", "test_every_plant_is_found[x]"),
+        Item("test_docs", "test_the_code_runs_as_printed[solids.md]"),
+    )
+    assert short([kept, whole, quick, case]) == [kept, quick]
+
+
+def test_seconds_are_those_of_a_report(tmp_path, monkeypatch):
+    table = tmp_path / "seconds.csv"
+    monkeypatch.setattr("short.SECONDS", table)
+    monkeypatch.setattr("short.MEASURED", {("test_a", "test_one"): 4.0, ("test_b", "test_two[x]"): 5.0})
+    times = {"test_one": 1.0, "test_two[x]": 6.0, "test_two[y]": 7.0, "test_three[x]": SLOW, "test_three[y]": 1.0}
+    files = ["test_a", "test_b", "test_b", "test_b", "test_b"]
+    cases = "".join(
+        f'<testcase classname="tests.{file}" name="{name}" time="{time}"/>'
+        for file, (name, time) in zip(files, times.items(), strict=True)
+    )
+    report = tmp_path / "suite.xml"
+    report.write_text(f"<testsuites><testsuite>{cases}</testsuite></testsuites>")
+    write_seconds(report)
+    assert table.read_text() == "file,test,seconds\ntest_b,test_three[x],3\ntest_b,test_two,7\n"
 
 
 def test_every_value_is_in_a_chosen_case():
