@@ -24,12 +24,16 @@ KEPT = {
     "test_image_loss": {"test_the_whole_chain_from_gravity_to_the_picture[True]"},
     "test_implicit_pressure": {"test_at_the_fixed_point_it_is_the_exact_gradient[three phases-1e-05]"},
     "test_notebooks": {"test_all_cells_run[first_steps]"},
+    "test_first_commands": {"test_a_new_scene_runs_at_once[2-True]"},
+    "test_packages": {"test_they_are_there_in_processes_of_their_own"},
+    "test_plants": {"test_plants_of_one_scene_are_found"},
     "test_projection": {
         "test_a_step_is_that_of_the_twin[space]",
         "test_reverse_mode_is_forward_mode_is_the_limit_of_differences[plane]",
     },
     "test_ranges": {"test_any_number_of_ranges_gives_the_same_bits[the projection]"},
     "test_readme": {"test_the_code_runs_as_printed"},
+    "test_reference_projection": {"test_steps_are_those_of_the_twin[scene-wendland_c2]"},
     "test_solid_loads": {"test_loads_have_derivatives[projection]"},
     "test_validation_projection": {
         "test_a_dam_break_makes_no_energy_and_is_not_compressed[0.001]",
