@@ -1,0 +1,52 @@
+"""The walls of a container that has solids in it: which of them solids leave as they are, in float64."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cortado.discretise.room import Room
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid, Which
+from cortado.discretise.solids.wall_points import WallPoints
+
+
+@dataclass(frozen=True, eq=False)
+class ContainerWalls:
+    """The wall particles that a container has without solids.
+
+    Of those that are so far from all solids that no fluid beside these sees them, each keeps its place and its cell.
+    """
+
+    points: WallPoints
+    solids: Sequence[Solid]
+    """What closes the container."""
+    room: Room
+    """Where fluid may be, beside solids."""
+    spacing: float
+    """Of particles [m]."""
+    support: float
+    """[m]"""
+
+    @cached_property
+    def stay(self) -> Which:
+        """(b,) which wall particles keep their places."""
+        clear = 2.0 * self.support + self.spacing
+        return np.asarray(self.room.from_solids(self.points.positions + self.points.feet, clear) >= clear)
+
+    def keeps(self, points: Points) -> Which:
+        """(n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place, or
+        above the rim of the container."""
+        from scipy.spatial import cKDTree
+
+        kept = self.room.region.is_above_rim(points)
+        if self.stay.any():
+            kept |= self.stay[cKDTree(self.points.positions).query(points)[1]]
+        return np.asarray(kept & (self.room.from_solids(points, self.spacing) > 0.0))
+
+    def is_near(self, points: Points, furthest: float = 0.0) -> Which:
+        """(n,) which points (n, d) [m] are less than a length [m] from what can matter to a particle that does not keep
+        its place."""
+        near = 3.0 * (self.support + self.spacing) + furthest
+        return np.asarray(self.room.from_solids(points, near) < near)
