@@ -101,13 +101,13 @@ class Region:
         Over the rim of an open cup they may go, and what was outside already has not gone through.
         """
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
-        return np.asarray(through & ~self.is_above_rim(before) & ~self.is_above_rim(after))
+        return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
-    def is_above_rim(self, points: Points) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are no lower than the rim of an open cup."""
+    def is_below_rim(self, points: Points) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are where there is none."""
         if not np.isfinite(self.rim):
-            return np.zeros(len(points), dtype=bool)
-        return np.asarray(points @ (1.0 - self.across) >= self.rim)
+            return np.ones(len(points), dtype=bool)
+        return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
         """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""

@@ -40,10 +40,11 @@ class ContainerWalls:
         above the rim of the container."""
         from scipy.spatial import cKDTree
 
-        kept = self.room.region.is_above_rim(points)
-        if self.stay.any():
-            kept |= self.stay[cKDTree(self.points.positions).query(points)[1]]
-        return np.asarray(kept & (self.room.from_solids(points, self.spacing) > 0.0))
+        kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)
+        outside = points[kept]
+        cells = self.stay.any() and self.stay[cKDTree(self.points.positions).query(outside)[1]]
+        kept[kept] = ~self.room.region.is_below_rim(outside) | cells
+        return kept
 
     def is_near(self, points: Points, furthest: float = 0.0) -> Which:
         """(n,) which points (n, d) [m] are less than a length [m] from what can matter to a particle that does not keep
