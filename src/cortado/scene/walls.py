@@ -47,9 +47,10 @@ class Walls:
     """(b,) whose they are: `wall_numbers` of solids; -1 of those of the container."""
 
     @classmethod
-    def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_]) -> "Walls":
-        """Those of the container, with the weights that were found."""
-        return cls(points.positions, weights, points.feet, sticks, 0.0 * points.feet, np.full(len(points), -1))
+    def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
+        """Those of the container, with the weights that were found; whether all stick, or each of them (b,)."""
+        grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
+        return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
     @classmethod
     def joined(cls, parts: Sequence["Walls"]) -> "Walls":
@@ -80,7 +81,7 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
 
     points, dimension = container.points.some(container.stay), scene.dimension
     if not len(points):
-        return Walls.of(points, points.flat, np.zeros(0, dtype=bool))
+        return Walls.of(points, points.flat, scene.container.sticks)
     short, folded = scene.container.shortened(lattice.spacing, lattice.support)
     sought = _even_points(short, dimension, layers, lattice.spacing)
     lower, lengths = short.periods(dimension)
@@ -88,7 +89,7 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
     surface = WallSurface(sought.positions, sought.flat, lattice, room, lower, lengths, even_changes)
     weights = surface.weights(short.places(dimension, lattice.spacing, lattice.support))
     same = cKDTree(sought.positions).query(folded(points.positions))[1]
-    return Walls.of(points, weights[same], np.full(len(points), scene.container.sticks))
+    return Walls.of(points, weights[same], scene.container.sticks)
 
 
 def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
@@ -108,7 +109,7 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
     tables: list[Container | SolidTable] = [scene.container for _ in container.solids]
     tables += [table for table, several in zip(resting, images, strict=True) for _ in several]
     solids = [image for several in images for image in several]
-    surface = ExposedSurface.of(container, solids, lower, lattice.support, lattice.spacing)
+    surface = ExposedSurface.of(container, solids, lower)
     for table in resting:
         if not any(tables[number] is table for number in np.unique(surface.owner)):
             raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
@@ -134,12 +135,12 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
     room, begins = Room(Region.everywhere(dimension), (solid,), filled), solid.extent()[0]
     nothing = _even_points(NoContainer(), dimension, layers, lattice.spacing)
     container = ContainerWalls(nothing, (), room, lattice.spacing, lattice.support)
-    surface = ExposedSurface.of(container, room.images(solid), begins, lattice.support, lattice.spacing)
-    beside, kept = Places.upright(nothing.positions), Walls.of(nothing, nothing.flat, np.zeros(0, dtype=bool))
+    surface = ExposedSurface.of(container, room.images(solid), begins)
+    beside, kept = Places.upright(nothing.positions), Walls.of(nothing, nothing.flat, False)
     points, weights = _weighed(surface, beside, kept, layers, lattice)
     frame = np.eye(dimension) if filled.any() else turn
     placed = replace(points, positions=table.middle() + points.positions @ frame.T, feet=points.feet @ frame.T)
-    found = Walls.of(placed, weights, np.full(len(points), table.sticks))
+    found = Walls.of(placed, weights, table.sticks)
     slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
     return replace(found, slides=slides, solid=np.full(len(points), number))
 

@@ -49,27 +49,28 @@ class ExposedSurface:
     container: ContainerWalls
     lower: Points
     """(d,) where the period begins [m]"""
-    spacing: float
-    """Of particles; each point stands for a part of the surface that is a `FINE`th of it long and wide [m]."""
 
     @classmethod
-    def of(
-        cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points, reach: float, spacing: float
-    ) -> "ExposedSurface":
-        """That of solids, and of the container near them, up to ``reach`` [m] beyond the ends of a period that begins
-        at ``lower`` (d,) [m]."""
-        room, fine = container.room, spacing / FINE
+    def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
+        """That of solids, and of the container near them, up to a support beyond the ends of a period that begins at
+        ``lower`` (d,) [m]. Each point stands for a part of it that is a `FINE`th of a spacing long and wide."""
+        room, spacing, fine = container.room, container.spacing, container.spacing / FINE
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
         feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
         owner = np.repeat(np.arange(len(found)), [len(part) for part, _ in found])
-        free = _within_a_period(feet, lower, room.periods, reach) & _is_exposed(feet, away, room, spacing)
-        return cls(feet[free], away[free], owner[free], [*container.solids, *solids], container, lower, spacing)
+        free = _within_a_period(feet, lower, room.periods, container.support) & _is_exposed(feet, away, room, spacing)
+        return cls(feet[free], away[free], owner[free], [*container.solids, *solids], container, lower)
 
     @property
     def room(self) -> Room:
         """Where fluid may be."""
         return self.container.room
+
+    @property
+    def spacing(self) -> float:
+        """Of particles [m]."""
+        return self.container.spacing
 
     @cached_property
     def _tree(self) -> Any:
