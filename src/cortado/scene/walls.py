@@ -114,7 +114,7 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
         if not any(tables[number] is table for number in np.unique(surface.owner)):
             raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
     beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
-    beside = beside.some(container.is_near(beside.points))
+    beside = beside.some(container.is_near(beside.points, lattice.support))
     points, weights = _weighed(surface, beside, kept, layers, lattice)
     owners, numbers = surface.owners(points), wall_numbers(scene.solid)
     found = Walls.of(points, weights, np.array([table.sticks for table in tables])[owners])

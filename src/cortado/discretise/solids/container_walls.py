@@ -29,11 +29,16 @@ class ContainerWalls:
     support: float
     """[m]"""
 
+    @property
+    def _clear(self) -> float:
+        """How far from solids feet of wall particles are that keep their places [m]."""
+        return 2.0 * self.support + self.spacing
+
     @cached_property
     def stay(self) -> Which:
         """(b,) which wall particles keep their places."""
-        clear = 2.0 * self.support + self.spacing
-        return np.asarray(self.room.from_solids(self.points.positions + self.points.feet, clear) >= clear)
+        feet = self.points.positions + self.points.feet
+        return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
         """(n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place, or
@@ -46,8 +51,8 @@ class ContainerWalls:
         kept[kept] = ~self.room.region.is_below_rim(outside) | cells
         return kept
 
-    def is_near(self, points: Points, furthest: float = 0.0) -> Which:
-        """(n,) which points (n, d) [m] are less than a length [m] from what can matter to a particle that does not keep
-        its place."""
-        near = 3.0 * (self.support + self.spacing) + furthest
+    def is_near(self, points: Points, furthest: float) -> Which:
+        """(n,) which points (n, d) [m] are less than a length [m] from the surface where particles do not keep their
+        places, whose cells are cut there, or from solids; a few more are."""
+        near = self._clear + 2.0 * self.spacing + furthest
         return np.asarray(self.room.from_solids(points, near) < near)
