@@ -116,14 +116,14 @@ class ExposedSurface:
         def is_near(points: Points, furthest: float) -> NDArray[np.bool_]:
             beyond = furthest - depth - 0.5 * fine
             away = self._tree.query(points, distance_upper_bound=furthest)[0]
-            near = np.isfinite(away) & (away > depth - fine - beyond)
+            near = np.isfinite(away) & (away > depth - 0.5 * fine - beyond)
             near[near] = self.room.distance(points[near], beyond) > -beyond
             return near
 
         lower, upper = self.feet.min(axis=0), self.feet.max(axis=0)
         for points in lattice_about(lower, upper, depth + 0.5 * fine, fine, is_near):
             away, nearest = self._tree.query(points, distance_upper_bound=depth + fine)
-            beneath = np.isfinite(away) & (away > depth - fine)
+            beneath = np.isfinite(away) & (away > depth - 0.5 * fine)
             beneath[beneath] = self.room.distance(points[beneath], fine) > 0.0
             points = points[beneath]
             feet = self._feet_of(points, away[beneath], nearest[beneath])

@@ -63,7 +63,8 @@ class RestLattice:
         offsets = lattice_offsets(self.spacing, self.support, dimension)
         cells = places.points[:, None] + offsets @ places.axes
         raised = places.points + RAISED * self.spacing * places.axes[:, 0]
-        empty = -room.distance(raised)  # the radius of a ball around each that nothing is in
+        furthest = (RAISED + 0.5) * self.spacing + self.support
+        empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
         open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * self.spacing
         shares = np.ones(open_cells.shape)
         shares[~open_cells] = room.cell_shares(cells[~open_cells], self.spacing)
