@@ -2,7 +2,7 @@
 
 A cube of water, so many particles wide, stands beside a dented ball of 199,000 triangles, a quarter of a metre in
 radius, in a tank 1.6 times as long; where no solid cuts the water nothing is packed. The ball is so near to the tank
-that, with ``--motion fixed``, walls of both are found together, which takes longest. Seconds are those of one core: set
+that, with ``--motion fixed``, walls of both are found together where it is. Seconds are those of one core: set
 ``CORTADO_CORES=1 OPENBLAS_NUM_THREADS=1``.
 """
 

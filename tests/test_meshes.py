@@ -14,7 +14,8 @@ from cortado.discretise.solids.inside_points import points_inside
 from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_files import mesh_in_file, read_mesh, read_triangles
 from cortado.discretise.solids.mesh_fit import thickness_of
-from cortado.discretise.solids.solid import Box, Hollow, Placed, Round, Union
+from cortado.discretise.solids.primitives import Box, Round
+from cortado.discretise.solids.solid import Hollow, Placed, Union
 from cortado.discretise.solids.surface_points import surface_feet, surface_points
 from cortado.errors import CortadoWarning, InputError
 

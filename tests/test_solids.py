@@ -156,6 +156,30 @@ def test_fluid_around_a_solid_starts_at_rest(table, kind):
     assert found.max() < 1.01 and found.min() > 0.99
 
 
+def test_a_container_keeps_its_walls_where_no_fluid_beside_a_solid_sees_them():
+    """Those that are found together with the walls of the solid begin there, without a gap."""
+    one, spacing = scene([PILLAR], spacing=0.025), 0.025
+    walls, alone = discretise(one).walls, discretise(scene([], spacing=spacing)).walls
+    (solid,), clear = solids_of(one.solid), 2.0 * one.discretisation.support_radius + spacing
+    far = solid.distance(alone.positions + alone.feet) >= clear
+    assert 0.5 < far.mean() < 0.95
+    for name in ("positions", "weights", "feet", "solid"):
+        np.testing.assert_allclose(getattr(walls, name)[: far.sum()], getattr(alone, name)[far], atol=1e-9)
+    others = (walls.positions + walls.feet)[far.sum() :]
+    assert clear - spacing < solid.distance(others).max() < clear + spacing
+    layer = np.abs(walls.positions[:, 1] + 0.4 * spacing) < 1e-6
+    floor = np.sort(walls.positions[layer & (np.abs(walls.positions[:, 0] - 0.275) < 0.275), 0])
+    assert 0.3 * spacing < np.diff(floor).min() and np.diff(floor).max() < 1.2 * spacing
+
+
+def test_an_open_cup_with_a_solid_in_it_ends_at_its_rim():
+    cup = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.3, "height": 0.5, "lid": False}
+    water = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.3, "height": 0.2, "phase": "water"}
+    post = {"shape": "box", "lower": [-0.1, -0.1, -0.1], "upper": [0.1, 0.3, 0.1]}
+    walls = discretise(scene([post], 3, spacing=0.1, container=cup, fluid=[water])).walls
+    assert 0.4 < walls.positions[:, 1].max() < 0.5
+
+
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_a_dam_break_against_a_solid_gains_no_energy_and_does_not_enter_it(name, kind):

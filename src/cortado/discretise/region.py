@@ -101,10 +101,13 @@ class Region:
         Over the rim of an open cup they may go, and what was outside already has not gone through.
         """
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
-        if np.isfinite(self.rim):
-            along = 1.0 - self.across
-            through &= (before @ along < self.rim) & (after @ along < self.rim)
-        return through
+        return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
+
+    def is_below_rim(self, points: Points) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are where there is none."""
+        if not np.isfinite(self.rim):
+            return np.ones(len(points), dtype=bool)
+        return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
         """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""

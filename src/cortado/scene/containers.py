@@ -10,7 +10,8 @@ from pydantic import Field, model_validator
 
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Box, HalfSpace, Hollow, Placed, Revolved, Solid
+from cortado.discretise.solids.primitives import Box, HalfSpace, Revolved
+from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
 from cortado.discretise.walls.short_box import ShortBox

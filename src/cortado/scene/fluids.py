@@ -10,7 +10,8 @@ from pydantic import ValidationInfo, field_validator, model_validator
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
-from cortado.discretise.solids.solid import Box, Revolved, Solid
+from cortado.discretise.solids.primitives import Box, Revolved
+from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table

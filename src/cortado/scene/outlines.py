@@ -9,7 +9,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_files import mesh_in_file
-from cortado.discretise.solids.solid import Polygon, Solid
+from cortado.discretise.solids.primitives import Polygon
+from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, field_error, quantity
 from cortado.scene.fluids import beside_scene
 from cortado.scene.tables import Table

@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import HalfSpace, Solid
+from cortado.discretise.solids.primitives import HalfSpace
+from cortado.discretise.solids.solid import Solid
 from cortado.errors import Words
 from cortado.scene.containers import Container
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity

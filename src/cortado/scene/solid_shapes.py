@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Polygon, Revolved, Round, Solid
+from cortado.discretise.solids.primitives import Polygon, Revolved, Round
+from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, box_about, check_order, cylinder_about, refuse_plane
 from cortado.scene.outlines import MeshShape, PolygonShape

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points, corners
-from cortado.discretise.solids.solid import Placed, Solid
-from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.container_walls import ContainerWalls
+from cortado.discretise.solids.solid import Placed
+from cortado.discretise.solids.wall_points import WallPoints
+from cortado.discretise.solids.walls import ExposedSurface, solid_places
 from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
 from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
@@ -45,9 +47,10 @@ class Walls:
     """(b,) whose they are: `wall_numbers` of solids; -1 of those of the container."""
 
     @classmethod
-    def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_]) -> "Walls":
-        """Those of the container, with the weights that were found."""
-        return cls(points.positions, weights, points.feet, sticks, 0.0 * points.feet, np.full(len(points), -1))
+    def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
+        """Those of the container, with the weights that were found; whether all stick, or each of them (b,)."""
+        grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
+        return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
     @classmethod
     def joined(cls, parts: Sequence["Walls"]) -> "Walls":
@@ -57,40 +60,36 @@ class Walls:
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
-    if not resting_room(scene).solids:
-        still = [_container_walls(scene, layers, lattice)]
-    elif _stand_clear(scene, lattice):
-        inner = scene.model_copy(update={"container": NoContainer()})
-        still = [_container_walls(scene, layers, lattice), _around(inner, layers, lattice)]
-    else:
-        still = [_around(scene, layers, lattice)]
+    container = _container(scene, layers, lattice)
+    still = [_kept(scene, container, layers, lattice)]
+    if container.room.solids:
+        still.append(_around(scene, container, still[0], layers, lattice))
     periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
     return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
 
 
-def _stand_clear(scene: Scene, lattice: RestLattice) -> bool:
-    """Whether no fluid beside a solid at rest sees the container, whose walls then are those of one without solids."""
-    room = resting_room(scene)
-    if room.periods.any() or not all(solid.is_bounded for solid in room.solids):
-        return False
-    ends = np.concatenate([corners(*solid.extent()) for solid in room.solids])
-    return bool(room.region.distance(ends).max() < -2.0 * lattice.support - lattice.spacing)
+def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
+    """The walls of the container as they are without solids, in layers of even particles."""
+    points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
+    solids = scene.container.solids(scene.dimension, lattice.support)
+    return ContainerWalls(points, solids, resting_room(scene), lattice.spacing, lattice.support)
 
 
-def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of the container, in layers of even particles."""
+def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of them that solids at rest leave."""
     from scipy.spatial import cKDTree
 
-    (short, folded), dimension = scene.container.shortened(lattice.spacing, lattice.support), scene.dimension
-    points, sought = (
-        _even_points(container, dimension, layers, lattice.spacing) for container in (scene.container, short)
-    )
+    points, dimension = container.points.some(container.stay), scene.dimension
+    if not len(points):
+        return Walls.of(points, points.flat, scene.container.sticks)
+    short, folded = scene.container.shortened(lattice.spacing, lattice.support)
+    sought = _even_points(short, dimension, layers, lattice.spacing)
     lower, lengths = short.periods(dimension)
     room = Room(short.region(dimension).opened(lengths), (), lengths)
     surface = WallSurface(sought.positions, sought.flat, lattice, room, lower, lengths, even_changes)
     weights = surface.weights(short.places(dimension, lattice.spacing, lattice.support))
-    same = cKDTree(sought.positions).query(folded(points.positions))[1] if len(sought) else slice(0)
-    return Walls.of(points, weights[same], np.full(len(points), scene.container.sticks))
+    same = cKDTree(sought.positions).query(folded(points.positions))[1]
+    return Walls.of(points, weights[same], scene.container.sticks)
 
 
 def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
@@ -102,21 +101,21 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
     return WallPoints(positions, flat, region.nearest(positions) - positions)
 
 
-def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of the container and of all solids at rest, of what fluid can touch of them together."""
-    room, (lower, _) = resting_room(scene), scene.container.periods(scene.dimension)
+def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of all solids at rest and of the container near them, of what fluid can touch of them together."""
+    room, (lower, _) = container.room, scene.container.periods(scene.dimension)
     resting = [solid for solid in scene.solid if not solid.moves]
-    sides = scene.container.solids(scene.dimension, lattice.support)
     images = [room.images(solid) for solid in room.solids]
-    tables: list[Container | SolidTable] = [scene.container for _ in sides]
+    tables: list[Container | SolidTable] = [scene.container for _ in container.solids]
     tables += [table for table, several in zip(resting, images, strict=True) for _ in several]
-    solids = [*sides, *(image for several in images for image in several)]
-    surface = ExposedSurface.of(room, solids, lower, lattice.support, lattice.spacing)
+    solids = [image for several in images for image in several]
+    surface = ExposedSurface.of(container, solids, lower)
     for table in resting:
         if not any(tables[number] is table for number in np.unique(surface.owner)):
             raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
     beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
-    points, weights = _weighed(surface, beside, room.solids, layers, lattice)
+    beside = beside.some(container.is_near(beside.points, lattice.support))
+    points, weights = _weighed(surface, beside, kept, layers, lattice)
     owners, numbers = surface.owners(points), wall_numbers(scene.solid)
     found = Walls.of(points, weights, np.array([table.sticks for table in tables])[owners])
     of_tables = [-1 if isinstance(table, Container) else numbers[table.name] for table in tables]
@@ -134,23 +133,28 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
     solid = Placed(table.own_solid(), np.zeros(dimension), turn) if filled.any() else table.own_solid()
     room, begins = Room(Region.everywhere(dimension), (solid,), filled), solid.extent()[0]
-    surface = ExposedSurface.of(room, room.images(solid), begins, lattice.support, lattice.spacing)
-    nothing = Places.upright(np.zeros((0, dimension)))
-    points, weights = _weighed(surface, nothing, room.solids, layers, lattice)
+    nothing = _even_points(NoContainer(), dimension, layers, lattice.spacing)
+    container = ContainerWalls(nothing, (), room, lattice.spacing, lattice.support)
+    surface = ExposedSurface.of(container, room.images(solid), begins)
+    beside, kept = Places.upright(nothing.positions), Walls.of(nothing, nothing.flat, False)
+    points, weights = _weighed(surface, beside, kept, layers, lattice)
     frame = np.eye(dimension) if filled.any() else turn
     placed = replace(points, positions=table.middle() + points.positions @ frame.T, feet=points.feet @ frame.T)
-    found = Walls.of(placed, weights, np.full(len(points), table.sticks))
+    found = Walls.of(placed, weights, table.sticks)
     slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
     return replace(found, slides=slides, solid=np.full(len(points), number))
 
 
 def _weighed(
-    surface: ExposedSurface, beside: Places, solids: Sequence[Solid], layers: WallLayers, lattice: RestLattice
+    surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
 ) -> tuple[WallPoints, Points]:
-    """Wall particles beneath a surface, and their weights, by places ``beside`` and those about solids."""
+    """Wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside`` and
+    those about solids."""
     room, spacing, reach = surface.room, lattice.spacing, lattice.support
     points = surface.walls(layers, Planes(lattice.kernel, spacing, reach, room.dimension))
-    about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in solids)])
+    about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
     places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
-    sought = WallSurface(points.positions, points.flat, lattice, room, surface.lower, room.periods, uneven_changes)
-    return points, sought.weights(places)
+    walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
+    known = len(kept.weights)
+    all_walls = WallSurface(walls, flat, lattice, room, surface.lower, room.periods, uneven_changes, known)
+    return points, all_walls.weights(places)[: len(points)]

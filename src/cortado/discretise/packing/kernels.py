@@ -89,7 +89,6 @@ class PackingKernels:
     """See `packing_kernels`."""
 
     look_around: Any
-    count_pairs: Any
     linearise: Any
     multiply: Any
     multiply_back: Any
@@ -151,7 +150,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         sums[i] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def count_pairs(
+    def linearise(
         around: Around,
         free: wp.array(dtype=wp.bool),
         starts: wp.array(dtype=wp.int32),
@@ -160,53 +159,18 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         close: real,
         # in and out
         sums: wp.array(dtype=real),
+        equations: Equations,
         # out
-        counts: wp.array(dtype=wp.int32),
-        close_counts: wp.array(dtype=wp.int32),
+        distances: wp.array(dtype=real),
     ):
-        """Adds up the weighted kernels of what is ``listed`` between ``starts`` and ``ends``; how many of the pairs
-        with one that is free are within the support, and how many are nearer than ``close`` [m]."""
+        """Adds up the weighted kernels of what is ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
+        particles before it, each particle appends its own to the equations, if one of them is free; and how far apart
+        those are that are nearer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)
         x_i = around.x[i]
         total = real(0.0)
-        count = int(0)
-        close_count = int(0)
-        for k in range(starts[i], ends[i]):
-            j = listed[k]
-            x_ij = separation(x_i, around.x[j], around)
-            square = wp.length_sq(x_ij)
-            if square < limit:
-                w = around.weights[j] * weight(x_ij, around.per_support, around.normalisation)
-                total += w
-                if j < particles:
-                    sums[j] = sums[j] + w
-                    if free[i] or free[j]:
-                        count += 1
-                        if square < close * close:
-                            close_count += 1
-        sums[i] = sums[i] + total
-        counts[i] = count
-        close_counts[i] = close_count
-
-    @wp.kernel(module=module, enable_backward=False)
-    def linearise(
-        around: Around,
-        free: wp.array(dtype=wp.bool),
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        listed: wp.array(dtype=wp.int32),
-        close: real,
-        # out
-        equations: Equations,
-        distances: wp.array(dtype=real),
-    ):
-        """The derivatives, and how far apart pairs are that are too near [m]."""
-        i = wp.tid()
-        particles = free.shape[0]
-        limit = real(1.0) / (around.per_support * around.per_support)
-        x_i = around.x[i]
         own = vector()
         place = equations.starts[i]
         close_place = equations.close_starts[i]
@@ -215,19 +179,26 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
             x_ij = separation(x_i, around.x[j], around)
             square = wp.length_sq(x_ij)
             if square < limit:
+                w = around.weights[j] * weight(x_ij, around.per_support, around.normalisation)
+                total += w
                 g = (around.weights[j] * slope(x_ij, around.per_support, around.normalisation)) * x_ij
                 if j >= particles:
                     own += g
-                elif free[i] or free[j]:
-                    equations.others[place] = j
-                    equations.gradients[place] = g
-                    place += 1
-                    if square < close * close:
-                        equations.close_others[close_place] = j
-                        equations.directions[close_place] = wp.normalize(x_ij)  # 0 where both are at one place
-                        distances[close_place] = wp.length(x_ij)
-                        close_place += 1
+                else:
+                    sums[j] = sums[j] + w
+                    if free[i] or free[j]:
+                        equations.others[place] = j
+                        equations.gradients[place] = g
+                        place += 1
+                        if square < close * close:
+                            equations.close_others[close_place] = j
+                            equations.directions[close_place] = wp.normalize(x_ij)  # 0 where both are at one place
+                            distances[close_place] = wp.length(x_ij)
+                            close_place += 1
+        sums[i] = sums[i] + total
         equations.own[i] = own
+        equations.starts[i + 1] = place
+        equations.close_starts[i + 1] = close_place
 
     @wp.kernel(module=module, enable_backward=False)
     def multiply(
@@ -273,4 +244,4 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
             moves[equations.close_others[k]] = moves[equations.close_others[k]] - both
         moves[i] = moves[i] + move
 
-    return PackingKernels(look_around, count_pairs, linearise, multiply, multiply_back)
+    return PackingKernels(look_around, linearise, multiply, multiply_back)

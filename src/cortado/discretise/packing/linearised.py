@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.cpu_launches import launched, shared
-from cortado.discretise.packing.around import PointsAround, Which, starts_of
+from cortado.discretise.packing.around import PointsAround, Which
 from cortado.discretise.shapes import Points
 
 
@@ -44,28 +45,26 @@ class ListedPairs:
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         """Those that stay (n,) do not see air; pairs of which neither is ``free`` (n,) have no derivatives."""
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
-        self._around, self._count = around, len(free)
+        self._around, self._count, self._most = around, len(free), int((ends - starts).sum())
         self._given = {"free": free, "starts": starts, "ends": ends, "listed": listed}
 
     def linearised(self, close: float) -> Linearised:
         """The derivatives where the particles are now, and those of distances that are less than ``close`` [m]."""
-        kernels, count = self._around.kernels, self._count
-        given = {"around": self._around.on_cpu, "close": close, **self._given}
-        sums = np.full(count, self._around.own_weight)
-        counts, close_counts = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
-        launched(kernels.count_pairs, count, sums=sums, counts=counts, close_counts=close_counts, **given)
-        starts, close_starts = starts_of(counts), starts_of(close_counts)
-        arrays = {
-            "starts": starts,
-            "others": np.empty(starts[-1], dtype=np.int32),
-            "gradients": np.empty((starts[-1], 3)),
+        kernels, count, most = self._around.kernels, self._count, self._most
+        sums, distances = np.full(count, self._around.own_weight), np.empty(most)
+        close_starts = np.zeros(count + 1, dtype=np.int32)
+        arrays: dict[str, NDArray[Any]] = {
+            "starts": np.zeros(count + 1, dtype=np.int32),
+            "others": np.empty(most, dtype=np.int32),
+            "gradients": np.empty((most, 3)),
             "own": np.empty((count, 3)),
             "close_starts": close_starts,
-            "close_others": np.empty(close_starts[-1], dtype=np.int32),
-            "directions": np.empty((close_starts[-1], 3)),
+            "close_others": np.empty(most, dtype=np.int32),
+            "directions": np.empty((most, 3)),
         }
-        equations, distances = kernels.equations(), np.empty(close_starts[-1])
+        equations = kernels.equations()
         for name, array in arrays.items():
             setattr(equations, name, shared(array))
-        launched(kernels.linearise, count, equations=equations, distances=distances, **given)
-        return Linearised(kernels, equations, sums, distances)
+        given = {"around": self._around.on_cpu, "close": close, **self._given}
+        launched(kernels.linearise, count, sums=sums, equations=equations, distances=distances, **given)
+        return Linearised(kernels, equations, sums, distances[: close_starts[-1]])

@@ -18,7 +18,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.walls.weights import RestLattice
 from cortado.files.terminal import timed_note
 
-MOST_LOOKS, MOST_ROUNDS = 4, 36
+MOST_LOOKS, MOST_ROUNDS = 12, 36
 """How often it is looked at all particles; rounds of least squares after each look."""
 ROUND_OFF = 1e-9
 """By how much, relative, particles of a lattice may be further away than they are."""

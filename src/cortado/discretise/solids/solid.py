@@ -1,4 +1,5 @@
-"""What a solid is to the discretisation: signed distances, nearest points and faces of its surface, in float64."""
+"""What a solid is to the discretisation: signed distances, nearest points and faces of its surface, in float64; and
+solids made of others."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -7,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Points, across
-from cortado.discretise.solids.faces import Faces, arc, box_faces, cut_box_faces, polygon_faces, revolved_faces
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.faces import Faces
 
 Which = NDArray[np.bool_]
 
@@ -132,141 +133,6 @@ class Union(Solid):
 
 
 @dataclass(frozen=True)
-class Box(Solid):
-    """A box about the origin, along the axes."""
-
-    half: Points
-    """(d,) half of its sides [m]"""
-
-    def extent(self) -> tuple[Points, Points]:
-        return -self.half, self.half
-
-    def distance(self, points: Points) -> Points:
-        beyond = np.abs(points) - self.half
-        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
-
-    def nearest(self, points: Points) -> Points:
-        found = np.clip(points, -self.half, self.half)
-        beyond = np.abs(points) - self.half
-        inside = np.flatnonzero((beyond < 0.0).all(axis=1))
-        axis = np.argmax(beyond[inside], axis=1)
-        found[inside, axis] = np.where(points[inside, axis] < 0.0, -self.half[axis], self.half[axis])
-        return found
-
-    def faces(self, fine: float) -> Faces:
-        return box_faces(self.half)
-
-
-@dataclass(frozen=True)
-class Round(Solid):
-    """All points no further than a radius from a segment about the origin: a capsule, or a sphere (in 2-D a disc) where
-    the segment has no length."""
-
-    half: Points
-    """(d,) from the middle of the segment to its end [m]"""
-    radius: float
-    """[m]"""
-
-    def extent(self) -> tuple[Points, Points]:
-        reach = np.abs(self.half) + self.radius
-        return -reach, reach
-
-    def distance(self, points: Points) -> Points:
-        return np.asarray(np.linalg.norm(points - self._within(points), axis=1) - self.radius)
-
-    def nearest(self, points: Points) -> Points:
-        within = self._within(points)
-        away = points - within
-        length = np.linalg.norm(away, axis=1, keepdims=True)
-        sideways = np.eye(points.shape[1])[np.argmin(np.abs(self.half))]
-        return np.asarray(within + self.radius * np.where(length > 0.0, away / np.maximum(length, 1e-300), sideways))
-
-    def faces(self, fine: float) -> Faces:
-        length = float(np.linalg.norm(self.half))
-        above = arc(np.array([0.0, length]), self.radius, 0.0, np.pi, fine)
-        profile = polygon_faces(np.concatenate([above, -above]))
-        along = self.half / length if length > 0.0 else np.eye(len(self.half))[-1]
-        flat = len(self.half) == 2
-        upright = profile if flat else revolved_faces(profile, 2, fine)
-        return upright.moved(_standing(along), np.zeros(len(along)))
-
-    def _within(self, points: Points) -> Points:
-        """(n, d) the nearest points of the segment."""
-        square = float(self.half @ self.half)
-        along = np.clip(points @ self.half / square, -1.0, 1.0) if square > 0.0 else np.zeros(len(points))
-        return np.asarray(along[:, None] * self.half)
-
-
-@dataclass(frozen=True)
-class Revolved(Solid):
-    """A solid of revolution about an axis of space through the origin."""
-
-    profile: Solid
-    """Its cut with a plane through the axis, in 2-D: across the axis, to both sides, and along it."""
-    axis: int
-
-    def extent(self) -> tuple[Points, Points]:
-        lower, upper = self.profile.extent()
-        along = np.arange(3) == self.axis
-        return np.where(along, lower[1], -upper[0]), np.where(along, upper[1], upper[0])
-
-    def distance(self, points: Points) -> Points:
-        return self.profile.distance(self._flat(points))
-
-    def nearest(self, points: Points) -> Points:
-        flat = self._flat(points)
-        found = self.profile.nearest(flat)
-        across = np.delete(points, self.axis, axis=1)
-        away = np.where(flat[:, :1] > 0.0, across / np.maximum(flat[:, :1], 1e-300), np.array([1.0, 0.0]))
-        return np.insert(found[:, :1] * away, self.axis, found[:, 1], axis=1)
-
-    def faces(self, fine: float) -> Faces:
-        return revolved_faces(self.profile.faces(fine), self.axis, fine)
-
-    def _flat(self, points: Points) -> Points:
-        """(n, 2) distance from the axis, and height [m]."""
-        across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
-        return np.column_stack([across, points[:, self.axis]])
-
-
-@dataclass(frozen=True)
-class HalfSpace(Solid):
-    """All that is below a plane, as far as a box shows it."""
-
-    normal: Points
-    """(d,) unit vector upwards"""
-    height: float
-    """Of the plane along it [m]."""
-    lower: Points
-    """(d,) [m]"""
-    upper: Points
-    """(d,) [m]"""
-
-    @property
-    def is_bounded(self) -> bool:
-        return False
-
-    def extent(self) -> tuple[Points, Points]:
-        return self.lower, self.upper
-
-    def distance(self, points: Points) -> Points:
-        return np.asarray(points @ self.normal - self.height)
-
-    def nearest(self, points: Points) -> Points:
-        return np.asarray(points - self.distance(points)[:, None] * self.normal)
-
-    def faces(self, fine: float) -> Faces:
-        size = float(np.linalg.norm(self.upper - self.lower))
-        middle = 0.5 * (self.lower + self.upper)
-        top = middle - (middle @ self.normal - self.height) * self.normal
-        return box_faces(np.full(len(middle), size)).moved(_standing(self.normal), top - size * self.normal)
-
-    def shown_faces(self, fine: float) -> Faces:
-        return cut_box_faces(self.lower, self.upper, self.normal, self.height)
-
-
-@dataclass(frozen=True)
 class Hollow(Solid):
     """All of space but a shape: a tank with walls of any thickness."""
 
@@ -294,49 +160,3 @@ class Hollow(Solid):
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
         found = self.cavity.own_feet(fine)
         return None if found is None else (found[0], -found[1])
-
-
-@dataclass(frozen=True)
-class Polygon(Solid):
-    """A polygon in 2-D, whose sides do not cross."""
-
-    corners: Points
-    """(m, 2) [m], either way round"""
-
-    def extent(self) -> tuple[Points, Points]:
-        return self.corners.min(axis=0), self.corners.max(axis=0)
-
-    def distance(self, points: Points) -> Points:
-        away = np.linalg.norm(points - self.nearest(points), axis=1)
-        return np.where(self._holds(points), -away, away)
-
-    def nearest(self, points: Points) -> Points:
-        best, found = np.full(len(points), np.inf), np.empty_like(points)
-        for first, last in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
-            side = last - first
-            along = np.clip((points - first) @ side / (side @ side), 0.0, 1.0)
-            place = first + along[:, None] * side
-            square = ((points - place) ** 2).sum(axis=1)
-            nearer = square < best
-            best, found[nearer] = np.minimum(best, square), place[nearer]
-        return found
-
-    def faces(self, fine: float) -> Faces:
-        return polygon_faces(self.corners)
-
-    def _holds(self, points: Points) -> Which:
-        """(n,) by the number of sides that a ray along the first axis crosses."""
-        inside = np.zeros(len(points), dtype=bool)
-        for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
-            if y_0 == y_1:
-                continue
-            spans = (y_0 > points[:, 1]) != (y_1 > points[:, 1])
-            inside ^= spans & (points[:, 0] < x_0 + (points[:, 1] - y_0) * (x_1 - x_0) / (y_1 - y_0))
-        return inside
-
-
-def _standing(direction: Points) -> Points:
-    """(d, d) the rotation matrix that turns the last axis to a unit vector (d,)."""
-    frame = np.stack([*across(direction), direction], axis=1)
-    frame[:, 0] *= np.linalg.det(frame)
-    return frame

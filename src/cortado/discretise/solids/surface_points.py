@@ -84,13 +84,17 @@ def _normals(solid: Solid, feet: Points, spacing: float) -> Points:
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300))
 
 
-def surface_feet(solid: Solid, fine: float) -> tuple[Points, Points]:
+def _everywhere(points: Points, furthest: float) -> Which:
+    return np.ones(len(points), dtype=bool)
+
+
+def surface_feet(solid: Solid, fine: float, is_near: Near = _everywhere) -> tuple[Points, Points]:
     """Points of the surface (n, d) [m], some ``fine`` [m] apart, each with as much of its area, and unit vectors (n, d)
-    away from the solid."""
+    away from the solid; of a surface that a lattice finds those alone that are near something."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
-    near = _near(solid, fine, fine)
+    near = _near(solid, fine, fine, is_near)
     near = near[np.abs(solid.distance(near)) < 0.5 * fine]  # a band of this thickness has fine^d / fine for each point
     feet, away = solid.nearest(near), solid.outward(near)
     on_it = np.linalg.norm(near - feet, axis=1) < 1e-3 * fine  # too near to tell where out is
@@ -125,12 +129,14 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
     return found
 
 
-def _near(solid: Solid, fine: float, reach: float) -> Points:
-    """(n, d) points of a lattice less than ``reach`` [m] from the surface."""
+def _near(solid: Solid, fine: float, reach: float, is_wanted: Near) -> Points:
+    """(n, d) points of a lattice less than ``reach`` [m] from the surface, where it is near what is wanted."""
     lower, upper = (np.asarray(end) for end in solid.extent())
 
     def is_near(points: Points, furthest: float) -> Which:
-        return np.asarray(np.abs(solid.distance_up_to(points, furthest)) < furthest)
+        found = np.abs(solid.distance_up_to(points, furthest)) < furthest
+        found[found] = is_wanted(points[found], furthest)
+        return np.asarray(found)
 
     found = [points[is_near(points, reach)] for points in lattice_about(lower, upper, reach, fine, is_near)]
     return np.concatenate([np.zeros((0, len(lower))), *found])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
+from cortado.discretise.solids.container_walls import ContainerWalls
 from cortado.discretise.solids.solid import Solid
 from cortado.discretise.solids.surface_points import (
     FINE,
@@ -19,6 +20,7 @@ from cortado.discretise.solids.surface_points import (
     surface_feet,
     surface_points,
 )
+from cortado.discretise.solids.wall_points import WallPoints
 from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
 
@@ -32,28 +34,9 @@ HALVINGS, ROUNDS, DIGITS = 12, 30, 4
 
 
 @dataclass(frozen=True)
-class WallPoints:
-    """Wall particles whose weights are not known yet."""
-
-    positions: Points
-    """(b, d) [m]"""
-    flat: Points
-    """(b,) what each would count for in the density if its wall were flat [-]"""
-    feet: Points
-    """(b, d) from each to the nearest point of its surface [m]"""
-
-    @classmethod
-    def joined(cls, parts: Sequence["WallPoints"]) -> "WallPoints":
-        """One behind the other."""
-        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in ("positions", "flat", "feet")))
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-
-@dataclass(frozen=True)
 class ExposedSurface:
-    """What fluid in a room can touch of solids that may touch each other, as fine points."""
+    """What fluid in a room can touch of solids, which may touch each other, and of the container near them, as fine
+    points."""
 
     feet: Points
     """(n, d) [m]"""
@@ -62,21 +45,32 @@ class ExposedSurface:
     owner: NDArray[np.int64]
     """(n,) whose they are: index into `solids`"""
     solids: Sequence[Solid]
-    room: Room
+    """First what closes the container."""
+    container: ContainerWalls
     lower: Points
     """(d,) where the period begins [m]"""
-    spacing: float
-    """Of particles; each point stands for a part of the surface that is a `FINE`th of it long and wide [m]."""
 
     @classmethod
-    def of(cls, room: Room, solids: Sequence[Solid], lower: Points, reach: float, spacing: float) -> "ExposedSurface":
-        """That of solids which close a room, up to ``reach`` [m] beyond the ends of a period that begins at ``lower``
-        (d,) [m]."""
-        found = [surface_feet(solid, spacing / FINE) for solid in solids]
+    def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
+        """That of solids, and of the container near them, up to a support beyond the ends of a period that begins at
+        ``lower`` (d,) [m]. Each point stands for a part of it that is a `FINE`th of a spacing long and wide."""
+        room, spacing, fine = container.room, container.spacing, container.spacing / FINE
+        found = [surface_feet(side, fine, container.is_near) for side in container.solids]
+        found += [surface_feet(solid, fine) for solid in solids]
         feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        owner = np.repeat(np.arange(len(solids)), [len(part) for part, _ in found])
-        free = _within_a_period(feet, lower, room.periods, reach) & _is_exposed(feet, away, room, spacing)
-        return cls(feet[free], away[free], owner[free], solids, room, lower, spacing)
+        owner = np.repeat(np.arange(len(found)), [len(part) for part, _ in found])
+        free = _within_a_period(feet, lower, room.periods, container.support) & _is_exposed(feet, away, room, spacing)
+        return cls(feet[free], away[free], owner[free], [*container.solids, *solids], container, lower)
+
+    @property
+    def room(self) -> Room:
+        """Where fluid may be."""
+        return self.container.room
+
+    @property
+    def spacing(self) -> float:
+        """Of particles [m]."""
+        return self.container.spacing
 
     @cached_property
     def _tree(self) -> Any:
@@ -105,9 +99,10 @@ class ExposedSurface:
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner."""
+        """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner, but
+        for where the container keeps its walls."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
-        points = points[_within_a_period(points, self.lower, self.room.periods, 0.0)]
+        points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
         areas = np.full(len(points), (self.spacing / FINE) ** (points.shape[1] - 1))
         found = evenly_chosen(points, areas, DENSITY * self.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
@@ -121,14 +116,14 @@ class ExposedSurface:
         def is_near(points: Points, furthest: float) -> NDArray[np.bool_]:
             beyond = furthest - depth - 0.5 * fine
             away = self._tree.query(points, distance_upper_bound=furthest)[0]
-            near = np.isfinite(away) & (away > depth - fine - beyond)
+            near = np.isfinite(away) & (away > depth - 0.5 * fine - beyond)
             near[near] = self.room.distance(points[near], beyond) > -beyond
             return near
 
         lower, upper = self.feet.min(axis=0), self.feet.max(axis=0)
         for points in lattice_about(lower, upper, depth + 0.5 * fine, fine, is_near):
             away, nearest = self._tree.query(points, distance_upper_bound=depth + fine)
-            beneath = np.isfinite(away) & (away > depth - fine)
+            beneath = np.isfinite(away) & (away > depth - 0.5 * fine)
             beneath[beneath] = self.room.distance(points[beneath], fine) > 0.0
             points = points[beneath]
             feet = self._feet_of(points, away[beneath], nearest[beneath])

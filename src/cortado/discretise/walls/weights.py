@@ -63,7 +63,8 @@ class RestLattice:
         offsets = lattice_offsets(self.spacing, self.support, dimension)
         cells = places.points[:, None] + offsets @ places.axes
         raised = places.points + RAISED * self.spacing * places.axes[:, 0]
-        empty = -room.distance(raised)  # the radius of a ball around each that nothing is in
+        furthest = (RAISED + 0.5) * self.spacing + self.support
+        empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
         open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * self.spacing
         shares = np.ones(open_cells.shape)
         shares[~open_cells] = room.cell_shares(cells[~open_cells], self.spacing)
@@ -79,7 +80,7 @@ class WallSurface:
     walls: Points
     """(b, d) wall particles [m]"""
     flat: Points
-    """(b,) their weights in a flat wall [-]"""
+    """(b,) their weights in a flat wall [-], or those that are known"""
     lattice: RestLattice
     """The lattice of the fluid at rest."""
     room: Room
@@ -90,6 +91,8 @@ class WallSurface:
     """(d,) the lengths of the period [m], 0 for axes without one"""
     fit: "Fit"
     """`even_changes`, or `uneven_changes` where particles are on no lattice."""
+    known: int = 0
+    """How many of the wall particles, the last ones, have weights that are known."""
 
     def weights(self, places: Places) -> Points:
         """(b,) [-] what wall particles count for in the density, a fluid particle being 1.
@@ -101,13 +104,17 @@ class WallSurface:
         """
         from scipy.sparse import vstack
 
-        if not len(self.walls) or not len(places.points):
+        sought, changes = len(self.walls) - self.known, np.zeros(len(self.walls))
+        if not sought or not len(places.points):
             return self.flat.copy()
         chunks = range(0, len(places.points), CHUNK)
         demands = [self._demands(places.some(slice(start, start + CHUNK))) for start in chunks]
         sums = vstack([part for part, _ in demands]).tocsr()
-        wanted = np.concatenate([part for _, part in demands])
-        return np.asarray(self.flat * (1.0 + self.fit(sums, wanted - sums.sum(axis=1))), dtype=np.float64)
+        left = np.concatenate([part for _, part in demands]) - sums.sum(axis=1)
+        own = sums[:, :sought]
+        seen = np.diff(own.indptr) > 0
+        changes[:sought] = self.fit(own[seen], left[seen])
+        return np.asarray(self.flat * (1.0 + changes), dtype=np.float64)
 
     def _demands(self, places: Places) -> tuple["csr_array", Points]:
         """A matrix (m, b) that gives, with the weights of the walls over their flat ones, what is wanted, (m,)."""
