@@ -1,5 +1,6 @@
 """The certificate: no false alarm, horizons that can be foreseen, and advice. What it catches: `test_plants`."""
 
+import itertools
 import json
 from dataclasses import replace
 from functools import cache
@@ -13,6 +14,7 @@ import cortado
 from cortado import InputError, Problem, Simulation, gradients, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.alignment import Alignment, Judged
+from cortado.certificate.consistency import balanced
 from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
@@ -402,3 +404,12 @@ def test_growth_is_in_e_folds():
     assert 0.0 < growth(flight, dt) < 0.5
     assert growth(np.zeros((steps + 1, 2)), dt) == 0.0
     assert growth(np.full((steps + 1, 2), np.inf), dt) == np.inf
+
+
+def test_wrong_signs_of_two_parameters_do_not_cancel():
+    right = {"x": np.array(3.0), "y": np.array(-0.5), "z": np.array(7.0)}
+    along = balanced(right, {name: np.array(1.0) for name in right})
+    changes = {name: float(right[name] * along[name]) for name in right}
+    assert all(0.5 <= abs(change) <= 1.0 for change in changes.values())
+    for one, other in itertools.combinations(right, 2):
+        assert abs(changes[one] + changes[other]) > 0.1 * abs(changes[one])

@@ -15,6 +15,8 @@ MODE_TOLERANCE = 1e-8
 """Relative distance at most of reverse mode from forward mode in float64; both are exact to round-off."""
 PLATEAU = 1e-3
 """Relative distance at most of the central differences of two successive steps h for them to count as converged."""
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""The parts of its multiples beyond whole numbers differ."""
 SLACK = 10.0
 """Distance at most of forward mode from a central difference, in units of the least distance of two successive ones."""
 RESOLUTION = 1e-6
@@ -119,18 +121,21 @@ class Consistency(ShortRepr):
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
-    """The directions scaled so that each parameter's changes the loss by as much as the weakest.
+    """The directions scaled so that each parameter's changes the loss by as much as the weakest, or up to twice that.
 
-    Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more.
+    Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more; and
+    as no two change it by the same, wrong signs of two of them do not cancel.
     """
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}
     finite = [change for change in changes.values() if np.isfinite(change)]
     strongest = max(finite, default=0.0)
     felt = [change for change in finite if change > FAINT * strongest]
-    return {
-        name: along * (min(felt) / changes[name] if changes[name] > FAINT * strongest else 1.0)
-        for name, along in directions.items()
-    }
+
+    def scale(k: int, name: str) -> float:
+        wanted = (1.0 + k * GOLDEN % 1.0) * min(felt, default=0.0)
+        return wanted / changes[name] if changes[name] > FAINT * strongest else 1.0
+
+    return {name: scale(k, name) * along for k, (name, along) in enumerate(directions.items())}
 
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays) -> Consistency:
