@@ -15,12 +15,12 @@ MODE_TOLERANCE = 1e-8
 """Relative distance at most of reverse mode from forward mode in float64; both are exact to round-off."""
 PLATEAU = 1e-3
 """Relative distance at most of the central differences of two successive steps h for them to count as converged."""
-GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""The parts of its multiples beyond whole numbers differ."""
 SLACK = 10.0
 """Distance at most of forward mode from a central difference, in units of the least distance of two successive ones."""
 RESOLUTION = 1e-6
 """Relative distance that is allowed in any case."""
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""The parts of its multiples beyond whole numbers differ."""
 FAINT = 1e-4
 """Parameters that change the loss by less than this part of what the strongest does are left out when the others are
 scaled down to the weakest (`balanced`)."""

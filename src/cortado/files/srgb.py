@@ -55,9 +55,8 @@ def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
         raise InputError("The image has values that are not finite; look where it was computed.")
     light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
     bounds, values = _steps(light.dtype)
-    found = values.take(
-        (light.dtype.type(STEPS) * light).astype(np.uint16), mode="clip"
-    )  # all are there, and unchecked
+    steps = (light.dtype.type(STEPS) * light).astype(np.uint16)
+    found = values.take(steps, mode="clip")  # all are there, and unchecked
     found += light >= bounds.take(found, mode="clip")  # at most one value begins within a step
     return found
 
