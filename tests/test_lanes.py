@@ -3,13 +3,17 @@
 What they compute is compared with one thread for each particle in `tests/test_gpu.py`.
 """
 
+import pickle
+
 import pytest
 import warp as wp
 
+from cortado import Simulation
 from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
+from cortado.errors import InputError
 from cortado.gradients.filter_kernels import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import fill_kernel
@@ -29,6 +33,7 @@ from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from cortado.sph.viscosity_law import newtonian_law
+from scenes import scene
 
 
 class Device:
@@ -44,6 +49,23 @@ def test_few_particles_get_many_lanes_and_a_cpu_has_one():
     assert found == sorted(found, reverse=True) and found[-1] == 1
     assert all(32 % lanes == 0 for lanes in found)
     assert {lanes_for(size, Device(is_cpu=True)) for size in sizes} == {1}
+
+
+def test_lanes_that_are_asked_for_are_had_on_a_gpu_alone():
+    assert lanes_for(100, Device(is_cpu=False), 2) == 2
+    assert lanes_for(100, Device(is_cpu=True), 2) == 1
+
+
+@pytest.mark.parametrize("lanes", [3, 0, 32, "four", 1.5, True])
+def test_a_wrong_number_of_lanes_is_a_sentence(lanes):
+    with pytest.raises(InputError, match=r"^lanes is .*, but must be .*[.]$"):
+        Simulation(scene(), lanes=lanes)
+
+
+def test_copies_have_the_same_lanes():
+    simulation = Simulation(scene(), lanes=4)
+    for copy in (pickle.loads(pickle.dumps(simulation)), simulation.batch_of(3), simulation.in_precision("float64")):
+        assert copy._lanes == 4
 
 
 def kernels_of(discretisation):

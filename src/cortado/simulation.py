@@ -15,6 +15,7 @@ from cortado.arrays import whole_number
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
+from cortado.device.lanes import checked_lanes
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
@@ -75,12 +76,14 @@ class Simulation(Stepping, Measuring, Picturing):
         batch: int | None = None,
         forces: Sequence[ForceMaker] = (),
         solver: SolverMaker | None = None,
+        lanes: int | None = None,
     ):
         """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
         "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
         one launch, each with parameters of its own; see `docs/batches.md`. ``forces``: forces of one's own, such as
         `cortado.forces.Body`, which act besides the scene's; ``solver``: what makes a solver of one's own, instead of
-        the one that the scene names; see `docs/own_parts.md`."""
+        the one that the scene names; see `docs/own_parts.md`. ``lanes``: threads of a GPU that share a particle, by
+        default as many as are fastest for a scene of this size that runs alone; see `docs/batches.md`."""
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
@@ -95,7 +98,7 @@ class Simulation(Stepping, Measuring, Picturing):
         self._maker = self._given[1] or solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """What makes the solver, if it is not Cortado's own."""
-        self._called = called(scene.solver, self._given[1])
+        self._called, self._lanes = called(scene.solver, self._given[1]), checked_lanes(lanes)
         self.known = known_of(self.forces, self._maker, scene.solid)
         """Its parameters."""
         self.device = device_named(device)
@@ -137,7 +140,7 @@ class Simulation(Stepping, Measuring, Picturing):
 
     def _built(self, discrete: DiscreteScene) -> Solver:
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
-        return built(self._maker, SolverSetting(*own, self._called))
+        return built(self._maker, SolverSetting(*own, self._called, self._lanes))
 
     @property
     def carried_by(self) -> str | None:
@@ -151,7 +154,7 @@ class Simulation(Stepping, Measuring, Picturing):
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
         """What a simulation of the same scene is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return self.scene, self.device.alias, precision, energy, batch, *self._given
+        return self.scene, self.device.alias, precision, energy, batch, *self._given, self._lanes
 
     def __repr__(self) -> str:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"

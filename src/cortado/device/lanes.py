@@ -14,7 +14,9 @@ from typing import Any
 
 import warp as wp
 
+from cortado.arrays import whole_number
 from cortado.device.precision import Precision
+from cortado.errors import InputError, shown
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
 """Up to so many particles a GPU gets so many lanes for each; beyond them one. Measured on an H200."""
@@ -57,11 +59,24 @@ def _called(function: Any) -> Iterator[Any]:
             yield from _called(value.func)
 
 
-def lanes_for(particles: int, device: Any) -> int:
-    """How many lanes a particle gets, for so many particles of one scene."""
+COUNTS = (1, 2, 4, 8, 16)
+"""Lanes that a particle can have."""
+
+
+def checked_lanes(lanes: Any) -> int | None:
+    """What a user gives as ``lanes``; raises `InputError`."""
+    if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
+        wanted = ", ".join(map(str, COUNTS))
+        raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
+    return None if lanes is None else int(lanes)
+
+
+def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
+    """How many lanes a particle gets on a device: as many as are ``wanted`` on a GPU, or as suits so many particles of
+    one scene."""
     if device.is_cpu:
         return 1
-    return next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
+    return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
 
 
 @dataclass(frozen=True)

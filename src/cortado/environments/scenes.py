@@ -23,6 +23,9 @@ from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.simulation import Simulation
 
+LANES = 1
+"""What is fastest for the large batches that environments are made for, and the same in small ones, so that a scene has
+the same bits in all."""
 SEEN = 32
 """Particles that are observed, if not said otherwise."""
 
@@ -51,7 +54,8 @@ class Scenes:
     ):
         """``seen``: how many particles are observed, at most all."""
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
-        self.task, self.simulation = task, Simulation(task.scene, device, precision, batch=scenes)
+        self.task = task
+        self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
         self.reward, self._stepper = task.reward(self.simulation), Stepper(self.simulation, task.substeps)
         self._first = self.simulation.on_device()
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles

@@ -54,7 +54,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     """A scene that is cut into particles, on a device, with the forces of the scene and those that it was given."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
-    lanes, moves = lanes_for(layout.particles, device), bool(moving(scene.solid))
+    lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
     search = _search(scene, discrete, shared, layout)
 

@@ -31,6 +31,9 @@ class SolverSetting:
     """The parameters of the simulation, those of these forces and of the solver among them."""
     called: str
     """What sentences call the solver."""
+    lanes: int | None = None
+    """How many of them a particle gets on a GPU, if not as many as suit a scene of its size: see
+    `cortado.device.lanes`."""
 
 
 class SolverMaker(Protocol):
