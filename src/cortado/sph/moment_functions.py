@@ -2,16 +2,21 @@
 and Lok 1999), and how full the neighbourhood is by it.
 
 With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M: 1 inside, about 0.6 at
-a flat surface, and 0 where neighbours lie on a line or are missing.
+a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are nothing but rounding:
+`ROUNDING` (tr M)^2 is added to I_2, so that H is 0 there in float32 too.
 """
 
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
+
+ROUNDING = 64.0
+"""How much that is, in units of the last place of 1."""
 
 
 @cache
@@ -86,6 +91,7 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
     """Of a precision in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
+    rounding = wp.constant(real(ROUNDING * float(np.finfo(precision.numpy).eps) * (dimension == 3)))
 
     @wp.func
     def change(diagonal: vector, others: vector) -> matrix:
@@ -102,8 +108,8 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
         """tiny covers particles without neighbours, where H is 0."""
         product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
         I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
-        I_3 = wp.determinant(M)
-        return (real(3.0) - plane) * I_3 / (I_2 - plane * I_3 + tiny)
+        I_3, trace = wp.determinant(M), wp.trace(M)
+        return (real(3.0) - plane) * I_3 / (I_2 - plane * I_3 + rounding * trace * trace + tiny)
 
     @wp.func
     def inverse(M: matrix) -> matrix:
