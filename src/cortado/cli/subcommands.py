@@ -24,6 +24,7 @@ from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.many_runs import convergence, dataset, sweep
 from cortado.cli.parsing import Program, completion_script
+from cortado.cli.show_commands import export, picture, view
 from cortado.errors import InputError
 
 app = SubcommandApp()
@@ -220,81 +221,8 @@ def fit(
     return partial(fit_task, task, out, words, device, precision, overwrite, told)
 
 
-@command(app)
-def picture(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
-    frame: int = -1,
-    film: Flag = False,
-    lines: int | None = None,
-    camera: str | None = None,
-    colour: str | None = None,
-    out: Path | None = None,
-    overrides: Overrides = (),
-    device: Device = "cpu",
-) -> Work:
-    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
-
-    Args:
-        run: The folder of the run.
-        frame: Number of a recorded frame, counted from the end where it is negative.
-        film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
-        lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
-        camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
-        colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
-        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
-    """
-    from cortado.cli.commands.picture import camera_override, draw_run, picture_settings
-
-    replaced, settings = camera_override(camera) + as_text(overrides), picture_settings(lines, colour)
-    return partial(draw_run, run, frame, film, out, replaced, device, settings)
-
-
-@command(app)
-def export(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
-    to: Literal["usd", "glb", "ply", "obj", "vtp"],
-    out: Path | None = None,
-    every: int = 1,
-    overrides: Overrides = (),
-) -> Work:
-    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
-
-    Args:
-        run: The folder of the run.
-        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
-        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
-        every: Frames of the run from one that is written to the next.
-        overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
-    """
-    require_at_least(1, every, "--every")
-    from cortado.cli.commands.export import export_run
-
-    return partial(export_run, run, to, out, every, as_text(overrides))
-
-
-@command(app)
-def view(
-    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: str = "float32",
-    port: int = 8080,
-) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
-    a button for its next step; Ctrl-C ends it.
-
-    Args:
-        path: The folder of a run, a scene file, or a task file.
-        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        precision: "float32" or "float64", of a scene or a task that runs.
-        port: Of the page on this machine; the next one that is free if it is taken.
-    """
-    from cortado.cli.commands.view import view as show
-
-    return partial(show, path, as_text(overrides), device, precision, port)
-
-
+for show in (picture, export, view):
+    command(app)(show)
 command(app)(sweep)
 command(app, answers=True)(convergence)
 command(app)(dataset)
