@@ -268,23 +268,13 @@ def test_contrast_is_found_between_neighbours_alone():
     assert 0 < wanted.sum() < 35
 
 
-class _Shades:
-    """A painter of states that are pictures."""
-
-    def image(self, picture, _):
-        return picture
-
-    def images(self, states):
-        return (picture for picture, _ in states)
-
-
 def page_of(picture, fingerprint=""):
     """A page that shows what a function returns for the number of a frame."""
-    return Page(_Shades(), [lambda k: (picture(k), None)], fingerprint=fingerprint)
+    return Page([picture], fingerprint=fingerprint)
 
 
-def test_a_page_shows_its_states_side_by_side():
-    page = Page(_Shades(), [lambda k: (k, None), lambda k: (10 * k, None)], tuple)
+def test_a_page_shows_its_panels_side_by_side():
+    page = Page([lambda k: k, lambda k: 10 * k], tuple)
     assert page.image(3) == (3, 30)
     assert list(page.images([1, 2])) == [(1, 10), (2, 20)]
 

@@ -11,7 +11,7 @@ from cortado.cli.command import Work
 
 
 def picture(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
     frame: int = -1,
     film: Flag = False,
     lines: int | None = None,
@@ -21,22 +21,23 @@ def picture(
     overrides: Overrides = (),
     device: Device = "cpu",
 ) -> Work:
-    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
+    """Draw a shaded picture, or a film, of a run that `cortado run` wrote, or of several side by side.
 
     Args:
-        run: The folder of the run.
+        runs: Folders of up to nine runs, or of a sweep of them.
         frame: Number of a recorded frame, counted from the end where it is negative.
         film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
         lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
         camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
         colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
+        out: Where to write it, a film as .mp4 or, for pages of text, as .webp; if left out into the run's figures, of
+            several runs beside their folders.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
-    from cortado.cli.commands.picture import camera_override, draw_run, picture_settings
+    from cortado.cli.commands.picture import camera_override, draw_runs, picture_settings
 
     replaced, settings = camera_override(camera) + as_text(overrides), picture_settings(lines, colour)
-    return partial(draw_run, run, frame, film, out, replaced, device, settings)
+    return partial(draw_runs, runs, frame, film, out, replaced, device, settings)
 
 
 def export(

@@ -40,7 +40,7 @@ class Showing:
         own = cast("Trajectory", self)
         if k not in range(-len(own), len(own)):
             raise InputError(f"k is {shown(k)}, but must be the number of one of {len(own)} frames, such as 0 or -1.")
-        page = page_of(own, self._scene(scene), _device(device), settings)
+        page = page_of(own, self._scene(scene), device_of(device), settings)
         return ShadedPicture.of(page.image(k % len(own)))
 
     def film(
@@ -62,7 +62,7 @@ class Showing:
         """
         from cortado.runs.drawing import film_of
 
-        return film_of(cast("Trajectory", self), self._scene(scene), path, _device(device), settings)
+        return film_of(cast("Trajectory", self), self._scene(scene), path, device_of(device), settings)
 
     def _repr_html_(self) -> str:
         """In motion, with y up; and its first, middle and last frame, coloured by speed."""
@@ -88,7 +88,7 @@ class Showing:
         return found
 
 
-def _device(name: str) -> Any:
+def device_of(name: str) -> Any:
     """Warp's device of that name; raises `InputError` where there is none."""
     start_warp()
     return device_named(name)

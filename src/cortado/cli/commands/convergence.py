@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.commands.compare import SAME_TIME, differences
+from cortado.cli.commands.compare import SAME_TIME
+from cortado.cli.commands.named_runs import named_runs
 from cortado.errors import InputError
 from cortado.optimisation.sweep.richardson import Extrapolation
+from cortado.runs.differences import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
@@ -67,7 +69,7 @@ class Resolved:
 
 def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
     """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
-    runs = [Resolved.read(folder) for folder in _opened(folders)]
+    runs = [Resolved.read(folder) for folder in named_runs(folders)]
     if len(runs) < LEAST:
         raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST}.")
     key = _varied(runs)
@@ -100,15 +102,6 @@ def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
         "rows": rows,
     }
     return json.dumps(table, indent=2) if as_json else _as_text(table)
-
-
-def _opened(folders: Sequence[Path]) -> list[RunFolder]:
-    """The runs that are meant, in each folder of a sweep all of them."""
-    found: list[RunFolder] = []
-    for folder in folders:
-        inner = sorted(one.parent for one in folder.glob("*/environment.json"))
-        found += [RunFolder.open(one) for one in inner or [folder]]
-    return found
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
