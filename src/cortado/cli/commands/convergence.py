@@ -16,6 +16,7 @@ from cortado.optimisation.sweep.richardson import Extrapolation
 from cortado.runs.differences import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
+from cortado.runs.sensors.summary import summary
 from cortado.runs.trajectory import Trajectory
 
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
@@ -47,14 +48,11 @@ class Resolved:
         masses = last.constants["reference_density"].astype(np.float64)
         centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
         numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}
-        for name, read in folder.read_sensors().items():
-            for column, unit in read.units.items():
-                values, times = read[column], read.times
-                mean = np.trapezoid(values, times) / (times[-1] - times[0])
-                numbers |= {
-                    f"{name} {column}": (unit, float(values[-1])),
-                    f"{name} {column}, mean": (unit, float(mean)),
-                }
+        readings = folder.read_sensors()
+        for name, columns in summary(readings).items():
+            for column, found in columns.items():
+                unit = readings[name].units[column]
+                numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
         precision = read_json(folder.environment).get("settings", {}).get("precision", "")
         return cls(folder.path, read_json(folder.scene), precision, float(last.times[0]), numbers)
 
