@@ -15,8 +15,9 @@ from cortado.cli.arguments import (
     Precision,
     Scene,
     as_text,
+    check_frames,
     command_line,
-    require_at_least,
+    frames_asked_for,
     require_toml,
     steps_or_time,
 )
@@ -68,26 +69,36 @@ def examples(
 @command(app, answers=True)
 def describe(
     scene: Scene,
-    steps: int = 200,
+    steps: int | None = None,
+    time: float | None = None,
+    record_every: int | None = None,
+    fps: float | None = None,
     picture: Path | None = None,
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: Precision = "float32",
     json: Json = False,
 ) -> Work:
-    """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
+    """Describe a scene before it is run: its particles, what limits its time step, its memory, and of a run how long it
+    takes, how large it is on disk, and how long its film is.
 
     Args:
         scene: The scene file, or a task file.
-        steps: Number of time steps that it shall run.
+        steps: Number of time steps that it shall run; 200 if neither they nor a time are given.
+        time: Seconds that it shall simulate, in the place of steps.
+        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
+        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
         picture: Draw its first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
+    check_frames(record_every, fps)
+    steps = steps_or_time(steps, time)
     words = as_text(overrides)
     require_toml(scene, words)
     from cortado.cli.commands.describe import describe_scene
 
-    return partial(describe_scene, scene, steps, words, device, precision, picture, json)
+    frames = frames_asked_for(record_every, fps)
+    return partial(describe_scene, scene, steps, time, frames, words, device, precision, picture, json)
 
 
 @command(app)
@@ -125,16 +136,13 @@ def run(
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
-    if fps is not None and record_every is not None:
-        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
-    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
+    check_frames(record_every, fps)
     steps = steps_or_time(steps, time)
     words, wanted, told = as_text(overrides), as_text(record), command_line()
     require_toml(scene, words)
     from cortado.cli.commands.run import RunRequest, run_scene
-    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 
-    frames = EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
+    frames = frames_asked_for(record_every, fps)
     asked = (steps, time, words, device, precision, frames, wanted, state, resume, overwrite, pictures, told)
     return partial(run_scene, scene, RunRequest(out, *asked))
 

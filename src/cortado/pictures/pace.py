@@ -67,10 +67,14 @@ class Pace:
             return "step by step"
         return "in real time" if self.speed == 1.0 else f"at {self.speed:g} x"
 
+    @property
+    def seconds(self) -> float:
+        """How long the film is [s]."""
+        return self.times[-1] + 1.0 / self.frames_per_second
+
     def __str__(self) -> str:
         left_out = self.recorded - len(self.frames)
-        seconds = f"{self.times[-1] + 1.0 / self.frames_per_second:.1f} s"
-        kept = f"{counted(len(self.frames), 'frame')}, {seconds}, {self.in_words}"
+        kept = f"{counted(len(self.frames), 'frame')}, {self.seconds:.1f} s, {self.in_words}"
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
         if self.speed is not None and 1 < len(self.frames) == self.recorded and self.frames_per_second < SMOOTH:
