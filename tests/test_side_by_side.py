@@ -155,6 +155,7 @@ def test_the_command_draws_the_runs_of_a_sweep(tmp_path, monkeypatch, cortado_co
         (("picture",), "RUN is missing"),
         (("picture", "all", "--frame", "9", "--lines", "144"), "--frame is 9, but together the runs have 3 frames"),
         (("picture", "all", "nothing"), "There is no run in"),
+        (("picture", "all", "--device", "tpu"), "device is 'tpu'"),
     ):
         code, _, error = cortado_command(*words)
         assert code == 2 and sentence in error

@@ -17,6 +17,7 @@ from cortado.runs.colouring import coloured_by
 from cortado.runs.differences import labels
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_page
+from cortado.runs.showing import device_of
 from cortado.runs.shown_run import ShownRun
 from cortado.runs.side_by_side import runs_page, shown_alike
 from cortado.runs.trajectory import Trajectory
@@ -54,18 +55,18 @@ def draw_runs(
     as_film: bool,
     out: Path | None,
     overrides: list[str],
-    device: str,
+    device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
     """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; of several runs
     side by side. Returns a sentence that says where it is."""
-    folders = named_runs(runs)
+    folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
     trajectories = [_trajectory(folder) for folder in folders]
     scenes = shown_alike([look, *others], trajectories, settings)
     each = [
-        ShownRun(scene, trajectory, coloured_by(scene, trajectory, partial(Simulation, scene, device)))
+        ShownRun(scene, trajectory, coloured_by(scene, trajectory, partial(Simulation, scene, device_name)))
         for scene, trajectory in zip(scenes, trajectories, strict=True)
     ]
     picture = scenes[0].picture or Picture()
