@@ -20,6 +20,7 @@ from cortado.runs.picture_settings import shown_as
 from cortado.runs.shown_run import ShownRun
 from cortado.runs.side_by_side import common_times, runs_page
 from cortado.scene.picture import Picture
+from cortado.scene.units import unit_of
 from scenes import plane, scene
 
 SMALL = {"width": 256, "height": 144}
@@ -45,13 +46,20 @@ def test_a_film_has_the_times_of_the_run_with_most_frames():
 def test_labels_tell_runs_apart_by_what_differs():
     first = plane()
     thick = first.replaced("phase.0.viscosity=2.0", "picture.width=640")
-    assert labels([first, thick], ["a", "b"]) == [f"viscosity = {first.phase[0].viscosity:g}", "viscosity = 2"]
+    assert labels([first, thick], ["a", "b"]) == ["viscosity = 0.05 Pa s", "viscosity = 2 Pa s"]
     both = labels([first, thick.replaced("solver.time_step=0.0005")], ["a", "b"])
-    assert both[1] == "viscosity = 2, time step = 0.0005"
+    assert both[1] == "viscosity = 2 Pa s, time step = 0.0005 s"
     assert labels([first, first], ["a", "b"]) == ["a", "b"]
     assert labels([first, thick.replaced("name='honey'")], ["a", "b"]) == [first.name, "honey"]
-    many = [f"{key}=0.123" for key in ("phase.0.viscosity", "phase.0.rest_density", "solver.time_step")]
-    assert labels([first, first.replaced(*many, "discretisation.spacing=0.03")], ["a", "b"]) == ["a", "b"]
+    many = ["phase.0.viscosity=1.0", "phase.0.rest_density=900.0", "solver.time_step=0.001", "forces.pressure=false"]
+    assert labels([first, first.replaced(*many)], ["a", "b"]) == ["a", "b"]
+    chosen = labels([first, first.replaced("solver.time_step='auto'")], ["a", "b"])
+    assert chosen == ["time step = 0.0021 s", "time step = auto"]
+
+
+def test_values_have_their_units():
+    keys = ("phase.0.viscosity", "container.upper", "solver.time_step", "forces.gravity", "name", "solver.kind", "a.b")
+    assert [unit_of(key) for key in keys] == ["Pa s", "m", "s", "m/s2", "", "", ""]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 from cortado.errors import shown
 from cortado.runs.run_files import computed
 from cortado.scene.scene import Scene
+from cortado.scene.units import unit_of
 
 _MISSING = "missing"
 MOST_KEYS, LONGEST = 3, 64
@@ -33,8 +34,8 @@ def _has_tables(values: list[Any]) -> bool:
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
     """What each of several scenes is called beside the others: its name if all names differ, or else the values in
-    which the scenes differ, such as ``viscosity = 0.1``. ``otherwise``: what they are called where no values differ, or
-    too many."""
+    which the scenes differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values
+    differ, or too many."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table)))
     short = [key.rpartition(".")[2] for key in keys]
@@ -57,6 +58,7 @@ def _value(table: Any, key: str) -> str:
             table = table[int(part)] if isinstance(table, list) else table[part]
         except (LookupError, TypeError, ValueError):
             return "none"
-    if isinstance(table, float):
-        return f"{table:g}"
-    return "none" if table is None else shown(table).strip("'\"")
+    if table is None or isinstance(table, str):
+        return table or "none"
+    text = f"{table:g}" if isinstance(table, float) else shown(table)
+    return f"{text} {unit_of(key)}".rstrip()
