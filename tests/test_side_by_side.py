@@ -15,10 +15,11 @@ from cortado.pictures.labels import labelled
 from cortado.pictures.page import Page
 from cortado.pictures.stage import Stage
 from cortado.runs.colouring import coloured_by
+from cortado.runs.common_clock import ShownFrames, common_times
 from cortado.runs.differences import labels
 from cortado.runs.picture_settings import shown_as
 from cortado.runs.shown_run import ShownRun
-from cortado.runs.side_by_side import common_times, runs_page
+from cortado.runs.side_by_side import runs_page
 from cortado.scene.picture import Picture
 from cortado.scene.units import unit_of
 from scenes import plane, scene
@@ -41,6 +42,16 @@ def test_a_film_has_the_times_of_the_run_with_most_frames():
     np.testing.assert_array_equal(common_times([fine, fine + 1e-9]), fine)
     np.testing.assert_array_equal(common_times([np.array([0.5])]), [0.5])
     np.testing.assert_array_equal(common_times([np.array([0.0]), coarse]), coarse)
+
+
+def test_the_nearest_frame_is_shown():
+    own, times = np.array([0.0, 0.1, 0.25, 0.3]), np.linspace(0.0, 0.4, 41)
+    shown = ShownFrames(own, times)
+    distances = np.abs(own[:, None] - times)
+    np.testing.assert_allclose(distances[shown.nearest, np.arange(41)], distances.min(axis=0), atol=1e-12)
+    assert shown.off == pytest.approx(0.07) and shown.during.sum() == 31
+    assert shown.time_in_words(8) == "0.10 s" and shown.time_in_words(40) == "stands still at 0.30 s"
+    assert ShownFrames(own + 0.2, times).notes("late")[0].startswith('"late" begins at 0.2 s')
 
 
 def test_labels_tell_runs_apart_by_what_differs():

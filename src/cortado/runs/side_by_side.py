@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from math import ceil, log10
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from cortado.pictures.pace import pace_of
 from cortado.pictures.page import Page, Panel
 from cortado.pictures.scale import Scale
 from cortado.runs.colouring import coloured_by
+from cortado.runs.common_clock import SAME, ShownFrames, common_times, interval_of
 from cortado.runs.differences import labels
 from cortado.runs.picture_settings import shown_as
 from cortado.runs.showing import device_of
@@ -28,9 +28,6 @@ from cortado.runs.shown_run import ShownRun
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
-
-SAME = 0.01
-"""Of the time between two frames: those that are apart by less are at the same time."""
 
 
 def film_side_by_side(
@@ -115,56 +112,27 @@ def shown_alike(
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
     """Runs of scenes that are `shown_alike`, each with its name and its time; and the times of its frames [s]."""
     times = common_times([run.trajectory.times for run in runs])
-    interval = _interval(times)
     stages, across = framed_together([run.stage for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     colour = (runs[0].scene.picture or Picture()).colour
     scale = Scale.of(colour, np.concatenate(values)) if values else None
-    panels, notes, off = list[Panel](), list[str](), 0.0
-    for run, name, stage in zip(runs, names, stages, strict=True):
-        own = run.trajectory.times
-        nearest = np.abs(own[:, None] - times).argmin(axis=0)
-        during = (times > own[0] - SAME * interval) & (times < own[-1] + SAME * interval)
-        off = max(off, float(np.abs(own[nearest] - times)[during].max(initial=0.0)))
-        told = [_time_in_words(float(own[k]), interval, is_on) for k, is_on in zip(nearest, during, strict=True)]
-        panels.append(_labelled(run.panel(stage, device, scale), nearest, name, told))
-        notes += [f'"{name}" ends at {own[-1]:.4g} s and stands still from then on'] if not during[-1] else []
-        notes += [f'"{name}" begins at {own[0]:.4g} s'] if not during[0] else []
-    if off > SAME * interval:
+    shown = [ShownFrames(run.trajectory.times, times) for run in runs]
+    panels = [
+        _labelled(run.panel(stage, device, scale), name, frames)
+        for run, stage, name, frames in zip(runs, stages, names, shown, strict=True)
+    ]
+    notes = [note for name, frames in zip(names, shown, strict=True) for note in frames.notes(name)]
+    off = max(frames.off for frames in shown)
+    if off > SAME * interval_of(times):
         notes.append(f"each run shows its recorded frame nearest in time, at most {off:.2g} s away")
     composed = partial(_composed, across, scale)
     told_apart = " ".join([*(run.fingerprint for run in runs), *names])
     return Page(panels, composed, told_apart, "; ".join(notes)), times
 
 
-def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """(frames,) [s] of a film of runs whose frames are at times (own frames,): those of the run with most frames in a
-    second, and before and after it those of others."""
-    found = np.zeros(0)
-    for times in sorted(each, key=lambda own: (_interval(own), -len(own))):
-        if not len(found):
-            found = np.asarray(times, dtype=np.float64)
-            continue
-        apart = 0.5 * _interval(times)
-        outside = (times < found[0] - apart) | (times > found[-1] + apart)
-        found = np.sort(np.concatenate([found, times[outside]]))
-    return found
-
-
-def _interval(times: NDArray[Any]) -> float:
-    """The usual time between two frames [s]; infinite with a single one."""
-    return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
-
-
-def _time_in_words(time: float, interval: float, is_on: bool) -> str:
-    """The time of the frame that is shown [s], with as many digits as tell frames apart."""
-    digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
-    return f"{time:.{digits}f} s" if is_on else f"stands still at {time:.{digits}f} s"
-
-
-def _labelled(panel: Panel, frames: NDArray[Any], name: str, told: Sequence[str]) -> Panel:
-    """The pictures of a panel, of which it shows the frames (frames of the page,), with a name and a time on them."""
-    return lambda k: labelled(panel(int(frames[k])), name, told[k])
+def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
+    """The pictures of a panel of the frames that are shown, with a name and a time on them."""
+    return lambda k: labelled(panel(int(shown.nearest[k])), name, shown.time_in_words(k))
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
