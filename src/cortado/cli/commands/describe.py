@@ -113,7 +113,8 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
         "device": str(simulation.device),
         "precision": simulation.precision.name,
     }
-    return {**found, **length.for_machines(), **_memory(simulation, length), **_expected(simulation, length.steps)}
+    steps = length.steps
+    return {**found, **length.for_machines(), **_memory(simulation, steps), **_expected(simulation, steps)}
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
@@ -159,9 +160,9 @@ def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
     }
 
 
-def _memory(simulation: Simulation, length: RunLength) -> dict[str, float | None]:
+def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
     """[bytes] of a run, and of a gradient."""
-    real, steps = simulation.precision.bytes, length.steps
+    real = simulation.precision.bytes
     if not isinstance(simulation.solver, ParticleSolver):
         return {"memory_bytes": None, "gradient_memory_bytes": None}
     rollout = Rollout(simulation.solver, 1)
@@ -205,7 +206,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
         ),
         ("time", _time(found, length)),
         ("trajectory", _trajectory(length)),
-        ("film", "none" if length.film is None else f"{length.film}; what it takes to draw it comes on top"),
+        ("film", _film(length)),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
     rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
@@ -246,6 +247,13 @@ def _trajectory(length: RunLength) -> str:
     return (
         f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says how many"
     )
+
+
+def _film(length: RunLength) -> str:
+    """What the film of the run shows, and how long it is."""
+    if length.film is not None:
+        return f"{length.film}; what it takes to draw it comes on top"
+    return "of unknown length; --time says it" if length.time is None else "none"
 
 
 def _duration(seconds: float) -> str:
