@@ -1,6 +1,7 @@
 """Shaded pictures of a solved task: before, after, target and the search in motion."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,8 @@ def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
     """That of films of states after so many steps."""
     if scene.solver.chooses:
         return Pace.unknown(len(steps))
-    return pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
+    pace = pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
+    return replace(pace, of_search=True)
 
 
 def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
