@@ -60,6 +60,14 @@ def test_a_table_of_time_steps(cortado_command):
 
 
 @pytest.mark.usefixtures("scene")
+def test_runs_with_unlike_amounts_of_fluid_are_warned_of(cortado_command):
+    sweep = ["sweep", "scene.toml", "--set", "discretisation.spacing=0.1,0.07,0.05", "--steps", 2, "--no-pictures"]
+    assert cortado_command(*sweep)[0] == 0
+    code, _, err = cortado_command("convergence", "runs/sweep")
+    assert code == 0 and "Warning: the runs do not have the same fluid: " in err and "with a spacing of 0.07 m" in err
+
+
+@pytest.mark.usefixtures("scene")
 def test_runs_that_do_not_belong_together_are_refused(cortado_command):
     run(cortado_command, "a", 0.002, steps=2)
     run(cortado_command, "b", 0.001)

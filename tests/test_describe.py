@@ -10,11 +10,14 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
+from cortado.cli.commands.run import RunRequest, run_scene
+from cortado.cli.commands.run_length import RunLength
 from cortado.cli.commands.run_summary import Energy, RunSummary
 from cortado.discretise.calibration import SLACK
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
+from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 from cortado.scene.stability import stability_limit, stability_limits
 from scenes import jet, plane, two_layers
 
@@ -43,6 +46,42 @@ def test_it_says_what_the_scene_has(capsys):
         and found["measured_steps"] >= 4
     )
     assert 0 < found["memory_bytes"] < found["gradient_memory_bytes"]
+
+
+@pytest.mark.parametrize(
+    "time, steps, choice",
+    [
+        (0.05, None, FramesPerSecond(100.0)),
+        (0.049, None, FramesPerSecond(100.0)),
+        (0.05, None, FramesPerSecond(5000.0)),
+        (None, 20, EverySteps(3)),
+        (None, 21, EverySteps(3)),
+    ],
+)
+def test_a_run_has_the_steps_and_the_frames_that_were_told(time, steps, choice):
+    told = RunLength.of(cortado.Simulation("scene.toml"), steps, time, choice)
+    run_scene(Path("scene.toml"), RunRequest(Path("run"), steps, time, frames=choice, report=False))
+    trajectory = cortado.Trajectory.load("run/trajectory.vtkhdf")
+    assert len(trajectory) == told.frames and len(trajectory.converged) == told.steps
+    assert trajectory.times[-1] == pytest.approx(told.time)
+    assert told.trajectory == pytest.approx(Path("run/trajectory.vtkhdf").stat().st_size, rel=0.2)
+
+
+def test_the_run_and_its_film_are_told(capsys):
+    main(["describe", "scene.toml", "--time", "1.05", "--set", "picture.film_speed=0.5"])
+    out = capsys.readouterr().out
+    assert "500 steps, 1.05 s of motion: about" in out and "film        127 frames, 2.1 s, at 0.5 x; 374 of" in out
+    none = cortado.Simulation(cortado.load_scene("scene.toml", ["picture.film_frames=0"]))
+    assert RunLength.of(none, 10, None, EverySteps(1)).film is None
+
+
+def test_steps_that_are_chosen_are_estimated():
+    simulation = cortado.Simulation(plane(solver={"time_step": "auto"}))
+    told, taken = RunLength.of(simulation, None, 0.2, EverySteps(1)), len(simulation.run(time=0.2).converged)
+    assert told.is_about and told.time == 0.2 and told.frames == told.steps + 1 and told.film is not None
+    assert 0.5 * taken < told.steps < 2.5 * taken
+    unknown = RunLength.of(simulation, 10, None, FramesPerSecond(50.0))
+    assert unknown.frames is unknown.trajectory is unknown.film is None and unknown.in_words == "10 steps"
 
 
 def test_memory_grows_with_what_is_kept(capsys):
@@ -89,6 +128,11 @@ def test_a_scene_that_does_not_bear_its_first_steps(capsys):
         (["absent.toml"], "cannot be read"),
         (["."], "cannot be read"),
         (["scene.toml", "--steps", "0"], "steps is 0"),
+        (["scene.toml", "--steps", "5", "--time", "1"], "--time is given, but must be left out"),
+        (["scene.toml", "--time", "nan"], "--time is nan"),
+        (["scene.toml", "--time", "1e30"], "must be less, as that takes about"),
+        (["scene.toml", "--fps", "-1"], "--fps is -1"),
+        (["scene.toml", "--record-every", "0"], "--record-every is 0"),
         (["scene.toml", "--device", "tpu"], "device is 'tpu'"),
         (["scene.toml", "--picture", "scene.toml/a.png"], "cannot be written"),
         (["scene.toml", "--picture", "."], "--picture is '.', but must be the name of a PNG file"),

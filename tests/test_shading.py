@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -268,23 +269,13 @@ def test_contrast_is_found_between_neighbours_alone():
     assert 0 < wanted.sum() < 35
 
 
-class _Shades:
-    """A painter of states that are pictures."""
-
-    def image(self, picture, _):
-        return picture
-
-    def images(self, states):
-        return (picture for picture, _ in states)
-
-
 def page_of(picture, fingerprint=""):
     """A page that shows what a function returns for the number of a frame."""
-    return Page(_Shades(), [lambda k: (picture(k), None)], fingerprint=fingerprint)
+    return Page([picture], fingerprint=fingerprint)
 
 
-def test_a_page_shows_its_states_side_by_side():
-    page = Page(_Shades(), [lambda k: (k, None), lambda k: (10 * k, None)], tuple)
+def test_a_page_shows_its_panels_side_by_side():
+    page = Page([lambda k: k, lambda k: 10 * k], tuple)
     assert page.image(3) == (3, 30)
     assert list(page.images([1, 2])) == [(1, 10), (2, 20)]
 
@@ -376,6 +367,15 @@ def test_a_film_shows_every_frame_in_real_time_or_as_slowly_as_it_says():
     assert len(short.frames) == 421 and short.speed == 0.05 and str(short) == "421 frames, 12.6 s, at 0.05 x"
     np.testing.assert_allclose(np.diff(short.times), 0.03)
     assert Pace.of(10.0 * np.arange(101)).speed == 50.0  # a frame every 10 s
+
+
+@pytest.mark.parametrize("span", [0.0063, 0.36, 1.0, 3.0, 100.0])
+def test_the_frames_that_a_film_says_are_enough(span):
+    few = Pace.of(np.linspace(0.0, span, 4))
+    more = Pace.of(np.linspace(0.0, span, round(few.enough * span) + 1))
+    assert more.frames_per_second == pytest.approx(25.0, rel=0.02) and "records" not in str(more)
+    frames = int(str(replace(few, of_search=True)).partition("film_frames=")[2].split()[0])
+    assert frames == pytest.approx(few.enough * span + 1.0, abs=0.6)
 
 
 def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
@@ -490,7 +490,7 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
     main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
     assert (
-        "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 5000 "
+        "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 16667 "
         in capsys.readouterr().out
     )
     main(["optimise", "task.toml", "--out", "b"])

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import cortado.cli.commands.sweep
@@ -23,6 +24,8 @@ from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
 from cortado.optimisation.sweep.combinations import combinations
 from cortado.optimisation.sweep.table import write_table
+from cortado.runs.sensors.log import Readings, from_csv
+from cortado.runs.sensors.summary import summary
 from cortado.runs.trajectory import Trajectory
 from dask_processes import PATIENCE, scheduler
 
@@ -136,6 +139,27 @@ def test_options_that_make_no_combinations_are_a_sentence(options, words):
         combinations(options)
     assert_one_sentence(str(caught.value))
     assert words in str(caught.value)
+
+
+def test_what_sensors_read_is_in_the_table(sweep):
+    text = TINY_SCENE + '[[sensor]]\nkind = "wall_force"\nname = "walls"\n'
+    Path("sensed.toml").write_text(text)
+    options = ("--set", "phase.0.viscosity=10,5", "--steps", "3", "--no-pictures", "--out", "sensed")
+    assert sweep("sensed.toml", *options)[0] == 0
+    for row in rows("sensed"):
+        read = from_csv(Path("sensed") / row["folder"] / "sensors.csv")["walls"]
+        found = {what: float(row[f"sensors.walls.force_y.{what}"]) for what in ("last", "mean", "greatest")}
+        assert found["last"] == read["force_y"][-1] and abs(found["greatest"]) == np.abs(read["force_y"]).max() > 0.0
+        assert found["mean"] == np.trapezoid(read["force_y"], read.times) / np.ptp(read.times)
+
+
+def test_the_greatest_reading_is_the_farthest_from_0():
+    values = np.array([[1.0, np.nan], [-4.0, 2.0], [3.0, 1.0]])
+    found = summary({"a": Readings(np.array([0.0, 1.0, 3.0]), values, {"x": "N", "y": "m"})})["a"]
+    assert found["x"] == {"last": 3.0, "mean": (-1.5 - 1.0) / 3.0, "greatest": -4.0}
+    assert found["y"]["last"] == 1.0 and np.isnan(found["y"]["mean"]) and found["y"]["greatest"] == 2.0
+    once = summary({"a": Readings(np.zeros(1), np.full((1, 1), 2.0), {"x": "N"})})["a"]["x"]
+    assert once == {"last": 2.0, "mean": 2.0, "greatest": 2.0}
 
 
 def test_the_table_keeps_the_order_whatever_has_ended(tmp_path):

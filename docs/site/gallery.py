@@ -50,7 +50,7 @@ class Entry:
         """Run the scene into a folder, and write the picture and the film into another."""
         from PIL import Image
 
-        from cortado.cli.commands.picture import draw_run
+        from cortado.cli.commands.picture import draw_runs
         from cortado.cli.commands.run import RunRequest, run_scene
         from cortado.runs.frame_choice import FramesPerSecond
         from cortado.runs.trajectory import Trajectory
@@ -60,9 +60,9 @@ class Entry:
         values = [*PICTURE, *fine, *self.values]
         asked = {"time": self.seconds * part, "overrides": values, "device": device, "frames": frames}
         run_scene(self.scene, RunRequest(run, **asked, report=False))
-        draw_run(run, -1, True, folder / f"{name}.webp", [], device, {})
+        draw_runs([run], -1, True, folder / f"{name}.webp", [], device, {})
         last = len(Trajectory.load(run / "trajectory.vtkhdf")) - 1
-        draw_run(run, round(self.still * last), False, run / "still.png", [], device, {})
+        draw_runs([run], round(self.still * last), False, run / "still.png", [], device, {})
         Image.open(run / "still.png").save(folder / f"{name}.jpg", quality=90)
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.problem import Problem as Problem
+    from cortado.runs.side_by_side import film_side_by_side as film_side_by_side
     from cortado.runs.trajectory import Trajectory as Trajectory
     from cortado.scene.scene import Scene as Scene
     from cortado.scene.scene import load_scene as load_scene
@@ -65,6 +66,7 @@ _HOMES = {
     "Trajectory": "runs.trajectory",
     "certify": "certificate",
     "evaluate": "optimisation.evaluate",
+    "film_side_by_side": "runs.side_by_side",
     "fit": "optimisation.fitting.fit",
     "load_scene": "scene.scene",
     "optimise": "optimisation.optimise",

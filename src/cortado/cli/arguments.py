@@ -4,12 +4,15 @@ import sys
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from cortado.errors import InputError
 from cortado.scene.toml import read_toml
+
+if TYPE_CHECKING:
+    from cortado.runs.frame_choice import FrameChoice
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -40,6 +43,20 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
     if not 0.0 < time < inf:
         raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
     return None
+
+
+def check_frames(record_every: int | None, fps: float | None) -> None:
+    """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""
+    if fps is not None and record_every is not None:
+        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
+    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
+
+
+def frames_asked_for(record_every: int | None, fps: float | None) -> "FrameChoice":
+    """Which states are frames, by options that were checked: every one if nothing is said."""
+    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
+
+    return EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
 
 
 def require_toml(file: Path, overrides: Sequence[str] = ()) -> None:

@@ -15,8 +15,9 @@ from cortado.cli.arguments import (
     Precision,
     Scene,
     as_text,
+    check_frames,
     command_line,
-    require_at_least,
+    frames_asked_for,
     require_toml,
     steps_or_time,
 )
@@ -24,6 +25,7 @@ from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.many_runs import convergence, dataset, sweep
 from cortado.cli.parsing import Program, completion_script
+from cortado.cli.show_commands import export, picture, view
 from cortado.errors import InputError
 
 app = SubcommandApp()
@@ -67,26 +69,36 @@ def examples(
 @command(app, answers=True)
 def describe(
     scene: Scene,
-    steps: int = 200,
+    steps: int | None = None,
+    time: float | None = None,
+    record_every: int | None = None,
+    fps: float | None = None,
     picture: Path | None = None,
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: Precision = "float32",
     json: Json = False,
 ) -> Work:
-    """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
+    """Describe a scene before it is run: its particles, what limits its time step, its memory, and of a run how long it
+    takes, how large it is on disk, and how long its film is.
 
     Args:
         scene: The scene file, or a task file.
-        steps: Number of time steps that it shall run.
+        steps: Number of time steps that it shall run; 200 if neither they nor a time are given.
+        time: Seconds that it shall simulate, in the place of steps.
+        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
+        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
         picture: Draw its first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
+    check_frames(record_every, fps)
+    steps = steps_or_time(steps, time)
     words = as_text(overrides)
     require_toml(scene, words)
     from cortado.cli.commands.describe import describe_scene
 
-    return partial(describe_scene, scene, steps, words, device, precision, picture, json)
+    frames = frames_asked_for(record_every, fps)
+    return partial(describe_scene, scene, steps, time, frames, words, device, precision, picture, json)
 
 
 @command(app)
@@ -124,16 +136,13 @@ def run(
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
-    if fps is not None and record_every is not None:
-        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
-    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
+    check_frames(record_every, fps)
     steps = steps_or_time(steps, time)
     words, wanted, told = as_text(overrides), as_text(record), command_line()
     require_toml(scene, words)
     from cortado.cli.commands.run import RunRequest, run_scene
-    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 
-    frames = EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
+    frames = frames_asked_for(record_every, fps)
     asked = (steps, time, words, device, precision, frames, wanted, state, resume, overwrite, pictures, told)
     return partial(run_scene, scene, RunRequest(out, *asked))
 
@@ -220,81 +229,8 @@ def fit(
     return partial(fit_task, task, out, words, device, precision, overwrite, told)
 
 
-@command(app)
-def picture(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
-    frame: int = -1,
-    film: Flag = False,
-    lines: int | None = None,
-    camera: str | None = None,
-    colour: str | None = None,
-    out: Path | None = None,
-    overrides: Overrides = (),
-    device: Device = "cpu",
-) -> Work:
-    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
-
-    Args:
-        run: The folder of the run.
-        frame: Number of a recorded frame, counted from the end where it is negative.
-        film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
-        lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
-        camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
-        colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it; into the run's figures if left out. A film ends in .mp4, or in .webp for pages of text.
-        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
-    """
-    from cortado.cli.commands.picture import camera_override, draw_run, picture_settings
-
-    replaced, settings = camera_override(camera) + as_text(overrides), picture_settings(lines, colour)
-    return partial(draw_run, run, frame, film, out, replaced, device, settings)
-
-
-@command(app)
-def export(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
-    to: Literal["usd", "glb", "ply", "obj", "vtp"],
-    out: Path | None = None,
-    every: int = 1,
-    overrides: Overrides = (),
-) -> Work:
-    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
-
-    Args:
-        run: The folder of the run.
-        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
-        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
-        every: Frames of the run from one that is written to the next.
-        overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
-    """
-    require_at_least(1, every, "--every")
-    from cortado.cli.commands.export import export_run
-
-    return partial(export_run, run, to, out, every, as_text(overrides))
-
-
-@command(app)
-def view(
-    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: str = "float32",
-    port: int = 8080,
-) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
-    a button for its next step; Ctrl-C ends it.
-
-    Args:
-        path: The folder of a run, a scene file, or a task file.
-        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        precision: "float32" or "float64", of a scene or a task that runs.
-        port: Of the page on this machine; the next one that is free if it is taken.
-    """
-    from cortado.cli.commands.view import view as show
-
-    return partial(show, path, as_text(overrides), device, precision, port)
-
-
+for show in (picture, export, view):
+    command(app)(show)
 command(app)(sweep)
 command(app, answers=True)(convergence)
 command(app)(dataset)

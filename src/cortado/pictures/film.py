@@ -26,9 +26,16 @@ class Film:
     path: Path
     pace: Pace
     """Which frames it shows, and how fast."""
+    notes: str = ""
+    """As those of a page."""
+
+    @property
+    def in_words(self) -> str:
+        """What it shows."""
+        return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
 
     def __str__(self) -> str:
-        return f"{self.path.name}: {self.pace}"
+        return f"{self.path.name}: {self.in_words}"
 
     def __repr__(self) -> str:
         return f"Film({self.path}, {self.pace})"
@@ -58,11 +65,11 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            images = page.images(shown[there:], partial(_ahead, len(page.states)))
+            images = page.images(shown[there:], partial(_ahead, len(page.panels)))
             for image, time in zip(images, pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()
-    return Film(path, pace)
+    return Film(path, pace, page.notes)
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:

@@ -14,13 +14,19 @@ FINER = 3
 """How many times finer than pixels lines are drawn, for smooth edges."""
 Text = tuple[tuple[int, int], str, str]
 """Where words are, (column, row), the words, and which point of them is there, by Pillow's two letters."""
+SMALL, SMALLEST = 11, 7
+"""Pixels of the letters of a word on a small picture, and of one that is too long for it."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 
 
-def labelled(image: Points, text: str) -> Points:
-    """A picture (rows, columns, 3), linear, on which a word is then written, at its top, on the left."""
-    size = max(round(0.042 * image.shape[0]), 11)
-    return written(image, [((round(0.9 * size), round(0.7 * size)), text, "la")], size)
+def labelled(image: Points, text: str, below: str = "") -> Points:
+    """A picture (rows, columns, 3), linear, on which a word is then written on the left, at its top, and another one at
+    its bottom, in smaller letters where the first would be too long."""
+    rows, columns = image.shape[:2]
+    size = max(round(0.042 * rows), SMALL)
+    left, top = round(0.9 * size), round(0.7 * size)
+    size = max(min(size, int(size * (columns - 2 * left) / max(_font(size).getlength(text), 1.0))), SMALLEST)
+    return written(image, [((left, top), text, "la"), ((left, rows - top), below, "ld")], size)
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:

@@ -34,20 +34,25 @@ class Pace:
     """[-] seconds of the run in a second of the film; 1 is real time; None where times are not known"""
     recorded: int
     """How many frames there are."""
+    enough: float = 0.0
+    """[1/s] frames in a second of the run with which the film would show `USUAL` ones; 0 where times are not known"""
+    of_search: bool = False
+    """Whether the frames are those of a search, which [picture] says the number of, and not those of a run."""
 
     @classmethod
     def of(cls, times: Sequence[float] | NDArray, count: int | None = None, speed: float | None = None) -> "Pace":
         """That of a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly chosen; all if
         left out. ``speed``: if left out that of real time, or as much slower as the film needs to last `SHORTEST`, and
         to show no more frames in a second than are seen."""
-        count = min(count or len(times), len(times))
+        count, span = min(count or len(times), len(times)), float(times[-1] - times[0])
+        enough = USUAL / (speed or _easy_speed(span, round(USUAL * max(SHORTEST, span)) + 1))
         if speed is None:
-            speed = _easy_speed(times[-1] - times[0], count)
-        elif times[-1] > times[0]:
-            count = min(count, floor(QUICKEST * (times[-1] - times[0]) / speed) + 1)
+            speed = _easy_speed(span, count)
+        elif span > 0.0:
+            count = min(count, floor(QUICKEST * span / speed) + 1)
         chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, count)).astype(int)).tolist()
         shown = tuple((times[k] - times[0]) / speed for k in chosen)
-        return cls(tuple(chosen), shown, speed, len(times))
+        return cls(tuple(chosen), shown, speed, len(times), enough)
 
     @classmethod
     def unknown(cls, count: int) -> "Pace":
@@ -67,15 +72,26 @@ class Pace:
             return "step by step"
         return "in real time" if self.speed == 1.0 else f"at {self.speed:g} x"
 
+    @property
+    def seconds(self) -> float:
+        """How long the film is [s]."""
+        return self.times[-1] + 1.0 / self.frames_per_second
+
+    @property
+    def _more(self) -> str:
+        """What records enough frames."""
+        if self.of_search and self.speed is not None:
+            return f"picture.film_frames={self.enough * self.speed * self.times[-1] + 1.0:.0f}"
+        return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
+
     def __str__(self) -> str:
         left_out = self.recorded - len(self.frames)
-        seconds = f"{self.times[-1] + 1.0 / self.frames_per_second:.1f} s"
-        kept = f"{counted(len(self.frames), 'frame')}, {seconds}, {self.in_words}"
+        kept = f"{counted(len(self.frames), 'frame')}, {self.seconds:.1f} s, {self.in_words}"
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
         if self.speed is not None and 1 < len(self.frames) == self.recorded and self.frames_per_second < SMOOTH:
             kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: "
-            kept += f"--fps {USUAL / self.speed:.4g} records {USUAL:g} for each second of the film"
+            kept += f"{self._more} records {USUAL:g} for each second of the film"
         return kept
 
 

@@ -1,7 +1,7 @@
 """Who draws a scene: a ray tracer in 3-D, a painter of the plane in 2-D."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.particles import mixed
 from cortado.pictures.plane import PlanePainter
 from cortado.pictures.plane_stage import PlaneStage
-from cortado.pictures.scenery import State
 from cortado.pictures.space import SpacePainter
 from cortado.pictures.stage import Stage, extent_of
 from cortado.scene.scene import Scene
@@ -18,25 +17,25 @@ ENOUGH = 1_000_000
 """Positions, of all particles in all frames, that tell where the fluid comes to."""
 
 
-class Painter(Protocol):
-    """Draws states of one scene."""
-
-    def image(self, *state: Any) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
-
-    def images(self, states: Iterable[State]) -> Iterator[Points]:
-        """The `image` of each state in their order."""
-
-
 def painter(
     scene: Scene, positions: Points, device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
-    """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays;
-    ``poses``: the same scene with its solids where they will be, for them to be in the picture, too."""
+    """The painter of a scene; arguments as of `stage_of`, and the ``device`` of the rays."""
+    return painter_on(stage_of(scene, positions, poses), device)
+
+
+def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter | SpacePainter:
+    """The painter of what is on a stage; ``device``: that of the rays."""
+    return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
+
+
+def stage_of(scene: Scene, positions: Points, poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
+    """What is around the fluid of a scene, which will be at positions (frames, n, d) [m]; ``poses``: the same scene
+    with its solids where they will be, for them to be in the picture, too."""
     particles = spread([np.asarray(positions).reshape(-1, scene.dimension)])
     if scene.dimension == 2:
-        return PlanePainter(PlaneStage.of(scene, *extent_of(particles), poses))
-    return SpacePainter(Stage.of(scene, particles, poses), device)
+        return PlaneStage.of(scene, *extent_of(particles), poses)
+    return Stage.of(scene, particles, poses)
 
 
 def spread(states: Sequence[Points]) -> Points:

@@ -1,8 +1,6 @@
 """Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,7 @@ TOUCHING = 0.9
 
 @dataclass(frozen=True)
 class PlanePainter:
-    """Draws states of one scene: `image` and `images`."""
+    """Draws states of one scene."""
 
     stage: PlaneStage
 
@@ -48,10 +46,6 @@ class PlanePainter:
         for opacity, light in stage.before:
             image = image * (1.0 - opacity) + light
         return np.clip(image, 0.0, 1.0)
-
-    def images(self, states: Iterable[State]) -> Iterator[Points]:
-        """The `image` of each state in their order."""
-        return starmap(self.image, states)
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
         """(rows, columns) the part of each pixel that fluid covers, and its colour (rows, columns, 3)."""

@@ -1,7 +1,7 @@
 """Everything around the fluid in the plane: paper, the walls of a container or a tank, their shadow, and solids."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,6 +40,8 @@ class PlaneStage:
     spacing: float
     """[m]"""
     solids: tuple[ShownSolid, ...] = ()
+    seen: tuple[Points, Points] | None = None
+    """Lower and upper ends (2,) [m] of what the picture has in its middle; those of what is shown if left out."""
 
     @classmethod
     def of(cls, scene: Scene, lower: Points, upper: Points, poses: Iterable[Scene] = ()) -> "PlaneStage":
@@ -53,23 +55,44 @@ class PlaneStage:
             lower, upper = extent_with((lower - paper, upper + paper), [scene, *poses])
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
 
+    @property
+    def ends(self) -> tuple[Points, Points]:
+        """Lower and upper ends (2,) [m] of what is shown, in the scene's axes."""
+        return self.lower, self.upper
+
+    @property
+    def seen_size(self) -> Points:
+        """(2,) how wide and high what the picture has in its middle is [m]."""
+        lower, upper = self.seen or self.ends
+        return upper - lower
+
+    def framed(self, ends: tuple[Points, Points], picture: Picture) -> "PlaneStage":
+        """The same in a picture of another size, with all that is between ``ends`` in its middle."""
+        return replace(self, picture=picture, seen=ends)
+
     @cached_property
     def pixel(self) -> float:
         """The width of a pixel [m]."""
         size = np.array([self.picture.width, self.picture.height])
-        return float(((self.upper - self.lower) / (FILLED * size)).max())
+        return float((self.seen_size / (FILLED * size)).max())
+
+    @property
+    def _middle(self) -> Points:
+        """(2,) of the picture [m]."""
+        lower, upper = self.seen or self.ends
+        return 0.5 * (lower + upper)
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
         """(rows, columns) where the middle of each pixel is [m]: x, and y."""
-        columns, rows, middle = self.picture.width, self.picture.height, 0.5 * (self.lower + self.upper)
+        columns, rows, middle = self.picture.width, self.picture.height, self._middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
     def on_screen(self, points: Points) -> Points:
         """As `Stage.on_screen`, of points (n, 2) [m]."""
-        off = (points - 0.5 * (self.lower + self.upper)) / self.pixel
+        off = (points - self._middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
     @property
@@ -144,7 +167,7 @@ class PlaneStage:
     def _paper(self) -> Points:
         """The background, a little brighter in the middle and darker in the corners."""
         x, y = self.pixels
-        middle, half = 0.5 * (self.lower + self.upper), 0.5 * self.pixel * self.picture.width
+        middle, half = self._middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         return np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
 

@@ -34,7 +34,7 @@ class Scale:
         """That of numbers, such as those of all frames of a film; ``unit`` of what is no quantity that all scenes
         have."""
         least, greatest = np.percentile(values, OUTERMOST)
-        return cls(name, UNITS[name] if unit is None else unit, float(least), float(greatest))
+        return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
         """(n, 3) linear, of numbers (n,)."""

@@ -1,6 +1,5 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
-from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ SOLID_RAYS = 40, 6
 
 
 class SpacePainter:
-    """Draws states of one scene of so many particles: `image` and `images`."""
+    """Draws states of one scene of so many particles."""
 
     def __init__(self, stage: Stage, device: Any = "cpu"):
         self.stage, self.device = stage, wp.get_device(device)
@@ -66,10 +65,6 @@ class SpacePainter:
         with WARP:
             compile_ahead(self, self.device)
             return self._rays(scenery(self.stage, State(*state), self._launch))
-
-    def images(self, states: Iterable[State]) -> Iterator[Points]:
-        """The `image` of each state in their order."""
-        return (self.image(*state) for state in states)
 
     def _rays(self, fluid: Scenery) -> Points:
         stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[DeviceSurface]()

@@ -39,6 +39,10 @@ class Stage:
     """(3,) of what is shown [m], in the frame of the picture"""
     upper: Points
     """(3,) [m]"""
+    seen: tuple[Points, Points]
+    """Lower and upper ends (3,) [m] of what the camera sees, in the frame of the picture."""
+    elevation: float
+    """Of the camera, where nobody said where it is [degrees]."""
     eye: Points
     """(3,) where the camera is [m]"""
     look_at: Points
@@ -73,24 +77,43 @@ class Stage:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
         origin = 0.5 * (lower + upper)
         shown = (corners(lower, upper) - origin) @ frame.T
-        low, high = shown.min(axis=0), shown.max(axis=0)
+        low, high = _box(shown)
         several = len(scene.phase) > 1
         from_above = several and (scene.render is None or scene.render.view == "top")
         into_cup = from_above and isinstance(scene.container, CylinderContainer)
         into_cup |= any(table.shape == "cup" and not table.transparency for table in scene.solid)
         elevation = FROM_ABOVE if into_cup else FROM_THE_SIDE
-        eye, look_at = fitted(low, high, elevation, picture)
-        if picture.look_at is not None:
-            eye, look_at = eye + frame @ (picture.look_at - origin) - look_at, frame @ (picture.look_at - origin)
-        if picture.camera is not None:
-            eye = frame @ (picture.camera - origin)
         media, transparency = media_of(scene, float((high - low).max()))
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
-        back = eye - look_at
-        seen = eye, look_at, float(np.degrees(np.arctan2(back[0], back[2])))
+        nowhere = np.zeros(3), np.zeros(3), 0.0
+        seen = (low, high), elevation, *nowhere
         own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, media, cuts, ())
-        return own.at(scene, None)
+        return own.framed((lower, upper), picture).at(scene, None)
+
+    def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
+        """The same in a picture of another size, with a camera that sees all that is between ``ends`` (3,) [m], in the
+        scene's axes, or is where the picture says."""
+        lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
+        eye, look_at = fitted(lower, upper, self.elevation, picture)
+        if picture.look_at is not None:
+            wanted = self.frame @ (picture.look_at - self.origin)
+            eye, look_at = eye + wanted - look_at, wanted
+        if picture.camera is not None:
+            eye = self.frame @ (picture.camera - self.origin)
+        back = eye - look_at
+        azimuth = float(np.degrees(np.arctan2(back[0], back[2])))
+        return replace(self, seen=(lower, upper), eye=eye, look_at=look_at, azimuth=azimuth, picture=picture)
+
+    @property
+    def ends(self) -> tuple[Points, Points]:
+        """Lower and upper ends (3,) [m] of what is shown, in the scene's axes."""
+        return _box(corners(self.lower, self.upper) @ self.frame + self.origin)
+
+    @property
+    def seen_size(self) -> Points:
+        """(2,) how wide and high what the camera sees is [m], across its direction."""
+        return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
     def home(self) -> View:
@@ -102,9 +125,9 @@ class Stage:
         """The same, but as far off, if nobody said where, as it has to be to see everything from all sides."""
         if self.picture.camera is not None:
             return self.home
-        back, middle = self.eye - self.look_at, 0.5 * (self.lower + self.upper)
+        back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
         elevation = float(np.degrees(np.arcsin(back[1] / np.linalg.norm(back))))
-        sides = (fitted(self.lower, self.upper, elevation, self.picture, turn) for turn in np.arange(0.0, 180.0, 15.0))
+        sides = (fitted(*self.seen, elevation, self.picture, turn) for turn in np.arange(0.0, 180.0, 15.0))
         off = AROUND * max(float(np.linalg.norm(eye - look_at)) for eye, look_at in sides)
         eye = middle + off * back / np.linalg.norm(back)
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
@@ -211,6 +234,11 @@ class Stage:
 def extent_of(positions: Points) -> tuple[Points, Points]:
     """Lower and upper ends (d,) [m] of nearly all positions (n, d) [m]: a few drops may be further away."""
     return np.quantile(positions, 0.002, axis=0), np.quantile(positions, 0.998, axis=0)
+
+
+def _box(points: Points) -> tuple[Points, Points]:
+    """Lower and upper ends (3,) of points (n, 3)."""
+    return points.min(axis=0), points.max(axis=0)
 
 
 def spilled(container: Container, positions: Points, spacing: float) -> bool:

@@ -32,6 +32,10 @@ class FrameChoice(Protocol):
     def expected(self, rollout: Rollout) -> int:
         """How many frames are likely to come."""
 
+    def count(self, steps: int, time: float | None) -> int | None:
+        """How many frames so many steps of one length have that simulate a time [s]; None where that depends on a time
+        that is not known."""
+
 
 @dataclass(frozen=True)
 class EverySteps:
@@ -56,6 +60,10 @@ class EverySteps:
     def expected(self, rollout: Rollout) -> int:
         """See `FrameChoice`."""
         return expected_frames(rollout, self.steps)
+
+    def count(self, steps: int, time: float | None) -> int:
+        """See `FrameChoice`."""
+        return 1 + -(-steps // self.steps)
 
 
 @dataclass(frozen=True)
@@ -91,6 +99,13 @@ class FramesPerSecond:
     def expected(self, rollout: Rollout) -> int:
         """See `FrameChoice`."""
         return len(self.announced(rollout))
+
+    def count(self, steps: int, time: float | None) -> int | None:
+        """See `FrameChoice`."""
+        if time is None:
+            return None
+        due, before = (floor(end * self.rate + SAME) for end in (time, time - time / steps))
+        return 1 + min(steps, due if due > before else due + 1)
 
 
 def _clock(rollout: Rollout) -> Clock:

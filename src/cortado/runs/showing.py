@@ -3,15 +3,25 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
 from cortado.errors import InputError, shown
 from cortado.pictures.film import Film
+from cortado.pictures.notebook import as_text, with_view
+from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.pictures.shaded_picture import ShadedPicture
 from cortado.scene.scene import Scene, as_scene
 
 if TYPE_CHECKING:
     from cortado.runs.trajectory import Trajectory
+
+IN_A_NOTEBOOK = 1_000_000
+"""Bytes of what a notebook shows in motion."""
+MANY = 2000
+"""Particles of which the nearest others are looked for."""
 
 
 class Showing:
@@ -30,7 +40,7 @@ class Showing:
         own = cast("Trajectory", self)
         if k not in range(-len(own), len(own)):
             raise InputError(f"k is {shown(k)}, but must be the number of one of {len(own)} frames, such as 0 or -1.")
-        page = page_of(own, self._scene(scene), _device(device), settings)
+        page = page_of(own, self._scene(scene), device_of(device), settings)
         return ShadedPicture.of(page.image(k % len(own)))
 
     def film(
@@ -52,7 +62,24 @@ class Showing:
         """
         from cortado.runs.drawing import film_of
 
-        return film_of(cast("Trajectory", self), self._scene(scene), path, _device(device), settings)
+        return film_of(cast("Trajectory", self), self._scene(scene), path, device_of(device), settings)
+
+    def _repr_html_(self) -> str:
+        """In motion, with y up; and its first, middle and last frame, coloured by speed."""
+        from cortado.pictures.particle_sets import particles
+
+        own = cast("Trajectory", self)
+        if not len(own):
+            return as_text(repr(own))
+        shown = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
+        titles = [f"t = {frame.time:.4g} s" for frame in shown]
+        speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
+        sets, label = [frame.positions for frame in shown], "speed [m/s]"
+        chosen, stride = thinned(len(own), own.particles, 2 * own.positions.shape[2] + 1, IN_A_NOTEBOOK)
+        thin = [array[chosen, ::stride] for array in (own.positions, own.velocities)]
+        cloud = Cloud("run", thin[0], np.linalg.norm(thin[1], axis=2))
+        view = particle_view([cloud], own.times[chosen], _spacing(own.positions[0]), stride=stride)
+        return with_view(own, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 
     def _scene(self, given: Scene | str | Path | None) -> Scene:
         found = self.scene if given is None else as_scene(given)
@@ -61,7 +88,16 @@ class Showing:
         return found
 
 
-def _device(name: str) -> Any:
+def device_of(name: str) -> Any:
     """Warp's device of that name; raises `InputError` where there is none."""
     start_warp()
     return device_named(name)
+
+
+def _spacing(positions: NDArray[Any]) -> float:
+    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return 1.0
+    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
-from cortado.pictures.notebook import as_text, with_view
-from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.sensors.log import Readings
@@ -27,10 +25,6 @@ from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
 from cortado.words import counted
 
-IN_A_NOTEBOOK = 1_000_000
-"""Bytes of what a notebook shows in motion."""
-MANY = 2000
-"""Particles of which the nearest others are looked for."""
 SUFFIXES = (".vtkhdf", ".hdf")
 """By which ParaView knows a trajectory."""
 
@@ -96,22 +90,6 @@ class Trajectory(Showing):
     def __repr__(self) -> str:
         times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
         return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
-
-    def _repr_html_(self) -> str:
-        """In motion, with y up; and its first, middle and last frame, coloured by speed."""
-        from cortado.pictures.particle_sets import particles
-
-        if not len(self):
-            return as_text(repr(self))
-        shown = [self[k] for k in sorted({0, len(self) // 2, len(self) - 1})]
-        titles = [f"t = {frame.time:.4g} s" for frame in shown]
-        speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
-        sets, label = [frame.positions for frame in shown], "speed [m/s]"
-        chosen, stride = thinned(len(self), self.particles, 2 * self.positions.shape[2] + 1, IN_A_NOTEBOOK)
-        thin = [array[chosen, ::stride] for array in (self.positions, self.velocities)]
-        cloud = Cloud("run", thin[0], np.linalg.norm(thin[1], axis=2))
-        view = particle_view([cloud], self.times[chosen], _spacing(self.positions[0]), stride=stride)
-        return with_view(self, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -303,15 +281,6 @@ class Trajectory(Showing):
         solids = motions_in(arrays["others"], arrays["positions"].shape[2])
         more: dict[str, Any] = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
         return cls(**{name: arrays[name] for name in names}, **more)
-
-
-def _spacing(positions: NDArray[Any]) -> float:
-    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
-    from scipy.spatial import KDTree
-
-    if len(positions) < 2:
-        return 1.0
-    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:

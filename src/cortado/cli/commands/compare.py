@@ -10,6 +10,7 @@ import numpy as np
 from cortado.errors import InputError, shown
 from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
+from cortado.runs.differences import differences
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 
@@ -17,7 +18,6 @@ _LARGEST = 2**31
 """Bytes of a file that is read."""
 _IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
 """Keys of environment.json that differ between any two runs, or are compared apart."""
-_MISSING = "missing"
 SAME_TIME = 1e-9
 """Relative: times that differ by less are the same, as so many steps of another length add up to."""
 _UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
@@ -73,24 +73,6 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _table(value: Any) -> dict[str, Any]:
     return dict(value) if isinstance(value, Mapping) else {}
-
-
-def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
-    """Both values of whatever differs, by dotted names."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        pairs = {key: (one.get(key, _MISSING), other.get(key, _MISSING)) for key in {**one, **other}}
-    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _has_tables(one):
-        pairs = {str(k): pair for k, pair in enumerate(zip(one, other, strict=True))}
-    else:
-        return {} if one == other else {name: [one, other]}
-    before = f"{name}." if name else ""
-    return {
-        key: pair for part, values in pairs.items() for key, pair in differences(*values, f"{before}{part}").items()
-    }
-
-
-def _has_tables(values: list[Any]) -> bool:
-    return any(isinstance(value, Mapping) for value in values)
 
 
 def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """``cortado convergence``: the same scene at several resolutions: the order of convergence, and the limit."""
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,17 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.commands.compare import SAME_TIME, differences
-from cortado.errors import InputError
+from cortado.cli.commands.compare import SAME_TIME
+from cortado.cli.commands.named_runs import named_runs
+from cortado.errors import CortadoWarning, InputError
 from cortado.optimisation.sweep.richardson import Extrapolation
+from cortado.runs.differences import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
+from cortado.runs.sensors.summary import summary
 from cortado.runs.trajectory import Trajectory
 
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST = 3
 """Runs that an order takes."""
+SAME_MASS = 0.005
+"""Relative: masses of fluid that differ by less are the same."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,8 @@ class Resolved:
     precision: str
     end: float
     """[s]"""
+    mass: float
+    """Of all fluid [kg], in 2-D of a layer 1 m thick."""
     numbers: dict[str, tuple[str, float]]
     """The unit and the value of each, by name."""
 
@@ -42,19 +50,17 @@ class Resolved:
             raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
         last = Trajectory.load(folder.trajectory)[-1:]
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
-        masses = last.constants["reference_density"].astype(np.float64)
+        scene, masses = read_json(folder.scene), last.constants["reference_density"].astype(np.float64)
         centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
         numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}
-        for name, read in folder.read_sensors().items():
-            for column, unit in read.units.items():
-                values, times = read[column], read.times
-                mean = np.trapezoid(values, times) / (times[-1] - times[0])
-                numbers |= {
-                    f"{name} {column}": (unit, float(values[-1])),
-                    f"{name} {column}, mean": (unit, float(mean)),
-                }
+        readings = folder.read_sensors()
+        for name, columns in summary(readings).items():
+            for column, found in columns.items():
+                unit = readings[name].units[column]
+                numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
         precision = read_json(folder.environment).get("settings", {}).get("precision", "")
-        return cls(folder.path, read_json(folder.scene), precision, float(last.times[0]), numbers)
+        mass = float(masses.sum()) * float(scene["discretisation"]["spacing"]) ** last.dimension
+        return cls(folder.path, scene, precision, float(last.times[0]), mass, numbers)
 
     def size(self, key: str) -> float:
         """The spacing [m] or the time step [s]; raises `InputError` for one that is chosen."""
@@ -67,7 +73,7 @@ class Resolved:
 
 def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
     """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
-    runs = [Resolved.read(folder) for folder in _opened(folders)]
+    runs = [Resolved.read(folder) for folder in named_runs(folders)]
     if len(runs) < LEAST:
         raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST}.")
     key = _varied(runs)
@@ -81,6 +87,7 @@ def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
                 f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s, but all runs must end at "
                 "the same time: choose a --time that is a multiple of every time step."
             )
+    _warn_of_masses(runs)
     rows = []
     for name, (unit, _) in runs[0].numbers.items():
         values = [run.numbers[name][1] for run in runs]
@@ -102,13 +109,17 @@ def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
     return json.dumps(table, indent=2) if as_json else _as_text(table)
 
 
-def _opened(folders: Sequence[Path]) -> list[RunFolder]:
-    """The runs that are meant, in each folder of a sweep all of them."""
-    found: list[RunFolder] = []
-    for folder in folders:
-        inner = sorted(one.parent for one in folder.glob("*/environment.json"))
-        found += [RunFolder.open(one) for one in inner or [folder]]
-    return found
+def _warn_of_masses(runs: Sequence[Resolved]) -> None:
+    """Say where runs have unlike amounts of fluid, which no order of convergence is about."""
+    least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
+    if most.mass > (1.0 + SAME_MASS) * least.mass:
+        warnings.warn(
+            f"the runs do not have the same fluid: {least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, "
+            f"{most.mass:.4g} kg with {most.size(SPACING):g} m. Choose spacings that divide the sizes of all bodies of "
+            "fluid.",
+            CortadoWarning,
+            stacklevel=3,
+        )
 
 
 def _varied(runs: Sequence[Resolved]) -> str:

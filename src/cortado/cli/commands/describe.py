@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import check_steps
 from cortado.cli.commands.memory_use import estimated_bytes
-from cortado.device.memory import frame_parts, step_parts
+from cortado.cli.commands.run_length import RunLength
+from cortado.device.memory import step_parts
 from cortado.errors import DivergedError, InputError
 from cortado.files.atomic import sentences
 from cortado.optimisation.inverse.in_words import task_in_words
@@ -22,12 +22,14 @@ from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of
 from cortado.pictures.plan import plan
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
+from cortado.runs.frame_choice import FrameChoice
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
+from cortado.words import counted
 
 SAME = 1e-6
 """Relative: a time step that is rounded to float32 is the same."""
@@ -63,7 +65,9 @@ class MeasuredSpeed:
 
 def describe_scene(
     scene_file: Path,
-    steps: int,
+    steps: int | None,
+    time: float | None,
+    frames: FrameChoice,
     overrides: list[str],
     device: str,
     precision: str,
@@ -74,17 +78,18 @@ def describe_scene(
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     simulation = Simulation(load_scene(scene_file, overrides), device, precision)
-    found = _described(simulation, check_steps(steps))
+    length = RunLength.of(simulation, steps, time, frames)
+    found = _described(simulation, length)
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:
         with sentences(picture.parent):
             picture.parent.mkdir(parents=True, exist_ok=True)
         found["picture"] = str(_drawn(simulation, picture).absolute())
-    return json.dumps(found, indent=2) if as_json else _as_text(found)
+    return json.dumps(found, indent=2) if as_json else _as_text(found, length)
 
 
-def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
+def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
     (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
@@ -107,10 +112,9 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
-        "steps": steps,
-        "simulated_time_s": steps * size if chosen_by is None else None,
     }
-    return {**found, **_memory(simulation, steps), **_expected(simulation, steps)}
+    steps = length.steps
+    return {**found, **length.for_machines(), **_memory(simulation, steps), **_expected(simulation, steps)}
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
@@ -157,20 +161,15 @@ def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
 
 
 def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
-    """[bytes] of a run with every step recorded, and of a gradient."""
-    real, numbers = simulation.precision.bytes, simulation.numbers_in_frame(3)
-    trajectory = sum(frame_parts(steps + 1, numbers, real).values())
+    """[bytes] of a run, and of a gradient."""
+    real = simulation.precision.bytes
     if not isinstance(simulation.solver, ParticleSolver):
-        return {"memory_bytes": None, "gradient_memory_bytes": None, "trajectory_bytes": trajectory}
+        return {"memory_bytes": None, "gradient_memory_bytes": None}
     rollout = Rollout(simulation.solver, 1)
     forward, backward = estimated_bytes(simulation, rollout)
     own = sum(step_parts(steps, real).values())
     checkpoints = min(steps * sum(array.capacity for array in rollout.initial.arrays()), MEMORY_BUDGET)
-    return {
-        "memory_bytes": forward + own,
-        "gradient_memory_bytes": backward + own + checkpoints,
-        "trajectory_bytes": trajectory,
-    }
+    return {"memory_bytes": forward + own, "gradient_memory_bytes": backward + own + checkpoints}
 
 
 def _drawn(simulation: Simulation, path: Path) -> Path:
@@ -180,7 +179,7 @@ def _drawn(simulation: Simulation, path: Path) -> Path:
     return write_picture(path, plan(simulation.scene, simulation.positions[free], colours[free], simulation.device))
 
 
-def _as_text(found: dict[str, Any]) -> str:
+def _as_text(found: dict[str, Any], length: RunLength) -> str:
     phases = ", ".join(f"{count} {name}" for name, count in found["particles_of_phase"].items())
     waiting = f", {found['particles_in_emitter']} of them in the emitter" if found["particles_in_emitter"] else ""
     limits = {name: limit for name, limit in found["time_step_limits_s"].items() if limit is not None}
@@ -205,11 +204,9 @@ def _as_text(found: dict[str, Any]) -> str:
             f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
             "beside Python and Warp themselves",
         ),
-        ("time", _time(found)),
-        (
-            "trajectory",
-            f"{_bytes(found['trajectory_bytes'])} with a frame for every step; --record-every makes it less",
-        ),
+        ("time", _time(found, length)),
+        ("trajectory", _trajectory(length)),
+        ("film", _film(length)),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
     rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
@@ -230,19 +227,41 @@ def _size(found: dict[str, Any]) -> str:
     return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
 
 
-def _time(found: dict[str, Any]) -> str:
+def _time(found: dict[str, Any], length: RunLength) -> str:
     if "diverged" in found:
         return f"unknown. {found['diverged']}"
-    seconds = found["simulated_time_s"]
-    motion = "" if seconds is None else f", {seconds:g} s of motion"
     slower = "later ones may take more pressure iterations"
     if found["particles_in_emitter"]:
         slower = "later ones take longer, as fluid comes out of the emitter"
     return (
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, without what is "
         f"recorded (mean of the first {found['measured_steps']} steps; {slower}); "
-        f"{found['steps']} steps{motion}: about {found['expected_seconds']:.2g} s"
+        f"{length.in_words}: {_duration(found['expected_seconds'])}"
     )
+
+
+def _trajectory(length: RunLength) -> str:
+    """What is recorded, on disk."""
+    if length.frames is None:
+        return "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
+    return (
+        f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says how many"
+    )
+
+
+def _film(length: RunLength) -> str:
+    """What the film of the run shows, and how long it is."""
+    if length.film is not None:
+        return f"{length.film}; what it takes to draw it comes on top"
+    return "of unknown length; --time says it" if length.time is None else "none"
+
+
+def _duration(seconds: float) -> str:
+    """About how long, in the unit that one would say."""
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * size:
+            return f"about {seconds / size:.2g} {unit}"
+    return f"about {seconds:.2g} s"
 
 
 def _bytes(size: float | None) -> str:

@@ -18,6 +18,7 @@ _GROUPS = {
         ("cortado optimise task.toml --out runs/found", "find what a task file asks for; --resume goes on"),
         ("cortado fit task.toml --out runs/fit", "a viscosity with an error bar, from a video or a force"),
         ("cortado sweep dam.toml --set phase.0.viscosity=0.05,0.1", "every combination of some values"),
+        ("cortado picture runs/sweep --film", "its runs side by side"),
         ("cortado convergence runs/sweep", "of several spacings: the order, the limit"),
         ("cortado dataset dam.toml --runs 100 --out data", "varied runs to train on, as LagrangeBench's"),
         ("cortado gradients check dam.toml --steps 20", "are gradients right, and for how long?"),

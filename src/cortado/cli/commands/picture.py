@@ -1,19 +1,25 @@
 """``cortado picture``: a shaded picture, or a film, of a run that is there."""
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cortado.cli.commands.named_runs import named_runs
 from cortado.errors import InputError
 from cortado.files.interruption import keeping
-from cortado.pictures.film import film, lacking
+from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.pace import pace_of
 from cortado.runs.colouring import coloured_by
-from cortado.runs.picture_settings import shown_as
+from cortado.runs.differences import labels
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_page
+from cortado.runs.showing import device_of
+from cortado.runs.shown_run import ShownRun
+from cortado.runs.side_by_side import runs_page, shown_alike
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -43,36 +49,57 @@ def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
     return folder.read_scene(overrides)
 
 
-def draw_run(
-    run: Path,
+def draw_runs(
+    runs: Sequence[Path],
     frame: int,
     as_film: bool,
     out: Path | None,
     overrides: list[str],
-    device: str,
+    device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; returns a sentence
-    that says where it is."""
-    folder = RunFolder.open(run)
-    scene = shown_as(scene_of_run(folder, overrides), settings)
-    if not folder.trajectory.exists():
-        raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
-    trajectory = Trajectory.load(folder.trajectory)
-    missing = lacking(scene)
-    if missing:
-        raise InputError(missing)
-    page = run_page(scene, trajectory, device, coloured_by(scene, trajectory, lambda: Simulation(scene, device)))
-    if as_film and (scene.picture or Picture()).film_frames == 0:
+    """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; of several runs
+    side by side. Returns a sentence that says where it is."""
+    folders, device = named_runs(runs), device_of(device_name)
+    look = scene_of_run(folders[0], overrides)
+    others = [scene_of_run(folder, []) for folder in folders[1:]]
+    trajectories = [_trajectory(folder) for folder in folders]
+    scenes = shown_alike([look, *others], trajectories, settings)
+    each = [
+        ShownRun(scene, trajectory, coloured_by(scene, trajectory, partial(Simulation, scene, device_name)))
+        for scene, trajectory in zip(scenes, trajectories, strict=True)
+    ]
+    picture = scenes[0].picture or Picture()
+    if as_film and picture.film_frames == 0:
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
+    if len(each) == 1:
+        (one,) = each
+        page, times = run_page(one.scene, one.trajectory, device, one.values), one.trajectory.times
+        place, name = folders[0].figures, "film" if as_film else "picture"
+    else:
+        page, times = runs_page(each, labels(scenes, _names(folders)), device)
+        place, name = Path(os.path.commonpath([folder.path.parent for folder in folders])), "side_by_side"
     if as_film:
-        path = out or folder.figures / "film.mp4"
+        path = out or place / f"{name}.mp4"
         further = "" if path.suffix == ".webp" else ", and the same command goes on with it"
         with keeping(lambda: f"what is drawn is in {path}{further}"):
-            made = film(path, page, range(len(trajectory)), pace_of(trajectory.times, scene.picture or Picture()))
-        return f"The film is in {path}: {made.pace}."
-    if frame not in range(-len(trajectory), len(trajectory)):
-        raise InputError(f"--frame is {frame}, but the run has {len(trajectory)} frames, from 0.")
-    path = out or folder.figures / "picture.png"
-    write_picture(path, page.image(frame))
-    return f"The picture is in {path}."
+            made = film(path, page, range(len(times)), pace_of(times, picture))
+        return f"The film is in {path}: {made.in_words}."
+    if frame not in range(-len(times), len(times)):
+        of = "the run has" if len(each) == 1 else "together the runs have"
+        raise InputError(f"--frame is {frame}, but {of} {len(times)} frames, from 0.")
+    path = out or place / f"{name}.png"
+    write_picture(path, page.image(frame % len(times)))
+    return f"The picture is in {path}{f': {page.notes}' if page.notes else ''}."
+
+
+def _trajectory(folder: RunFolder) -> Trajectory:
+    if not folder.trajectory.exists():
+        raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
+    return Trajectory.load(folder.trajectory)
+
+
+def _names(folders: Sequence[RunFolder]) -> list[str]:
+    """Of the folders, or numbers where some have one name."""
+    found = [folder.path.name for folder in folders]
+    return found if len(set(found)) == len(found) else [f"run {k}" for k in range(1, len(found) + 1)]

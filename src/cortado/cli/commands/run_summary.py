@@ -1,6 +1,7 @@
 """What the last lines of ``cortado run`` say: the time a step takes, energies, and densities."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -11,6 +12,8 @@ from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.emitted import is_out
+from cortado.runs.sensors.log import Readings
+from cortado.runs.sensors.summary import summary
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
@@ -82,10 +85,19 @@ class RunSummary:
     """Particles beside or below an open cup at the end."""
     particles: int
     """That did not begin in an emitter."""
+    readings: Mapping[str, Readings] = field(default_factory=dict)
+    """What sensors read, by their names."""
 
     @classmethod
-    def of(cls, simulation: Simulation, rollout: Rollout, last: State, seconds: float) -> "RunSummary":
-        """``last``: the state at the end."""
+    def of(
+        cls,
+        simulation: Simulation,
+        rollout: Rollout,
+        last: State,
+        seconds: float,
+        readings: Mapping[str, Readings] | None = None,
+    ) -> "RunSummary":
+        """``last``: the state at the end; ``readings`` of sensors."""
         solver, taken, found = rollout.solver, rollout.taken, None
         if isinstance(solver, ParticleSolver):
             densities = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
@@ -102,6 +114,7 @@ class RunSummary:
             densities=found,
             spilt=_spilt(simulation, last),
             particles=simulation.free_particles,
+            readings=readings or {},
         )
 
     @property
@@ -117,7 +130,8 @@ class RunSummary:
         """What is the same in every run, by names."""
         energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
-        return {"energy": energies, "density": {"least": least, "greatest": greatest}, "spilt": self.spilt}
+        sensors = {"sensors": summary(self.readings)} if self.readings else {}
+        return {"energy": energies, "density": {"least": least, "greatest": greatest}, "spilt": self.spilt, **sensors}
 
     def rows(self) -> list[tuple[object, ...]]:
         """(what, value, unit) of each row of a table."""
@@ -135,6 +149,12 @@ class RunSummary:
             *energies,
             *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
             *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
+            *(
+                (f"{name} {column}, {what}".replace("_", " "), f"{value:.4g}", self.readings[name].units[column])
+                for name, columns in summary(self.readings).items()
+                for column, found in columns.items()
+                for what, value in found.items()
+            ),
         ]
 
     def __str__(self) -> str:

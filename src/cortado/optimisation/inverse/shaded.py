@@ -1,6 +1,7 @@
 """Shaded pictures of a solved task: before, after, target and the search in motion."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
-from cortado.pictures.page import Page
+from cortado.pictures.page import Page, Panel
 from cortado.pictures.painter import colours_of, painter, spread
 from cortado.pictures.scenery import State
 from cortado.runs.emitted import is_out, those
@@ -73,7 +74,8 @@ def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
     """That of films of states after so many steps."""
     if scene.solver.chooses:
         return Pace.unknown(len(steps))
-    return pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
+    pace = pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
+    return replace(pace, of_search=True)
 
 
 def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
@@ -88,7 +90,10 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
     def composed(images: list[Points]) -> Points:
         return side_by_side(images, across, names)
 
-    return Page(artist, [partial(_state, made, run) for run in runs], composed)
+    def drawn(run: Run) -> Panel:
+        return lambda step: artist.image(*_state(made, run, step))
+
+    return Page([drawn(run) for run in runs], composed)
 
 
 def _state(made: Setup, run: Run, step: int) -> State:

@@ -30,6 +30,15 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
     write_atomically(folder / NAME, text.getvalue())
 
 
+def folders_in(folder: Path) -> list[str]:
+    """The names of the folders in the table of a sweep, in its order; none where there is no table that can be read."""
+    try:
+        with open(folder / NAME, newline="", encoding="utf-8") as file:
+            return [row["folder"] for row in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, csv.Error):
+        return []
+
+
 def failed(result: Mapping[str, Any]) -> bool:
     """Whether something did not come out as it should."""
     return bool(result["failures"])
