@@ -3,8 +3,8 @@
     python -m benchmarks.peers.splishsplash_column runs/column.npz
 
 writes what `python -m benchmarks.fits film --column runs/column.npz` draws: ``times`` (frames,) [s], ``positions`` and
-``velocities`` (frames, n, 2), and the ``spacing`` [m] and ``viscosity`` [Pa s] that the program was told. It needs numpy
-and `pysplishsplash` alone (see `splishsplash.py`), and takes some two minutes of a core.
+``velocities`` (frames, n, 2), and the ``spacing`` [m] and ``viscosity`` [Pa s] that the program was told. It needs
+NumPy and `pysplishsplash` alone (see `splishsplash.py`), and takes some two minutes of a core.
 
 What that program does differently, and what was done about it:
 
