@@ -22,6 +22,7 @@ VARIANTS = {
     "projection, 4 mm, 1 ms": [],
     "projection, 4 mm, 0.5 ms": ["solver.time_step=0.0005", "problem.steps=400"],
     "projection, 2.5 mm, 1 ms": FINER,
+    "projection, 2.5 mm, 0.5 ms": [*FINER, "solver.time_step=0.0005", "problem.steps=400"],
 }
 """By the solver, the spacing and the time step, what they have other than the task."""
 DRAWN = ("PCISPH, 4 mm, 1 ms", "projection, 4 mm, 0.5 ms", "projection, 2.5 mm, 1 ms")
