@@ -38,7 +38,7 @@ def wrong() -> Work:
 
 
 @command(app, answers=True)
-def film(column: Path, out: Path = Path("runs/fit_video.mp4")) -> Work:
+def film(column: Path, out: Path = Path("runs/film.mp4")) -> Work:
     """Draw a column that another simulator let collapse, and film it.
 
     Args:
@@ -50,7 +50,7 @@ def film(column: Path, out: Path = Path("runs/fit_video.mp4")) -> Work:
 
 @command(app, answers=True)
 def foreign(column: Path | None = None, out: Path = Path("runs/fits")) -> Work:
-    """Fit the film of another simulator, `examples/fit_video.mp4`, with both solvers and two spacings.
+    """Fit the film of another simulator, `examples/fit_video_film.mp4`, with both solvers and two spacings.
 
     Args:
         column: What the film was drawn from; if given, the viscosity is told by which it lost its energy.
