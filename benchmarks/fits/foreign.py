@@ -25,7 +25,7 @@ VARIANTS = {
     "projection, 2.5 mm, 0.5 ms": [*FINER, "solver.time_step=0.0005", "problem.steps=400"],
 }
 """By the solver, the spacing and the time step, what they have other than the task."""
-DRAWN = ("PCISPH, 4 mm, 1 ms", "projection, 4 mm, 0.5 ms", "projection, 2.5 mm, 1 ms")
+DRAWN = ("PCISPH, 4 mm, 1 ms", "projection, 4 mm, 0.5 ms", "projection, 2.5 mm, 0.5 ms")
 """Whose residuals are drawn, in three frames each."""
 DISSIPATED = 16.4
 """The viscosity [Pa s] by which the column of the film lost its energy; `viscosity_by_energy` finds it."""
