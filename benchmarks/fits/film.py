@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from cortado.errors import InputError
+from cortado.files.atomic import sentences
 from cortado.files.video import pyav
 
 WIDTH, HEIGHT = 0.16, 0.08
@@ -28,7 +29,9 @@ def film(column: Path, out: Path) -> str:
     """Draw the states that `benchmarks/peers/splishsplash_column.py` wrote, as a video."""
     av, (times, positions, _, spacing) = pyav(), column_of(column)
     every = round(1.0 / (FRAME_RATE * (times[1] - times[0])))
-    with av.open(str(out), "w") as container:
+    with sentences(out.parent):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    with sentences(out), av.open(str(out), "w") as container:
         stream = container.add_stream("libx264", rate=FRAME_RATE)
         stream.width, stream.height, stream.pix_fmt, stream.options = PIXELS, PIXELS // 2, "yuv444p", {"crf": "23"}
         for picture in camera(surface(x, spacing) for x in positions[::every]):
