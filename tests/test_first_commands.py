@@ -188,6 +188,8 @@ def test_examples_are_listed_and_copied(cortado_command):
     assert (code, err) == (0, "") and all(name in out for name in shown)
     assert cortado_command("examples", "--copy", "fit_heights", "--to", "fit")[0] == 0
     assert sorted(os.listdir("fit")) == ["fit_heights.toml", "fit_heights_left.csv", "fit_heights_right.csv"]
+    assert cortado_command("examples", "--copy", "fit_video", "--to", "film")[0] == 0
+    assert sorted(os.listdir("film")) == ["fit_video.toml", "fit_video_film.mp4"]
     code, out, _ = cortado_command("examples", "--copy", "pour", "--copy", "first_gradient.py", "--to", "a/b")
     assert (code, sorted(os.listdir("a/b"))) == (0, ["first_gradient.py", "pour.toml"])
     assert "cortado optimise a/b/pour.toml" in out and "python a/b/first_gradient.py" in out

@@ -2,6 +2,7 @@
 
 import pickle
 from html import escape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from bad_scenes import assert_one_sentence
 from cortado import measured
 from cortado.errors import ComputationError, InputError
 from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.optimisation.fitting.doubts import TOO_LARGE_IN_MOTION, still_and_moving
+from cortado.optimisation.fitting.figures import video_figures
 from cortado.optimisation.fitting.fitted import with_error
 from cortado.optimisation.fitting.noise import (
     Products,
@@ -206,11 +209,25 @@ def test_the_tangent_of_a_picture_is_the_transpose_of_its_adjoint(experiment):
 
 
 def test_a_fit_finds_what_was_measured_without_noise(experiment):
-    found = cortado.fit(experiment, {"viscosity": 1.0}, {"camera.translation": ([-0.1, -0.1, 0.0], [0.1, 0.1, 0.0])})
+    found = cortado.fit(experiment, {"viscosity": 1.0})  # how far away the camera is no parallel ray tells
     assert found.converged and found.values["viscosity"] == pytest.approx(TRUE, rel=1e-4)
     assert found.values["camera.width"] == pytest.approx(0.48, rel=1e-4)
     assert found.labels == ["viscosity", "camera.translation[0]", "camera.translation[1]", "camera.width"]
     assert "viscosity 2.0" in str(found) and "Pa s" in str(found)
+
+
+def test_frames_of_a_video_are_drawn_beside_what_was_found(simulation, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("cortado.optimisation.fitting.figures.images", lambda *given: drawn.append(given) or given[-1])
+    frames, mask = np.full((5, 12, 16, 3), 0.5), np.arange(12 * 16).reshape(12, 16) > 16
+    video = measured.Video(simulation.renderer(resolution=(16, 12)), 0.01 * np.arange(5), frames, mask)
+    off = np.linspace(-0.3, 0.1, 5)[:, None] * np.ones(video.measured.shape)
+    part = SimpleNamespace(part=SimpleNamespace(observation=video), label="camera", residuals=off)
+    ((words, path),) = video_figures(SimpleNamespace(parts=[part]), tmp_path)
+    ((pictures, titles, _),) = drawn
+    assert "camera" in words and path.parent == tmp_path and titles[5] == "found less measured, 0.02 s"
+    assert [picture[3, 4, 0] for picture in pictures] == pytest.approx([0.5, 0.2, 0.0, 0.5, 0.4, 0.1, 0.5, 0.6, 0.3])
+    assert all((picture[0] == 1.0).all() for picture in pictures)
 
 
 @pytest.fixture(scope="module")
@@ -358,3 +375,17 @@ def test_a_wrong_start_is_a_sentence(start, bounds, words, shaken):
     with pytest.raises(InputError, match=words) as error:
         cortado.fit(shaken, start, bounds)
     assert_one_sentence(str(error.value))
+
+
+def test_a_background_that_stays_tells_how_large_the_noise_is():
+    random = np.random.default_rng(0)
+    moves = np.linspace(0.0, 1.0, 8)[:, None] * np.r_[np.zeros(40), np.linspace(0.2, 1.0, 30)]
+    noise = 0.01 * random.standard_normal(moves.shape)
+    still, moving = still_and_moving(moves - noise, noise)
+    assert still == pytest.approx(0.01, rel=0.2) and moving == pytest.approx(0.01, rel=0.2)
+    wrong = noise + 0.05 * (moves > 0.0)
+    hidden = np.where(np.arange(70) % 7 == 0, np.nan, moves - wrong)
+    still, moving = still_and_moving(hidden, np.where(np.isnan(hidden), 0.0, wrong))
+    assert still == pytest.approx(0.01, rel=0.2) and moving > 2.0 * TOO_LARGE_IN_MOTION * still
+    assert still_and_moving(moves[:, 30:], noise[:, 30:]) == (np.inf, 0.0)  # too few that stay
+    assert still_and_moving(moves, 1e-9 * noise)[0] == pytest.approx(0.002)  # rounding of what was measured

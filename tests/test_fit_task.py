@@ -83,6 +83,16 @@ def test_each_command_names_the_other(task):
         load_fit(EXAMPLES / "identify.toml")
 
 
+def test_the_film_of_another_program_shows_what_its_scene_begins_with():
+    (one,) = load_fit(EXAMPLES / "fit_video.toml").experiments
+    experiment = one.experiment("cpu", "float32")
+    camera, simulation = experiment.observations["camera"], experiment.simulation
+    assert camera.times == pytest.approx(np.arange(13) / 60.0, abs=1e-3)
+    drawn, seen = simulation.renderer().render(simulation.positions), camera.measured[0].reshape(32, 64, 3)
+    assert np.sqrt(np.mean((drawn - seen) ** 2)) < 0.04
+    assert np.sqrt(np.mean((drawn[::-1] - seen) ** 2)) > 0.1  # upside down
+
+
 def test_frames_of_a_folder_are_read(tmp_path):
     for k in range(4):
         write_picture(tmp_path / f"{k:02}.png", np.full((32, 48, 3), 0.2 + 0.1 * k))

@@ -13,6 +13,8 @@ from cortado.cli.process import main
 from .cases import CaseName
 from .coverage import cover, cover_linear
 from .effort import cost_beside_search
+from .film import film as draw_film
+from .foreign import of_another_simulator
 from .wrong import of_another_model
 
 app = SubcommandApp()
@@ -33,6 +35,28 @@ def effort(seed: int = 0) -> Work:
 def wrong() -> Work:
     """Fit videos of another solver and of a finer spacing: are the truths within the bars, or does the fit doubt?"""
     return of_another_model
+
+
+@command(app, answers=True)
+def film(column: Path, out: Path = Path("runs/film.mp4")) -> Work:
+    """Draw a column that another simulator let collapse, and film it.
+
+    Args:
+        column: What `benchmarks/peers/splishsplash_column.py` wrote.
+        out: The film, an mp4.
+    """
+    return partial(draw_film, column, out)
+
+
+@command(app, answers=True)
+def foreign(column: Path | None = None, out: Path = Path("runs/fits")) -> Work:
+    """Fit the film of another simulator, `examples/fit_video_film.mp4`, with both solvers and two spacings.
+
+    Args:
+        column: What the film was drawn from; if given, the viscosity is told by which it lost its energy.
+        out: Folder of a picture of the residuals.
+    """
+    return partial(of_another_simulator, column, out)
 
 
 @command(app, answers=True)

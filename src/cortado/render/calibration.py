@@ -48,6 +48,16 @@ class Calibration:
         """The values as the view was aimed."""
         return {name: self._values[name] for name in self.names}
 
+    @property
+    def unseen(self) -> dict[str, np.ndarray]:
+        """By name, true for the numbers that no picture shows: how far a camera of parallel rays, which look along an
+        axis, is moved along them."""
+        camera = self.aimed.camera
+        if "translation" not in self.names or not isinstance(camera, Orthographic):
+            return {}
+        sight = np.subtract(camera.look_at, camera.position)
+        return {"translation": np.isclose(np.abs(sight), np.linalg.norm(sight))}
+
     def view(self, values: Mapping[str, np.ndarray]) -> View:
         """The view with these values; raises `InputError` where there is none."""
         if not self.names:

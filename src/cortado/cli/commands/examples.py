@@ -11,6 +11,8 @@ from cortado.files.shipped import examples_folder
 from cortado.files.terminal import is_quiet
 
 ALL = "all"
+DATA = (".csv", ".mp4")
+"""What an example may read, with its own name at the beginning: example_ANY.csv."""
 
 
 def list_examples(names: list[str], folder: Path) -> str:
@@ -34,7 +36,8 @@ def _chosen(names: list[str], known: list[str]) -> list[str]:
 def _copied(sources: list[Path], folder: Path) -> str:
     """Nothing is copied unless all of it can be: a file that is there is kept. What an example reads goes with it."""
     examples = [folder / source.name for source in sources]
-    sources = [*sources, *(data for source in sources for data in sorted(source.parent.glob(f"{source.stem}_*.csv")))]
+    beside = (path for source in sources for path in sorted(source.parent.glob(f"{source.stem}_*")))
+    sources = [*sources, *(path for path in beside if path.suffix in DATA)]
     targets = [folder / source.name for source in sources]
     for target in targets:
         if is_taken(target):

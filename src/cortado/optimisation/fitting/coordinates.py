@@ -30,10 +30,14 @@ class Coordinates:
 
     @classmethod
     def of(
-        cls, start: Mapping[str, Any], positive: Iterable[str], bounds: Mapping[str, tuple[Any, Any]] | None
+        cls,
+        start: Mapping[str, Any],
+        positive: Iterable[str],
+        bounds: Mapping[str, tuple[Any, Any]] | None,
+        unseen: Mapping[str, np.ndarray] | None = None,
     ) -> "Coordinates":
-        """``positive`` parameters are searched by their logarithm where all of their numbers are above 0. Raises
-        `InputError` for what does not fit."""
+        """``positive`` parameters are searched by their logarithm where all of their numbers are above 0; numbers that
+        are ``unseen`` are not searched. Raises `InputError` for what does not fit."""
         require_table("start", start, "{'viscosity': 0.5}")
         values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
         given = {} if bounds is None else bounds
@@ -43,6 +47,9 @@ class Coordinates:
                 raise InputError(f"bounds has {name}, but must be made of parameters that start has.")
         by_logarithm = {name for name in positive if name in values and (values[name] > 0.0).all()}
         ends = {name: _ends(name, values[name], given.get(name, (None, None))) for name in values}
+        for name, mask in ({} if unseen is None else unseen).items():
+            lower, upper = ends[name]
+            ends[name] = np.where(mask, values[name], lower), np.where(mask, values[name], upper)
 
         def flat(rows: Iterable[np.ndarray]) -> np.ndarray:
             return np.concatenate([np.ravel(row) for row in rows])

@@ -9,6 +9,14 @@ from cortado.optimisation.fitting.noise import ScoreCovariance
 
 TOO_LARGE = 1.3
 """Residuals over the noise that was given."""
+STILL = 0.01
+"""Of the greatest change over the frames: numbers that the model says change by less stay as they are."""
+FEW_STILL = 20
+"""Numbers that stay as they are; of fewer nothing is said."""
+TOO_LARGE_IN_MOTION = 2.0
+"""Residuals of the numbers that change over those of the numbers that stay as they are."""
+ROUNDING = 0.002
+"""Of the largest number measured: half a step of 8 bits, below which residuals say nothing."""
 TOO_SLOW = 0.35
 """Correlation time of residuals, over the length of the record."""
 TOO_FAR = 3.0
@@ -32,6 +40,13 @@ def doubts(
                 f"The residuals of {part.label} are {size / noise:.2g} times the noise that was given "
                 f"({size:.2g} against {noise:.2g} {part.observation.unit}): the model is wrong by that much."
             )
+        still, moving = still_and_moving(part.observation.measured, r)
+        if moving > TOO_LARGE_IN_MOTION * still:
+            found.append(
+                f"The residuals of {part.label} are {moving / still:.2g} times as large where the model changes as "
+                f"where it stays as it is ({moving:.2g} against {still:.2g} {part.observation.unit}): there it is "
+                "wrong by that much, and the error bars are too small."
+            )
         length = times[-1] - times[0]
         if weight.correlation_time > TOO_SLOW * length:
             found.append(
@@ -40,6 +55,18 @@ def doubts(
                 f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
     return (*found, *_halves(problem, at, weights, scores, labels))
+
+
+def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
+    """Root mean squares of the residuals (frames, m) of the numbers that the model says stay as they are, such as the
+    background of a video, which show the noise alone, and of the others; infinite and 0 where few stay."""
+    change = np.ptp(measured + r, axis=0)
+    counted = ~np.isnan(change)
+    still = counted & (change <= STILL * np.max(change[counted], initial=0.0))
+    if still.sum() < FEW_STILL or not (counted & ~still).any():
+        return np.inf, 0.0
+    quiet, moving = (float(np.sqrt(np.mean(r[:, chosen] ** 2))) for chosen in (still, counted & ~still))
+    return max(quiet, ROUNDING * float(np.nanmax(np.abs(measured)))), moving
 
 
 def _halves(

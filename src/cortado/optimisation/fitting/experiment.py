@@ -61,6 +61,13 @@ class Experiment:
         """The observations' own parameters, such as "camera.rotation", as a fit starts."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
+    @property
+    def unseen(self) -> dict[str, np.ndarray]:
+        """By the names of `start`, true for numbers that nothing that was measured depends on; an observation of one's
+        own need not say any."""
+        each = self.observations.items()
+        return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
+
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
         """The same experiment, in the same arrays, with other numbers measured, (frames, m) by name."""
         found = object.__new__(Experiment)

@@ -13,6 +13,8 @@ from cortado.runs.report import Figures
 
 GREATEST_SERIES = 4
 """Numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
+AGREE = 0.2
+"""Light of a pixel that shows that two pictures agree there: a middle grey."""
 
 
 def residual_figure(fitted: Fit, path: Path) -> Figures:
@@ -63,16 +65,23 @@ def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
 
 
 def video_figures(fitted: Fit, folder: Path) -> Figures:
-    """Of each video its last frame: measured, found, and how far apart they are."""
+    """Of each video its first frame, one in the middle and the last: measured, found, and how far apart they are."""
     found: Figures = []
     for number, part in enumerate(fitted.parts):
         video = part.part.observation
         if isinstance(video, Video):
-            rows, columns, _ = video.renderer.shape
-            pictures = np.ones((3, rows, columns, 3))
-            last, off = video.measured[-1].reshape(-1, 3), part.residuals[-1].reshape(-1, 3)
-            for picture, values in zip(pictures, (last, last + off, np.abs(off)), strict=True):
-                picture[video.mask] = np.clip(np.nan_to_num(values), 0.0, 1.0)
-            path = images(list(pictures), ("measured", "found", "apart"), folder / f"measured_{number}.png")
-            found.append((f"The last frame of {part.label}: measured, found, and how far apart they are.", path))
+            pictures, titles = list[np.ndarray](), list[str]()
+            for k in (0, len(video.times) // 2, -1):
+                measured, off = video.measured[k], part.residuals[k]
+                shown = {"measured": measured, "found": measured + off, "found less measured": AGREE + off}
+                for title, light in shown.items():
+                    picture = np.ones(video.renderer.shape)
+                    picture[video.mask] = np.clip(np.nan_to_num(light), 0.0, 1.0).reshape(-1, 3)
+                    pictures.append(picture)
+                    titles.append(f"{title}, {video.times[k]:.3g} s")
+            path = images(pictures, titles, folder / f"measured_{number}.png")
+            words = (
+                f"Frames of {part.label}. On the right grey is where both agree, light where too much light was found."
+            )
+            found.append((words, path))
     return found

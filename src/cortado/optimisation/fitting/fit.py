@@ -65,7 +65,8 @@ def fit(
     if not given:
         raise InputError("start is empty, but must have a parameter to fit.")
     positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
-    coordinates = Coordinates.of(given, positive, bounds)
+    unseen = {name: mask for one in each for name, mask in one.unseen.items()}
+    coordinates = Coordinates.of(given, positive, bounds, unseen)
     problem = LeastSquares(each, coordinates, on_trial)
     at = problem.estimated(coordinates.start)
     sizes = [part.observation.noise or _spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]

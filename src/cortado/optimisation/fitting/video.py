@@ -55,6 +55,11 @@ class Video:
         """The camera as it was aimed, as far as it is calibrated."""
         return self.calibration.start
 
+    @property
+    def unseen(self) -> Mapping[str, np.ndarray]:
+        """By name, true for the numbers of the camera that no picture shows."""
+        return self.calibration.unseen
+
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         """(rows, columns, 3) of a state, with values of what is calibrated."""
         return self._renderer(own).render(at.state.positions, at.state.mass_fractions, at.colours)
