@@ -24,63 +24,6 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 
 @wp.func
-def meet_behind_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Where a ray comes into the fluid, on a part of its way, outside of transparent solids."""
-    none = SurfaceHit()
-    none.found = False
-    none.t = FAR
-    start = wp.max(part[0], 0.0)
-    beside_container = part[0] > 0.0
-    beside_clear = wp.bool(False)
-    face = wp.int32(0)
-    place = wp.vec2(0.0)
-    layers = wp.int32(0)
-    while layers < LAYERS:  # which Warp does not write out
-        layers += 1
-        p = o + start * d
-        clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
-        in_solid = clear.sign < 0.0
-        if not clear.result:
-            in_solid = s.solids.has_tank > 0
-        if not in_solid:
-            hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
-            if hit.result and hit.sign < 0.0 and beside_clear:
-                side = at_surface(s.solids.surfaces[CLEAR], start, d, face, place[0], place[1])
-                return at_wall(s, surface, p, d, start, side.normal)
-            if hit.result and hit.sign < 0.0 and beside_container:
-                return at_wall(s, surface, p, d, start, wall_normal(s, p))
-            t = start + hit.t
-            if hit.result and t <= part[1] and (not clear.result or hit.t <= clear.t):
-                return at_surface(surface, t, d, hit.face, hit.u, hit.v)
-        start = start + clear.t + s.nearest
-        if not clear.result or start >= part[1]:
-            return none
-        beside_container = False
-        beside_clear = in_solid
-        face = clear.face
-        place = wp.vec2(clear.u, clear.v)
-    return none
-
-
-@wp.func
-def meet_without_solids(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Where a ray comes into the fluid, on a part of its way."""
-    none = SurfaceHit()
-    none.found = False
-    none.t = FAR
-    start = wp.max(part[0], 0.0)
-    hit = wp.mesh_query_ray(surface.mesh, o + start * d, d, FAR)
-    if not hit.result:
-        return none
-    if hit.sign < 0.0 and part[0] > 0.0:
-        p = o + start * d
-        return at_wall(s, surface, p, d, start, wall_normal(s, p))
-    if start + hit.t > part[1]:
-        return none
-    return at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
-
-
-@wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
     """Where a ray comes into the fluid on a part of its way, on which no transparent solid is."""
     met = SurfaceHit()
