@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imsave
 
-from compiling_notice import leave_large_derivatives_unoptimised, without_compiling
+from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from short import is_slow, seconds_of, short
@@ -54,11 +54,6 @@ def tier(item: pytest.Item) -> str:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--short", action="store_true", help="as make test does: without what make test-all alone runs")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("--short"):
-        leave_large_derivatives_unoptimised()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -4,9 +4,7 @@ import ast
 from pathlib import Path
 
 import pytest
-import warp as wp
 
-from compiling_notice import leave_large_derivatives_unoptimised
 from conftest import VALIDATION, tier
 from short import KEPT, MEASURED, SLOW, chosen, short, values_of, write_seconds
 
@@ -48,15 +46,6 @@ def test_what_is_slow_is_left_out_of_what_is_short():
         Item("test_docs", "test_the_code_runs_as_printed[solids.md]"),
     )
     assert short([kept, whole, quick, case]) == [kept, quick]
-
-
-def test_large_derivatives_alone_are_not_optimised_in_what_is_short(monkeypatch):
-    """Modules are looked up, not compiled."""
-    monkeypatch.setattr(wp, "get_module", wp.get_module)
-    leave_large_derivatives_unoptimised()
-    names = ("projection_2d_derivative", "projection_2d_tangent", "projection_2d_forward", "pcisph_derivative")
-    levels = [wp.get_module(f"cortado_{name}_of_no_kernel").options["optimization_level"] for name in names]
-    assert levels == [0, 0, None, None]
 
 
 def test_seconds_are_those_of_a_report(tmp_path, monkeypatch):
