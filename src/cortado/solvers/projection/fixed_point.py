@@ -53,15 +53,15 @@ class FixedPointKernels:
 
 
 @cache
-def fixed_point_kernels(discretisation: Discretisation, dimension: int) -> FixedPointKernels:
-    """In 2 or 3 dimensions."""
+def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
+    """The same in 2 and in 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, packed = neighbourhood_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
     divergence, clamp = projection_sums(discretisation).divergence, pressure_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
-    module = discretisation.module(False, f"fixed_point_{dimension}d")
+    module = discretisation.module(False, "fixed_point")
     used = ("L", "gamma", "drift", "a", "weights")
     seen = bundle(**{name: kind for name, kind in entries(precision).items() if name in used})
     LANES = discretisation.lanes
@@ -169,7 +169,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         """As `Solver.implicit_adjoint` says."""
         super().__init__(solver, steps)
         layout, precision = solver.layout, solver.layout.precision
-        self._own = fixed_point_kernels(solver.discretisation, solver.system.walled.dimension)
+        self._own = fixed_point_kernels(solver.discretisation)
         self._after = layout.state(solver.carried_fields)
         """k after the step that comes next, in the scene's order."""
         self._end = Carried(solver.carried_fields, layout)
