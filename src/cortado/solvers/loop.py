@@ -45,7 +45,7 @@ class LoopRecord:
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
         loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
-        iterations, errors = (copy.read()[:steps] for copy in self._seen)
+        iterations, errors = (copy.read(steps) for copy in self._seen)
         iterations = iterations.astype(int)
         self.counts = iterations.max(axis=1)
         """(steps,) how often the loop went round, in the scene of a batch that took most."""

@@ -32,7 +32,7 @@ class SolveRecord:
 
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
-        self.found: NDArray = self._seen.read()[:steps].astype(int)[self._kept]
+        self.found: NDArray = self._seen.read(steps).astype(int)[self._kept]
         """(steps,), in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "SolveRecord") -> None:
