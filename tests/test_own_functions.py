@@ -304,6 +304,10 @@ def time_second(x_ij, t, v_ij, k):
     return -k * t * v_ij
 
 
+def forgotten(x, v, rate, wind):
+    return rate * (wind - v)
+
+
 def fixed_time(x, v, t=0.0, k=1.0):
     return -k * t * v
 
@@ -353,6 +357,7 @@ def helped_part(x, v, k):
         (lambda: Body(np.sin, k=1.0), "Body has <ufunc 'sin'>, but must have a function"),
         (lambda: Body(drag), "Body function drag is given no value of k, but must have one of each parameter"),
         (lambda: Body(three, k=1.0), "Body function three is given no value of c, but must have"),
+        (lambda: Body(forgotten, wind=AWAY), "Body function forgotten is given no value of rate, but must have"),
         (lambda: Body(turned, k=1.0), "turned has the arguments v, x, k, but must have x, v first, and then t"),
         (lambda: Pair(time_second, k=1.0), "time_second has the arguments .*, but must have x_ij, v_ij first"),
         (lambda: Body(fixed_time), "fixed_time is given a value of t, but must be given none"),

@@ -205,7 +205,7 @@ def optimise(
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
 
 
-@command(app)
+@command(app, answers=True)
 def fit(
     task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
     out: Path = Path("runs/fit"),

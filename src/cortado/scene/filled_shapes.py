@@ -64,7 +64,7 @@ class FilledShape(Filled):
     """One with a place of its own."""
 
     position: tuple[Length, ...] | None = None
-    """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
+    """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
 
     def body(self) -> Placed:
         placed = super().body()

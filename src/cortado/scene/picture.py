@@ -33,7 +33,7 @@ class Picture(Table):
     camera: Place | None = None
     """(3,) where the camera is [m], in 3-D; left out, it sees all of the container."""
     camera_path: AnyCameraPath | None = None
-    """How the camera of a film moves, in 3-D; if left out it stays where it is."""
+    """How the camera moves over a run, in films and in single pictures, in 3-D; if left out it stays where it is."""
     look_at: Place | None = None
     """(3,) the middle of the picture [m], in 3-D; that of the container if left out."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0

@@ -28,7 +28,7 @@ class SolidTable(Coloured):
     name: Text
     """What others call it."""
     position: tuple[Length, ...] | None = None
-    """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
+    """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
     rotation: Rotation | None = None
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
     counterclockwise."""

@@ -27,6 +27,8 @@ class Inputs:
     """"vector" or "number": what they are, and what the function returns."""
 
 
+TIME = "t", "time"
+"""Names that the time has."""
 INPUTS = {
     "Body": Inputs(("x", "v")),
     "Pair": Inputs(("x_ij", "v_ij")),
@@ -119,8 +121,9 @@ def formula(
 def _arguments(
     what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Names of the inputs, and the parameters' values in the order of the function's arguments. Inputs may have any
-    names, but those of ``first``, and t, stand for nothing else."""
+    """Names of the inputs, and the parameters' values in the order of the function's arguments. The first two inputs
+    may have any names; those of ``first``, and t, stand for nothing else. A third one is the time only where its name
+    says so, as it may be a parameter whose value was forgotten."""
     signature, known = inspect.signature(function).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
@@ -137,7 +140,7 @@ def _arguments(
         if name in values:
             raise InputError(f"{what} is given a value of {name}, but must be given none, as the run has its own.")
     inputs = tuple(name for name in signature if name not in values)
-    if lacking := [name for name in tuple(signature)[3:] if name in inputs]:
+    if lacking := [name for name in inputs[2:] if inputs.index(name) > 2 or name not in TIME]:
         found = f"{what} is given no value of {', '.join(lacking)}"
         raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(inputs)] != inputs:

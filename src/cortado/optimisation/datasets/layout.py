@@ -116,6 +116,7 @@ def metadata(
     time_step = scene.solver.fixed_time_step("a data set")
     moments = {f"{name}_{what}": value for name in ("vel", "acc") for what, value in _moments(train, name).items()}
     lengths = {f"sequence_length_{purpose}": frames for purpose in split}
+    gravity = {} if "forces.gravity" in table.vary else {"g_ext": list(scene.forces.gravity)}
     counts = {f"num_trajs_{purpose}": len(numbers) for purpose, numbers in split.items()}
     return {
         "case": scene.name,
@@ -130,7 +131,7 @@ def metadata(
         "bounds": np.transpose([ends[0] - origin, ends[1] - origin]).tolist(),
         "origin": origin.tolist(),
         "default_connectivity_radius": REACH * scene.discretisation.spacing,
-        "g_ext": list(scene.forces.gravity),
+        **gravity,
         "seed": table.seed,
         "vary": dict(table.vary),
         **lengths,
