@@ -30,8 +30,7 @@ def picture(
         lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
         camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
         colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
-        out: Where to write it, a film as .mp4 or, for pages of text, as .webp; if left out into the run's figures, of
-            several runs beside their folders.
+        out: Where to write it, a film as .mp4 or .webp; if left out into the run's figures, of several beside them.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
     from cortado.cli.commands.picture import camera_override, draw_runs, picture_settings
