@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import cortado
+from cortado.optimisation.fitting.figures import AGREE
 from cortado.optimisation.fitting.fitted import Fit, with_error
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.pictures.figures import images
@@ -63,7 +64,7 @@ def residuals_drawn(fits: dict[str, Fit], path: Path) -> Path:
     for name, fitted in fits.items():
         (part,) = fitted.parts
         for k in np.linspace(0, len(part.residuals) - 1, 4).round().astype(int)[1:]:
-            panels.append(np.clip(0.2 + part.residuals[k].reshape(32, 64, 3), 0.0, 1.0))
+            panels.append(np.clip(AGREE + part.residuals[k].reshape(32, 64, 3), 0.0, 1.0))
             titles.append(f"{name}, after {part.part.observation.times[k]:.2f} s")
     return images(panels, titles, path)
 

@@ -32,8 +32,7 @@ class SolverSetting:
     called: str
     """What sentences call the solver."""
     lanes: int | None = None
-    """How many of them a particle gets on a GPU, if not as many as suit a scene of its size: see
-    `cortado.device.lanes`."""
+    """Threads of a GPU that share a particle, if not as many as suit the scene: see `cortado.device.lanes`."""
 
 
 class SolverMaker(Protocol):

@@ -140,7 +140,7 @@ def _arguments(
         if name in values:
             raise InputError(f"{what} is given a value of {name}, but must be given none, as the run has its own.")
     inputs = tuple(name for name in signature if name not in values)
-    if lacking := [name for name in inputs[2:] if inputs.index(name) > 2 or name not in TIME]:
+    if lacking := [name for k, name in enumerate(inputs[2:]) if k > 0 or name not in TIME]:
         found = f"{what} is given no value of {', '.join(lacking)}"
         raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(inputs)] != inputs:
