@@ -21,6 +21,8 @@ from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, s
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index, of water."""
+DARK = wp.constant(wp.float32(10.0))
+"""How many free paths of light within fluid nothing is seen beyond: a part of 5e-5 goes as far."""
 
 
 @wp.struct
@@ -82,7 +84,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         inside = wp.bool(True)
         for _ in range(SEGMENTS):
             if inside:
-                met = leave(s, surface, o, d)
+                met = leave(s, surface, o, d, wp.min(DARK / wp.max(medium[0], 1.0e-6), FAR))
                 left = wp.exp(-medium[0] * met.t)
                 soft = 0.55 * lit + wp.vec3(0.40)
                 found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
