@@ -142,7 +142,7 @@ class Exported:
     @cached_property
     def _stage(self) -> Stage:
         """Of a run in 3-D: whether its fluid ends at the walls of its container."""
-        return Stage.of(self.scene, spread(self._trajectory.positions))
+        return Stage.of(self.scene, spread(list(self._trajectory.positions)))
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
         try:
