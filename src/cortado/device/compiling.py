@@ -57,10 +57,12 @@ def compile_ahead_adjoint(owner: Any, device: Any) -> None:
 def compile_meanwhile(owner: Any, device: Any) -> None:
     """Begin to compile the same in another thread, on a CPU with a core to spare, while this one goes on with something
     else; `compile_ahead` waits for what was begun."""
-    if device.is_cpu and usable_cores() > 1:
+    if not device.is_cpu or usable_cores() < 2:
+        return
+    sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
+    missing = _missing({module: size for module, size in sizes.items() if module not in _begun}, device)
+    if missing:
         _Said.anything = True  # or else a line would come of what nobody waits for
-        sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
-        missing = _missing({module: size for module, size in sizes.items() if module not in _begun}, device)
         _begun.update(dict.fromkeys(missing, helpers().submit(_side_by_side, missing, device, 1)))
 
 
