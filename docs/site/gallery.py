@@ -71,7 +71,7 @@ ENTRIES = {
     "pillar": Entry(TEMPLATES / "pillar.toml", 0.0125, 1.3, 0.35, NEW),
     "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
     "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
-    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, (ORBIT,)),
+    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, ("solver.time_step=0.0005", ORBIT)),
     "jug": Entry(FIGURES / "jug.toml", 0.00125, 1.8, 0.5),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
     "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, MIXED, "container.colour=[0.8, 0.78, 0.72]")),
