@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from threading import Event, Timer
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import warp as wp
 
 import cortado
 from compiling_notice import COMPILING, UNOPTIMISED
+from cortado.device import compiling
 from cortado.device.compiling import kernels_of
 from cortado.device.kernels import is_derivative
 from scenes import plane, pour
@@ -152,3 +154,23 @@ def test_what_a_step_back_launches_is_compiled_ahead(launched):
     problem.value_and_gradient({"gravity": [0.0, -9.81]})
     back = {name for name in launched if "_derivative_" in name}
     assert back and back <= ahead
+
+
+def test_what_is_compiled_meanwhile_is_waited_for_and_not_compiled_again(monkeypatch):
+    """Not even where it has not ended when it is asked for."""
+    solver, done, wanted = cortado.Simulation(plane()).solver, set(), Event()
+    compiled = []
+
+    def slowly(modules, *_):
+        wanted.wait(10.0)
+        compiled.extend(modules)
+        done.update(modules)
+
+    monkeypatch.setattr(compiling, "_side_by_side", slowly)
+    monkeypatch.setattr(compiling, "_is_compiled", lambda module, device: module in done)
+    monkeypatch.setattr(compiling, "usable_cores", lambda: 2)
+    compiling.compile_meanwhile(solver, wp.get_device("cpu"))
+    assert not compiled
+    Timer(0.1, wanted.set).start()
+    compiling.compile_ahead(solver, wp.get_device("cpu"))
+    assert len(compiled) == len(set(compiled)) == len(done) > 1

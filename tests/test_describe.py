@@ -10,6 +10,7 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
+from cortado.cli.commands.drawing_time import seconds_of_picture
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.cli.commands.run_length import RunLength
 from cortado.cli.commands.run_summary import Energy, RunSummary
@@ -17,6 +18,7 @@ from cortado.discretise.calibration import SLACK
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
+from cortado.pictures.plane import PlanePainter
 from cortado.runs.frame_choice import EverySteps, FramesPerSecond
 from cortado.scene.stability import stability_limit, stability_limits
 from scenes import jet, plane, two_layers
@@ -26,6 +28,7 @@ from scenes import jet, plane, two_layers
 def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cortado.cli.commands.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
     return tmp_path
 
 
@@ -71,8 +74,21 @@ def test_the_run_and_its_film_are_told(capsys):
     main(["describe", "scene.toml", "--time", "1.05", "--set", "picture.film_speed=0.5"])
     out = capsys.readouterr().out
     assert "500 steps, 1.05 s of motion: about" in out and "film        127 frames, 2.1 s, at 0.5 x; 374 of" in out
+    assert "; about 64 s to draw, 0.5 s for the first state; splashes take up to twice as long\n" in out
     none = cortado.Simulation(cortado.load_scene("scene.toml", ["picture.film_frames=0"]))
     assert RunLength.of(none, 10, None, EverySteps(1)).film is None
+
+
+def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
+    drawn, ticks = [], iter([3.0, 5.5])
+    monkeypatch.setattr("cortado.cli.commands.drawing_time.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr(PlanePainter, "image", lambda _, *state: drawn.append(len(state[0])))
+    simulation = cortado.Simulation("scene.toml")
+    assert seconds_of_picture(simulation) == 2.5 and drawn == 2 * [simulation.particles]
+    shooting = cortado.Simulation(jet())
+    assert shooting.free_particles < shooting.particles
+    ticks = iter([0.0, 1.0])
+    assert seconds_of_picture(shooting) == 1.0 and drawn[-1] == (shooting.free_particles or shooting.particles)
 
 
 def test_steps_that_are_chosen_are_estimated():

@@ -19,6 +19,8 @@ from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.runs.curl import vorticity
 from cortado.runs.emitted import ages, is_out
+from cortado.runs.run_pictures import _with_scale, run_page
+from cortado.runs.shown_run import ShownRun
 from cortado.scene.camera_paths import Moment, View
 from cortado.scene.lights import LIGHTS
 from cortado.scene.picture import Picture
@@ -160,10 +162,28 @@ def test_flat_colours_are_those_of_the_scale():
 def test_a_scale_tells_its_numbers_in_its_unit():
     scale = Scale.of("speed", np.linspace(0.0, 2.0, 1001))
     image = np.full((360, 640, 3), 0.5)
-    told = scale.beside(image)
-    assert (told != image).any(axis=2).mean() < 0.15
+    told, columns = scale.on(image), scale.columns(360)
+    assert 10 < columns < 60 and (told[:, -columns:] != image[:, -columns:]).any()
+    np.testing.assert_array_equal(told[:, :-columns], image[:, :-columns])
+    beside = scale.beside(image)
+    assert beside.shape == (360, 640 + columns, 3)
+    np.testing.assert_array_equal(beside[:, :640], image)
+    np.testing.assert_allclose(beside[:, 640:], told[:, -columns:], atol=1e-12)
     assert scale._ticks() == [0.5, 1.0, 1.5]
-    assert Scale.of("age", np.ones(3)).unit == "s" and Scale.of("age", np.ones(3)).beside(image).shape == image.shape
+    assert Scale.of("age", np.ones(3)).unit == "s" and Scale.of("age", np.ones(3)).on(image).shape == image.shape
+
+
+@pytest.mark.parametrize("upper, is_beside", [([4.0, 0.4], True), ([0.4, 0.4], False)])
+def test_a_scale_covers_nothing_that_is_shown(upper, is_beside):
+    """A picture of a wide container is narrower, so that both have the columns that were asked for."""
+    own = plane(picture={**SMALL, "colour": "speed"}).replaced(f"container.upper={upper}")
+    trajectory = cortado.Simulation(own).run(2)
+    values = trajectory.quantity("speed")
+    scale, stage = Scale.of("speed", values), ShownRun(own, trajectory).stage
+    image = run_page(own, trajectory, "cpu", values).image(1)
+    narrow, drawn = _with_scale(stage, scale)
+    assert image.shape == (90, 160, 3) and (drawn == scale.beside) == is_beside
+    assert narrow.on_screen(corners(*narrow.ends))[:, 0].max() < 160 - scale.columns(90)
 
 
 def test_what_waits_in_an_emitter_is_not_drawn():

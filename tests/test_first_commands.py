@@ -260,7 +260,7 @@ def test_it_refuses_what_cortado_refuses(old, new):
     ("typed", "found"),
     [
         ("cortado optim", "optimise"),
-        ("cortado run --rec", "--record-every --record"),
+        ("cortado run --rec", "--record --record-every"),
         ("cortado gradients c", "check"),
     ],
 )

@@ -6,12 +6,18 @@ import trimesh
 import warp as wp
 from scipy.spatial import cKDTree
 
+import cortado
 from cortado.device import bands
 from cortado.device.bands import BandLauncher
 from cortado.errors import ComputationError
 from cortado.pictures import liquid as liquid_module
-from cortado.pictures.surface import liquid
+from cortado.pictures.contained_liquid import contained_liquid
+from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.painter import stage_of
+from cortado.pictures.particles import Particles
+from cortado.pictures.surface import Surface
 from cortado.pictures.surface_net import Neighbours, smoothed
+from scenes import scene
 
 SPACING = 0.1
 
@@ -24,7 +30,12 @@ def ball(radius=0.6, centre=(0.0, 0.0, 0.0)):
 
 
 def surface_of(positions, colours=None):
-    return liquid(positions, np.ones_like(positions) if colours is None else colours, SPACING)
+    colours = np.ones_like(positions) if colours is None else colours
+    launch = BandLauncher(wp.get_device("cpu"))
+    found = liquid_surface(Particles.on(launch.device, positions, colours), SPACING, launch)
+    each = (found.points, found.triangles, found.normals, found.colours)
+    points, corners, normals, colours = (one.numpy() for one in each)
+    return Surface(points, corners.reshape(-1, 3), normals, colours)
 
 
 def mesh_of(surface):
@@ -101,6 +112,50 @@ def test_what_is_very_far_away_is_left_out():
 def test_positions_that_are_not_numbers_are_a_sentence():
     with pytest.raises(ComputationError, match="2 particles cannot be drawn, whose positions are not finite"):
         surface_of(np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]))
+
+
+def resting(shape, container):
+    """Fluid of so many particles along each axis, or a cylinder of them, at rest in the corner of its container."""
+    size = SPACING * np.array(shape)
+    if container == "cylinder":
+        place = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5 * size[0]}
+        fluid, held = {**place, "height": size[1]}, {**place, "height": 2.0 * size[1]}
+    else:
+        fluid = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": size.tolist()}
+        wide = {"pool": [1.0, 2.0, 1.0], "dam": [2.0, 2.0, 1.0]}[container]
+        held = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": (size * wide).tolist()}
+    return scene(discretisation={"spacing": SPACING}, fluid=[{**fluid, "phase": "water"}], container=held)
+
+
+@pytest.mark.parametrize(
+    "shape, container",
+    [
+        ((10, 5, 10), "pool"),
+        ((20, 20, 20), "pool"),
+        ((8, 8, 8), "dam"),
+        ((13, 13, 13), "dam"),
+        ((20, 20, 20), "dam"),
+        ((11, 11, 11), "cylinder"),
+        ((13, 13, 13), "cylinder"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
+    simulation = cortado.Simulation(resting(shape, container))
+    positions = simulation.positions
+    found = contained_liquid(stage_of(simulation.scene, positions), positions, np.ones_like(positions))
+    mesh = mesh_of(found)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(len(positions) * simulation.lattice.volume, rel=0.03)
+    size = SPACING * np.array(shape)
+    if container == "cylinder":
+        np.testing.assert_allclose(np.linalg.norm(found.points[:, ::2], axis=1).max(), 0.5 * size[0], rtol=1e-5)
+        assert found.points[:, 1].min() == pytest.approx(0.0, abs=1e-6)
+        return
+    np.testing.assert_allclose(found.points.min(axis=0), 0.0, atol=1e-6)
+    assert found.points[:, 2].max() == pytest.approx(size[2], rel=1e-5)
+    on_floor = np.abs(found.points[:, 1]) < 1e-6
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-5)
+    assert np.median(found.normals[on_floor, 1]) == pytest.approx(-1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2, 5])

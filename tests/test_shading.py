@@ -274,6 +274,22 @@ def page_of(picture, fingerprint=""):
     return Page([picture], fingerprint=fingerprint)
 
 
+def test_light_has_no_edge_where_reflection_within_water_becomes_total():
+    """Seen along a column of the picture through the flat surface of a pool: the refracted ray meets the wall behind at
+    the critical angle in the middle, where the eye is 28.8 degrees above the surface."""
+    elevation = np.radians(28.8)
+    looks = {"look_at": [0.3, 0.5, 0.4], "camera": [0.3, 0.5 + 2.0 * np.sin(elevation), 0.4 + 2.0 * np.cos(elevation)]}
+    scene = scene_of(
+        picture={"width": 64, "height": 400, "field_of_view": 2.0, **looks},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "material": "water"}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.5, 0.8], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.8, 0.8]},
+    )
+    column = drawn(scene)[:, 32]
+    assert np.abs(np.diff(column[180:220], axis=0)).max() < 0.05
+    assert np.abs(column[150] - column[220]).max() > 0.1
+
+
 def test_a_page_shows_its_panels_side_by_side():
     page = Page([lambda k: k, lambda k: 10 * k], tuple)
     assert page.image(3) == (3, 30)

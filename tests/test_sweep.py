@@ -19,6 +19,7 @@ from bad_tasks import GOOD_TASK, TINY_SCENE
 from compiling_notice import without_compiling
 from cortado import InputError
 from cortado.cli import main
+from cortado.cli.arguments import ALL_FRAMES
 from cortado.device.executors import distributed as of_dask
 from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
@@ -264,7 +265,9 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
-    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32", True)
+    member = cortado.cli.commands.sweep.Member(
+        folder / "task.toml", None, folder / "elsewhere", "cpu", "float32", ALL_FRAMES, True
+    )
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 
@@ -375,6 +378,18 @@ def test_a_sweep_may_be_given_a_time(sweep):
     assert code == 0 and "2 of them there already" in out
 
 
+def test_runs_of_a_sweep_have_the_frames_that_are_asked_for(sweep):
+    """And a sweep that asks for others is another one."""
+    asked = ["scene.toml", "--set", "solver.time_step=0.001,0.002", "--time", 0.012, "--out", "runs", "--no-pictures"]
+    assert sweep(*asked, "--fps", 250)[0] == 0
+    for path in Path("runs").glob("*/*.vtkhdf"):
+        assert Trajectory.load(path).times == pytest.approx([0.0, 0.004, 0.008, 0.012])
+    code, _, err = sweep(*asked, "--record-every", 3)
+    assert code == 2 and "fps" in err
+    assert sweep(*asked[:-2], "others", "--record-every", 3, "--no-pictures")[0] == 0
+    assert {len(Trajectory.load(path)) for path in Path("others").glob("*/*.vtkhdf")} == {5, 3}
+
+
 def test_times_that_cannot_be_the_same_are_said(sweep):
     code, _, err = sweep("scene.toml", "--set", "solver.time_step=0.001,0.0015", "--steps", 4, "--out", "runs")
     assert code == 0
@@ -391,6 +406,13 @@ def test_times_that_cannot_be_the_same_are_said(sweep):
         (["scene.toml", "--set", "solver.time_step=0.001", "--time", "0"], "--time is 0, but must be a number of sec"),
         (["scene.toml", "--set", "solver.time_step=0.001", "--time", "inf"], "--time is inf, but must be a number of"),
         (["task.toml", *RATES, "--time", "0.1"], "--time is given, but must be left out, as the task says"),
+        (["task.toml", *RATES, "--fps", "10"], "--fps is given, but must be left out of a sweep of a task."),
+        (
+            ["scene.toml", "--set", "solver.time_step=0.001", "--fps", "-1"],
+            "--fps is -1, but must be a number of frames",
+        ),
+        (["scene.toml", "--set", "solver.time_step=0.001", "--fps", "1", "--record-every", "2"], "--fps is given, but"),
+        (["scene.toml", "--set", "solver.time_step=0.001", "--record-every", "0"], "--record-every is 0, but must be"),
     ],
 )
 def test_a_time_that_cannot_be_is_refused(sweep, arguments, words):

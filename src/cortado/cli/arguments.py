@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -45,18 +46,29 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
     return None
 
 
-def check_frames(record_every: int | None, fps: float | None) -> None:
-    """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""
-    if fps is not None and record_every is not None:
-        raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
-    require_at_least(1, 1 if record_every is None else record_every, "--record-every")
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which states of a run are frames of its trajectory."""
+
+    record_every: int | None = None
+    """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""
+    fps: float | None = None
+    """Frames of the trajectory in a second that is simulated, in the place of --record-every."""
+
+    def check(self) -> None:
+        """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""
+        if self.fps is not None and self.record_every is not None:
+            raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
+        require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
+
+    def choice(self, otherwise: int = 1) -> "FrameChoice":
+        """Those of options that were checked: every so many steps if nothing is said."""
+        from cortado.runs.frame_choice import EverySteps, FramesPerSecond
+
+        return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
 
 
-def frames_asked_for(record_every: int | None, fps: float | None) -> "FrameChoice":
-    """Which states are frames, by options that were checked: every one if nothing is said."""
-    from cortado.runs.frame_choice import EverySteps, FramesPerSecond
-
-    return EverySteps(record_every or 1) if fps is None else FramesPerSecond(fps)
+ALL_FRAMES = FrameOptions()
 
 
 def require_toml(file: Path, overrides: Sequence[str] = ()) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from cortado.cli.arguments import Flag, Json, Overrides, Precision, as_text, require_toml
+from cortado.cli.arguments import ALL_FRAMES, Flag, FrameOptions, Json, Overrides, Precision, as_text, require_toml
 from cortado.cli.command import Work
 
 
@@ -19,6 +19,7 @@ def sweep(
     out: Path = Path("runs/sweep"),
     device: str = "cpu",
     precision: Precision = "float32",
+    frames: FrameOptions = ALL_FRAMES,
     pictures: Flag = True,
     scheduler: str | None = None,
     workers: int | None = None,
@@ -38,13 +39,15 @@ def sweep(
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """
+    frames.check()
     combinations, together = as_text(sets), as_text(zips)
     require_toml(file)
     from cortado.cli.commands.executor import Where
     from cortado.cli.commands.sweep import run_sweep
 
     where = Where(scheduler, workers)
-    return partial(run_sweep, file, combinations, together, steps, time, out, device, precision, where, pictures)
+    asked = (combinations, together, steps, time, out, device, precision, where, frames, pictures)
+    return partial(run_sweep, file, *asked)
 
 
 def convergence(

@@ -8,16 +8,16 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from cortado.cli.arguments import (
+    ALL_FRAMES,
     Device,
     Flag,
+    FrameOptions,
     Json,
     Overrides,
     Precision,
     Scene,
     as_text,
-    check_frames,
     command_line,
-    frames_asked_for,
     require_toml,
     steps_or_time,
 )
@@ -71,8 +71,7 @@ def describe(
     scene: Scene,
     steps: int | None = None,
     time: float | None = None,
-    record_every: int | None = None,
-    fps: float | None = None,
+    frames: FrameOptions = ALL_FRAMES,
     picture: Path | None = None,
     overrides: Overrides = (),
     device: Device = "cpu",
@@ -86,19 +85,16 @@ def describe(
         scene: The scene file, or a task file.
         steps: Number of time steps that it shall run; 200 if neither they nor a time are given.
         time: Seconds that it shall simulate, in the place of steps.
-        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
-        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
         picture: Draw its first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
-    check_frames(record_every, fps)
+    frames.check()
     steps = steps_or_time(steps, time)
     words = as_text(overrides)
     require_toml(scene, words)
     from cortado.cli.commands.describe import describe_scene
 
-    frames = frames_asked_for(record_every, fps)
-    return partial(describe_scene, scene, steps, time, frames, words, device, precision, picture, json)
+    return partial(describe_scene, scene, steps, time, frames.choice(), words, device, precision, picture, json)
 
 
 @command(app)
@@ -110,8 +106,7 @@ def run(
     overrides: Overrides = (),
     device: Device = "cpu",
     precision: Precision = "float32",
-    record_every: int | None = None,
-    fps: float | None = None,
+    frames: FrameOptions = ALL_FRAMES,
     state: Path | None = None,
     resume: Flag = False,
     overwrite: Flag = False,
@@ -126,8 +121,6 @@ def run(
         time: Seconds that the scene is simulated, in the place of steps: the last step ends then or later.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        record_every: Steps from one frame of the trajectory to the next; 1 if left out.
-        fps: Frames of the trajectory in a second that is simulated, in the place of --record-every.
         state: Begin at the end of another run, which is the folder of one or a trajectory file.
         resume: Go on with the run in the folder, after it was stopped or killed.
         overwrite: Replace an earlier run in the same folder.
@@ -136,14 +129,13 @@ def run(
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
-    check_frames(record_every, fps)
+    frames.check()
     steps = steps_or_time(steps, time)
     words, wanted, told = as_text(overrides), as_text(record), command_line()
     require_toml(scene, words)
     from cortado.cli.commands.run import RunRequest, run_scene
 
-    frames = frames_asked_for(record_every, fps)
-    asked = (steps, time, words, device, precision, frames, wanted, state, resume, overwrite, pictures, told)
+    asked = (steps, time, words, device, precision, frames.choice(), wanted, state, resume, overwrite, pictures, told)
     return partial(run_scene, scene, RunRequest(out, *asked))
 
 

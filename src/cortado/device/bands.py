@@ -14,8 +14,8 @@ from cortado.device.threads import MOST_CORES, helpers
 
 BANDS = 8
 """Bands for each core: one may take longer than another."""
-LEAST_SHARED, LEAST_SHARED_OFTEN = 10_000, 50_000
-"""Threads of a launch that is cut, and of one of many that take little time each."""
+LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
+"""Threads of a band, and of a launch that is cut where it is one of many that take little time each."""
 
 
 class BandLauncher:
@@ -27,7 +27,7 @@ class BandLauncher:
 
     def __call__(self, kernel: wp.Kernel, count: int, **arguments: Any) -> None:
         cores = min(usable_cores(), MOST_CORES) if self.device.is_cpu else 1
-        bands = BANDS * cores if cores > 1 and count > LEAST_SHARED else 1
+        bands = max(min(BANDS * cores, count // LEAST), 1) if cores > 1 else 1
         bounds = [count * band // bands for band in range(bands + 1)]
 
         def work(band: int) -> None:

@@ -34,6 +34,8 @@ UNUSED = "-DWP_NO_BFLOAT16="
 """Leaves the functions of bfloat16 numbers out of Warp's headers, as Warp itself does where it does not precompile."""
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
 """What was compiled ahead for, by its identity."""
+_begun: dict[Any, Future[None]] = {}
+"""Modules that another thread compiles, or has compiled, which nobody has asked for yet."""
 
 
 def compile_ahead(owner: Any, device: Any) -> None:
@@ -50,6 +52,18 @@ def compile_ahead_adjoint(owner: Any, device: Any) -> None:
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
+
+
+def compile_meanwhile(owner: Any, device: Any) -> None:
+    """Begin to compile the same in another thread, on a CPU with a core to spare, while this one goes on with something
+    else; `compile_ahead` waits for what was begun."""
+    if not device.is_cpu or usable_cores() < 2:
+        return
+    sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
+    missing = _missing({module: size for module, size in sizes.items() if module not in _begun}, device)
+    if missing:
+        _Said.anything = True  # or else a line would come of what nobody waits for
+        _begun.update(dict.fromkeys(missing, helpers().submit(_side_by_side, missing, device, 1)))
 
 
 def begin_headers(kernel: wp.Kernel, device: Any) -> None:
@@ -88,10 +102,9 @@ def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     """Compile and load the modules of kernels that are not in the cache, if there are several; one alone can as well be
     compiled when it is launched."""
     _HEADERS.wait()
-    sizes: dict[Any, int] = {}
-    for kernel in kernels:
-        sizes[kernel.module] = sizes.get(kernel.module, 0) + len(kernel.adj.source) * (1 + 9 * _sums(kernel))
-    missing = sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
+    sizes = _sizes(kernels)
+    wait([_begun.pop(module) for module in sizes if module in _begun])
+    missing = _missing(sizes, device)
     if len(missing) < 2:
         return
     # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
@@ -99,6 +112,19 @@ def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     with _announced(len(missing), device):
         # The smallest comes first, with which the headers are precompiled; then those that take longest.
         _side_by_side([missing[-1], *missing[:-1]], device, cores)
+
+
+def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
+    """The modules of kernels, and a number for each that grows with the time that it takes to compile."""
+    found: dict[Any, int] = {}
+    for kernel in kernels:
+        found[kernel.module] = found.get(kernel.module, 0) + len(kernel.adj.source) * (1 + 9 * _sums(kernel))
+    return found
+
+
+def _missing(sizes: Mapping[Any, int], device: Any) -> list[Any]:
+    """Which modules have to be compiled, those that take longest first."""
+    return sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
 
 
 def _sums(kernel: wp.Kernel) -> bool:
@@ -183,8 +209,15 @@ class _Headers:
 
 
 _HEADERS = _Headers()
+
+
+def _wait_for_all() -> None:
+    _HEADERS.wait()
+    wait(list(_begun.values()))
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_HEADERS.wait)  # a child would wait for ever for what no thread of its own ends
+    os.register_at_fork(before=_wait_for_all)  # a child would wait for ever for what no thread of its own ends
 
 
 # ---- messages --------------------------------------------------------------------------------------------------------

@@ -18,11 +18,12 @@ AIR = 1.25
 """How much higher a picture is, at least, than what it shows would be if it were as wide as the picture."""
 
 
-def framed_together(stages: Sequence[PlaneStage | Stage]) -> tuple[list[PlaneStage | Stage], int]:
-    """Stages of one dimension, each in its part of a page as wide as the first one's picture and no higher, all in the
-    same scale, seen by a camera that sees all that any of them shows; and how many go into a row. Raises `InputError`
-    where parts are too small."""
-    page, count = stages[0].picture, len(stages)
+def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
+    """Stages of one dimension, each in its part of a page as wide as the first one's picture but for some ``spare``
+    columns and no higher, all in the same scale, seen by a camera that sees all that any of them shows; and how many go
+    into a row. Raises `InputError` where parts are too small."""
+    whole, count = stages[0].picture, len(stages)
+    page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
     ends = lower.min(axis=0), upper.max(axis=0)
     shown = stages[0].framed(ends, page).seen_size

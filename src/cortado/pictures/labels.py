@@ -25,7 +25,7 @@ def labelled(image: Points, text: str, below: str = "") -> Points:
     rows, columns = image.shape[:2]
     size = max(round(0.042 * rows), SMALL)
     left, top = round(0.9 * size), round(0.7 * size)
-    size = max(min(size, int(size * (columns - 2 * left) / max(_font(size).getlength(text), 1.0))), SMALLEST)
+    size = max(min(size, int(size * (columns - 2 * left) / max(length_of(text, size), 1.0))), SMALLEST)
     return written(image, [((left, top), text, "la"), ((left, rows - top), below, "ld")], size)
 
 
@@ -35,6 +35,11 @@ def written(image: Points, texts: Sequence[Text], size: int) -> Points:
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
+
+
+def length_of(text: str, size: int) -> float:
+    """How many pixels a text is wide, in letters that are so many pixels high."""
+    return float(_font(size).getlength(text))
 
 
 @lru_cache(maxsize=32)

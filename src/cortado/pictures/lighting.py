@@ -51,15 +51,17 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
+        is_under_floor = s.has_floor > 0 and p[1] < s.floor_height and n[1] < 0.0  # not seen: nothing is in its way
         around = wp.vec3(0.0)
         for k in range(directions.shape[0]):
             d = wp.normalize(n + 0.999 * directions[k])  # cosine-weighted
             arriving = wp.lerp(s.horizon, s.zenith, wp.max(d[1], 0.0))
             if d[1] < 0.0:
                 arriving = 0.55 * s.floor_colour
-            hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
-            if hit.result:
-                arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
+            if not is_under_floor:
+                hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
+                if hit.result:
+                    arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
             if has_opaque:
                 arriving = past_solids(s, p, d, reach, arriving)
             around += arriving

@@ -2,17 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
-import warp as wp
 
-from cortado.device.bands import BandLauncher
 from cortado.device.cores import usable_cores
-from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
-from cortado.pictures.liquid import liquid_surface
-from cortado.pictures.particles import Particles
 
 NEIGHBOURS = 24
 """Particles that a point of the surface has its colour from."""
@@ -33,15 +27,6 @@ class Surface:
     """(p, 3) unit vectors outwards"""
     colours: Points
     """(p, 3) linear, from 0 to 1"""
-
-
-def liquid(positions: Points, colours: Points, spacing: float, device: Any = "cpu") -> Surface:
-    """The surface of what particles (n, 3) [m] with colours (n, 3) fill; see `liquid_surface`."""
-    launch = BandLauncher(wp.get_device(device))
-    with WARP:
-        found = liquid_surface(Particles.on(launch.device, positions, colours), spacing, launch)
-        corners = found.triangles.numpy().reshape(-1, 3)
-        return Surface(found.points.numpy(), corners, found.normals.numpy(), found.colours.numpy())
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:

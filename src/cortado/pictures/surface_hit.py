@@ -24,18 +24,40 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 
 @wp.func
+def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
+    """The same, quicker, with the triangle that is straight behind the wall, along its normal, outwards; not found
+    where that is not near, and where p is not within fluid."""
+    met = SurfaceHit()
+    met.found = False
+    hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)
+    if hit.result and hit.sign < 0.0:
+        met = at_surface(surface, t, d, hit.face, hit.u, hit.v)
+        met.normal = normal
+    return met
+
+
+@wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
     """Where a ray comes into the fluid on a part of its way, on which no transparent solid is."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
-    start = wp.max(part[0], 0.0)
-    hit = wp.mesh_query_ray(surface.mesh, o + start * d, d, FAR)
+    if part[0] <= 0.0:
+        hit = wp.mesh_query_ray(surface.mesh, o, d, part[1])
+        if hit.result:
+            met = at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
+        return met
+    start = part[0]
+    p = o + start * d
+    normal = wall_normal(s, p)
+    touched = behind_wall(surface, p, d, start, normal)
+    if touched.found:
+        return touched
+    hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
     if not hit.result:
         return met
-    if hit.sign < 0.0 and part[0] > 0.0:
-        p = o + start * d
-        return at_wall(s, surface, p, d, start, wall_normal(s, p))
+    if hit.sign < 0.0:
+        return at_wall(s, surface, p, d, start, normal)
     if start + hit.t > part[1]:
         return met
     return at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
@@ -103,16 +125,19 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
         return met
 
     @wp.func
-    def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-        """Where a ray within the fluid comes out of it, or meets an opaque solid."""
+    def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, most: wp.float32):
+        """Where a ray within the fluid comes out of it, or meets an opaque solid, after a way of ``most`` [m] at
+        most, beyond which it is not followed."""
         part = room(s, o, d)
-        hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
+        wall_at = wp.where(part[1] > 0.0, part[1], FAR)
+        hit = wp.mesh_query_ray(surface.mesh, o, d, wp.min(wall_at, most))
         met = SurfaceHit()
         met.found = hit.result
-        met.t = 0.0
-        if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
+        met.t = wp.where(most < FAR, most, 0.0)
+        if hit.result:
             met = at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
-        elif hit.result:  # the wall comes first; what colour fluid has there does not matter
+        elif wall_at < most:  # the wall comes first; what colour fluid has there does not matter
+            met.found = True
             met.t = part[1]
             met.normal = -wall_normal(s, o + part[1] * d)
             if s.has_walls > 0:

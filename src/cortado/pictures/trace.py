@@ -3,8 +3,9 @@
 A ray that meets the fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid.
 What is refracted goes on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses
 the part 1 - exp(-scattering L), instead of which it gets the colour of the fluid in the light that falls on it,
-and of what remains the part colour^(absorption L) is left, by Beer and Lambert's law. Fluid is all the way what it is
-where a ray comes into it.
+and of what remains the part colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves
+the fluid for the surroundings near the critical angle, it is split again, and what is reflected goes on. Fluid is all
+the way what it is where a ray comes into it.
 """
 
 from functools import cache
@@ -21,6 +22,11 @@ from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, s
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index, of water."""
+FAINT = wp.constant(wp.float32(0.05))
+"""Reflectance below which light that leaves fluid is not split: what remains of it grows from 0 there, and is 1 where
+reflection is total, or else there would be an edge in the light where a smooth surface comes near that angle."""
+DARK = wp.constant(wp.float32(10.0))
+"""How many free paths of light within fluid nothing is seen beyond: a part of 5e-5 goes as far."""
 
 
 @wp.struct
@@ -82,7 +88,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         inside = wp.bool(True)
         for _ in range(SEGMENTS):
             if inside:
-                met = leave(s, surface, o, d)
+                met = leave(s, surface, o, d, wp.min(DARK / wp.max(medium[0], 1.0e-6), FAR))
                 left = wp.exp(-medium[0] * met.t)
                 soft = 0.55 * lit + wp.vec3(0.40)
                 found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
@@ -98,12 +104,21 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
             n = met.normal
             cosine = -wp.dot(n, d)
             if inside:
-                sine2 = INDEX * INDEX * (1.0 - cosine * cosine)
-                if sine2 >= 1.0:
+                outside = wp.sqrt(wp.max(1.0 - INDEX * INDEX * (1.0 - cosine * cosine), 0.0))  # cosine there
+                kept = wp.max(schlick(0.02, outside) - FAINT, 0.0) / (1.0 - FAINT)
+                refracted = wp.normalize(INDEX * d + (INDEX * cosine - outside) * n)
+                if kept > 0.0 and outside > 0.0:
+                    if meet(s, surface, p - s.nearest * n, refracted).found:
+                        kept = 0.0  # it goes on through that
+                    else:
+                        leaving = background(s, shadow, p - s.nearest * n, refracted, spread)
+                        found += (1.0 - kept) * wp.cw_mul(through, leaving)
+                        through = kept * through
+                if kept > 0.0:
                     d = wp.normalize(mirrored(d, n))
                     o = p + s.nearest * n
                 else:
-                    d = wp.normalize(INDEX * d + (INDEX * cosine - wp.sqrt(1.0 - sine2)) * n)
+                    d = refracted
                     o = p - s.nearest * n
                     inside = False
             else:
@@ -122,8 +137,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
                 o = p - s.nearest * n
                 inside = True
         if inside:
-            kept = tinted(c, wp.min(medium[1] * s.size, 1.0))  # it goes on to and fro
-            return found + wp.cw_mul(through, wp.cw_mul(kept, lit))
+            left_over = tinted(c, wp.min(medium[1] * s.size, 1.0))  # it goes on to and fro
+            return found + wp.cw_mul(through, wp.cw_mul(left_over, lit))
         return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
 
     @wp.func

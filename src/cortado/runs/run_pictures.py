@@ -1,19 +1,22 @@
 """Shaded pictures, a film and a view of one run."""
 
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, corners
 from cortado.files.progress import announce
 from cortado.pictures.film import film
+from cortado.pictures.grid import LEAST
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.pace import pace_of
 from cortado.pictures.page import Page, alone
+from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scale import Scale
 from cortado.pictures.scene_view import scene_view
+from cortado.pictures.stage import Stage
 from cortado.runs.report import Figures
 from cortado.runs.shown_run import ShownRun
 from cortado.runs.trajectory import Trajectory
@@ -46,13 +49,21 @@ def run_page(
     """The frames of a run by their number. ``values`` (frames, n): what the scene colours its particles by; ``unit``
     of what all scenes do not have."""
     run, picture = ShownRun(scene, trajectory, values), scene.picture or Picture()
-    scale = None if values is None else Scale.of(picture.colour, values, unit)
-    composed = alone if scale is None else partial(_beside, scale)
-    return Page([run.panel(run.stage, device, scale)], composed, run.fingerprint)
+    if values is None:
+        return Page([run.panel(run.stage, device, None)], fingerprint=run.fingerprint)
+    scale = Scale.of(picture.colour, values, unit)
+    stage, composed = _with_scale(run.stage, scale)
+    return Page([run.panel(stage, device, scale)], lambda images: composed(alone(images)), run.fingerprint)
 
 
-def _beside(scale: Scale, images: list[Points]) -> Points:
-    return scale.beside(alone(images))
+def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
+    """Where a picture has a scale at its right edge: on it, or beside a narrower one if it would cover what is
+    shown."""
+    free = stage.picture.width - scale.columns(stage.picture.height)
+    is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
+    if not is_covered or free < LEAST:
+        return stage, scale.on
+    return stage.framed(stage.ends, stage.picture.model_copy(update={"width": free})), scale.beside
 
 
 def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:

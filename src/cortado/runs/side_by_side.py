@@ -112,10 +112,11 @@ def shown_alike(
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
     """Runs of scenes that are `shown_alike`, each with its name and its time; and the times of its frames [s]."""
     times = common_times([run.trajectory.times for run in runs])
-    stages, across = framed_together([run.stage for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
-    colour = (runs[0].scene.picture or Picture()).colour
-    scale = Scale.of(colour, np.concatenate(values)) if values else None
+    picture = runs[0].scene.picture or Picture()
+    scale = Scale.of(picture.colour, np.concatenate(values)) if values else None
+    spare = 0 if scale is None else scale.columns(picture.height)
+    stages, across = framed_together([run.stage for run in runs], spare)
     shown = [ShownFrames(run.trajectory.times, times) for run in runs]
     panels = [
         _labelled(run.panel(stage, device, scale), name, frames)
@@ -136,7 +137,6 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
-    """The page, with the scale in the last picture of the first row."""
-    if scale is not None:
-        images = [scale.beside(image) if k == across - 1 else image for k, image in enumerate(images)]
-    return side_by_side(images, across)
+    """The page, with the scale beside it."""
+    page = side_by_side(images, across)
+    return page if scale is None else scale.beside(page)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.cli.commands.drawing_time import seconds_of_picture
 from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.cli.commands.run_length import RunLength
 from cortado.device.memory import step_parts
@@ -80,6 +81,8 @@ def describe_scene(
     simulation = Simulation(load_scene(scene_file, overrides), device, precision)
     length = RunLength.of(simulation, steps, time, frames)
     found = _described(simulation, length)
+    if length.film is not None:
+        found["picture_seconds"] = seconds_of_picture(simulation)
     if "optimise" in read_toml(scene_file):
         found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:
@@ -206,7 +209,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
         ),
         ("time", _time(found, length)),
         ("trajectory", _trajectory(length)),
-        ("film", _film(length)),
+        ("film", _film(length, found.get("picture_seconds"))),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
     rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
@@ -249,8 +252,12 @@ def _trajectory(length: RunLength) -> str:
     )
 
 
-def _film(length: RunLength) -> str:
-    """What the film of the run shows, and how long it is."""
+def _film(length: RunLength, seconds: float | None) -> str:
+    """What the film of the run shows, how long it is, and how long it takes to draw, if a picture takes so many
+    seconds."""
+    if length.film is not None and seconds is not None:
+        drawn = _duration(len(length.film.frames) * seconds)
+        return f"{length.film}; {drawn} to draw, {seconds:.2g} s for the first state; splashes take up to twice as long"
     if length.film is not None:
         return f"{length.film}; what it takes to draw it comes on top"
     return "of unknown length; --time says it" if length.time is None else "none"

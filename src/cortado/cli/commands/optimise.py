@@ -21,7 +21,7 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.figures import task_figures
 from cortado.optimisation.inverse.knots import knot_values
 from cortado.optimisation.inverse.setup import Setup, setup
-from cortado.optimisation.inverse.shaded import shaded_figures
+from cortado.optimisation.inverse.shaded import begin_shaded, shaded_figures
 from cortado.optimisation.inverse.task import Task, load_task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Record, Result, optimise
@@ -88,6 +88,9 @@ def _kept(folder: RunFolder) -> str:
 
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
+    shades = pictures and _can_shade(made)
+    if shades:
+        begin_shaded(made)
     try:
         result = _search(made, folder, resume, executor)
     except DivergedError as error:
@@ -109,7 +112,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     said = [summary, *advice]
     announce("\n".join([summary, *found_lines(made, estimate, knots), *advice]))
     with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
-        shaded = _shaded(made, result, folder.figures, pictures)
+        shaded = shaded_figures(made, result, folder.figures) if shades else TaskFigures()
         figures = shaded + task_figures(made, result, folder.figures)
         rows = found_rows(made, estimate, knots, verdict.errors)
         write_report(folder, made.task.scene.name, sections(made, estimate, result, verdict, said, figures, rows))
@@ -121,12 +124,12 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     return f"The results are in {folder.path}; open {to_open}."
 
 
-def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> TaskFigures:
-    """Shaded pictures and films, where they are wished; none, and a sentence, where a package is missing."""
-    missing = lacking(made.task.scene) if wished else None
+def _can_shade(made: Setup) -> bool:
+    """Whether there can be shaded pictures and films; says so where a package is missing."""
+    missing = lacking(made.task.scene)
     if missing:
         say(missing)
-    return shaded_figures(made, result, folder) if wished and not missing else TaskFigures()
+    return not missing
 
 
 def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:

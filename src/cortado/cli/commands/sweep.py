@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.arrays import check_steps
-from cortado.cli.arguments import STEPS
+from cortado.cli.arguments import ALL_FRAMES, STEPS, FrameOptions
 from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
@@ -18,7 +18,7 @@ from cortado.files.progress import track, untracked
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.sweep.combinations import Combination, combinations
 from cortado.optimisation.sweep.table import NAME, failed, write_table
-from cortado.runs.frame_choice import EverySteps
+from cortado.runs.frame_choice import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
@@ -40,6 +40,8 @@ class Member:
     """The folder of the sweep."""
     device: str
     precision: str
+    frames: FrameOptions
+    """Of runs of a scene."""
     report: bool
     """Whether each run of a scene has figures and a report."""
 
@@ -67,7 +69,7 @@ class Member:
             scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
         else:
             scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
-            settings = run_settings(steps, self.precision, _frames(steps))
+            settings = run_settings(steps, self.precision, self._frames(steps))
         folder = self._folder(combination)
         if folder is None:
             return None
@@ -113,12 +115,17 @@ class Member:
     def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
         """The run of a combination; one that was begun goes on."""
         steps = self.steps(combination)
-        frames = _frames(steps)
-        command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(frames.steps)]
+        frames = self._frames(steps)
+        ((name, value),) = frames.settings.items()
+        command = ["cortado", "run", *words, "--steps", str(steps), f"--{name.replace('_', '-')}", str(value)]
         asked = combination.overrides, self.device, self.precision, frames
         return RunRequest(
             self.out / combination.name, steps, None, *asked, resume=begun, command=command, report=self.report
         )
+
+    def _frames(self, steps: int) -> FrameChoice:
+        """About a hundred where nothing is said."""
+        return self.frames.choice(max(steps // 100, 1))
 
 
 def run_sweep(
@@ -131,15 +138,18 @@ def run_sweep(
     device: str,
     precision: str,
     where: Where,
+    frames: FrameOptions = ALL_FRAMES,
     pictures: bool = True,
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
     chosen = combinations(options, zipped)
     duration = _duration(file, chosen, steps, time)
-    if duration is None and not pictures:
-        raise InputError("--no-pictures is given, but must be left out of a sweep of a task.")
-    member = Member(file.absolute(), duration, out.absolute(), device, precision, pictures)
+    of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
+    for name, value in of_scenes.items():
+        if duration is None and value:
+            raise InputError(f"--{name} is given, but must be left out of a sweep of a task.")
+    member = Member(file.absolute(), duration, out.absolute(), device, precision, frames, pictures)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
     there = len(done)
@@ -205,11 +215,6 @@ def _time_step(file: Path, combination: Combination) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
-
-
-def _frames(steps: int) -> EverySteps:
-    """About a hundred frames."""
-    return EverySteps(max(steps // 100, 1))
 
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.compiling import compile_meanwhile
 from cortado.discretise.shapes import Points
 from cortado.files.progress import announce
 from cortado.losses import Snapshot
@@ -30,6 +31,13 @@ EVALUATIONS = (1, 5, 20, 100)
 """Whose runs are shown, as far as the search went; 0 is the first guess."""
 Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
+
+
+def begin_shaded(made: Setup) -> None:
+    """Compile what will draw them while the search goes on, which leaves a core to spare."""
+    simulation = made.problem.simulation
+    artist = painter(made.task.scene, simulation.positions, simulation.device)
+    compile_meanwhile(artist, simulation.device)
 
 
 def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:

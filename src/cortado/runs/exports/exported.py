@@ -3,17 +3,19 @@
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
-from cortado.pictures.painter import colours_of
+from cortado.pictures.contained_liquid import contained_liquid
+from cortado.pictures.painter import colours_of, spread
 from cortado.pictures.scale import Scale
 from cortado.pictures.shown_solids import ShownSolid, shown_solids
 from cortado.pictures.solid_mesh import SolidMesh
-from cortado.pictures.stage import upright
-from cortado.pictures.surface import liquid, nearest_colours, spheres
+from cortado.pictures.stage import Stage, upright
+from cortado.pictures.surface import nearest_colours, spheres
 from cortado.runs.colouring import coloured_by
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
@@ -137,10 +139,17 @@ class Exported:
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
         return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
 
+    @cached_property
+    def _stage(self) -> Stage:
+        """Of a run in 3-D: whether its fluid ends at the walls of its container."""
+        return Stage.of(self.scene, spread(list(self._trajectory.positions)))
+
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
-        makes = spheres if (self.scene.picture or Picture()).surface == "spheres" else liquid
         try:
-            found = makes(positions, colours, self.spacing)
+            if self._stage.picture.surface == "spheres":
+                found = spheres(positions, colours, self.spacing)
+            else:
+                found = contained_liquid(self._stage, positions, colours)
         except ComputationError:
             return None
         own = nearest_colours(found.points, positions, velocities, self.spacing)
