@@ -1,0 +1,104 @@
+"""Slopes over the width of the error bars, where tangents only tell those of a wiggle.
+
+What particles predict is a rough function of a parameter: the height of a surface moves in small jumps, as particles
+pass each other. Its derivative at a point may be many times as steep as what a change by a standard error does, and
+bars from it are as many times too small. So a forward run for each number looks one standard error away. Where that is
+not what the tangents say, differences over the width of the bars replace them, until the bars that follow are those
+that the differences were taken over.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.optimisation.fitting.certainty import Certainty
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.search import GREATEST_LOGARITHM, TINY, next_point
+
+REACH = 2.0
+"""Standard errors: to the ends of the intervals of 95 %."""
+STRAIGHT = 0.3
+"""Of what tangents say of one standard error: by so much less it may be off."""
+ROUNDING = 1e-5
+"""Of the largest number measured: bars that change what is predicted by less are not looked at."""
+MOST_ROUNDS = 8
+"""Of differences, each over the bars of the one before."""
+SETTLED = 0.3
+"""Of a standard error: a round that moves the estimate by less, and changes no bar by more, is the last."""
+
+
+def over_the_bars(
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
+) -> tuple[Linearised, bool | None]:
+    """The end of a search with slopes that hold over the width of the bars, and whether they settled; None where the
+    tangents do hold."""
+    axes = _axes(problem, at, weights)
+    if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
+        return at, None
+    for _ in range(MOST_ROUNDS):
+        at, tried = _differences(problem, at, weights, axes)
+        point, _ = next_point(problem, at, weights)
+        tried = [at, *tried, *_moved(problem, at, point - at.u)]
+        ended = min(tried, key=lambda one: problem.sum_of_squares(one.residuals, weights))
+        wider = _axes(problem, ended, weights)
+        moved = np.abs(np.linalg.solve(wider, ended.u - at.u)).max()
+        grown = np.linalg.norm(wider, axis=0) / np.linalg.norm(axes, axis=0) - 1.0
+        at, axes = ended, np.where(grown < 0.0, 0.5 * (axes + wider), wider)  # else they alternate
+        if max(moved, np.abs(grown).max()) <= SETTLED:
+            return at, True
+    return at, False
+
+
+def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+    """(free, free) columns of independent moves by a standard error each, none longer than a step of a search."""
+    axes = REACH * np.linalg.cholesky(Certainty.of(problem, at, weights).covariance)
+    logarithmic = problem.coordinates.logarithmic[problem.coordinates.free]
+    longest = np.abs(axes[logarithmic]).max(axis=0, initial=TINY)
+    return np.asarray(axes * np.minimum(1.0, GREATEST_LOGARITHM / longest))
+
+
+def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
+    """Whether a standard error away it is as the tangents say, on the side to which the search did not get."""
+    each = zip(problem.parts, at.jacobians, strict=True)
+    if all(np.abs(J @ axis).max() <= ROUNDING * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
+        return True
+    J, r = problem.stacked(at, weights)
+    onwards = -1.0 if (problem.coordinates.start - at.u) @ axis > 0.0 else 1.0
+    for way in (onwards, -onwards):
+        for one in _moved(problem, at, way * axis):
+            said = J @ (one.u - at.u)
+            off = problem.stacked(one, weights)[1] - r - said
+            return bool(np.linalg.norm(off) <= STRAIGHT * np.linalg.norm(said))
+    return True
+
+
+def _differences(
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
+) -> tuple[Linearised, list[Linearised]]:
+    """The same point, with differences towards the side of each axis on which less changes as its Jacobian, and the
+    points that were run for them."""
+    tried, columns = list[Linearised](), list[list[np.ndarray]]()
+    for axis in axes.T:
+        ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
+        slopes = [_difference(at, end, axis) for end in ends] or [[J @ axis for J in at.jacobians]]
+        columns.append(min(slopes, key=lambda one: problem.sum_of_squares(one, weights)))
+        tried += ends
+    inverse = np.linalg.inv(axes)
+    jacobians = [np.stack(part, axis=-1) @ inverse for part in zip(*columns, strict=True)]
+    return Linearised(at.u, at.residuals, jacobians), tried
+
+
+def _difference(at: Linearised, end: Linearised, axis: np.ndarray) -> list[np.ndarray]:
+    """What changes along a whole axis, of each part; an end at a bound is nearer."""
+    share = float((end.u - at.u) @ axis / (axis @ axis))
+    return [(after - before) / share for before, after in zip(at.residuals, end.residuals, strict=True)]
+
+
+def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
+    """The point that is so far away, within the bounds, with the Jacobian of this one; none where its run diverges."""
+    point = np.clip(at.u + shift, *problem.coordinates.bounds)
+    try:
+        return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
+    except DivergedError:
+        return []
