@@ -8,6 +8,7 @@ that the differences were taken over.
 """
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -76,23 +77,27 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weight
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """The same point, with differences towards the side of each axis on which less changes as its Jacobian, and the
-    points that were run for them."""
+    """The same point with differences along the axes as its Jacobian, and the points that were run for them.
+
+    Of the differences to both sides and of that across the one in which least changes is taken: the point itself may
+    lie on a kink, or in a hole that is far narrower than the bars."""
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
-        slopes = [_difference(at, end, axis) for end in ends] or [[J @ axis for J in at.jacobians]]
-        columns.append(min(slopes, key=lambda one: problem.sum_of_squares(one, weights)))
+        slopes = [_difference(a, b, axis) for a, b in combinations([at, *ends], 2)]
+        columns.append(
+            min(slopes or [[J @ axis for J in at.jacobians]], key=lambda one: problem.sum_of_squares(one, weights))
+        )
         tried += ends
     inverse = np.linalg.inv(axes)
     jacobians = [np.stack(part, axis=-1) @ inverse for part in zip(*columns, strict=True)]
     return Linearised(at.u, at.residuals, jacobians), tried
 
 
-def _difference(at: Linearised, end: Linearised, axis: np.ndarray) -> list[np.ndarray]:
-    """What changes along a whole axis, of each part; an end at a bound is nearer."""
-    share = float((end.u - at.u) @ axis / (axis @ axis))
-    return [(after - before) / share for before, after in zip(at.residuals, end.residuals, strict=True)]
+def _difference(a: Linearised, b: Linearised, axis: np.ndarray) -> list[np.ndarray]:
+    """What changes along a whole axis, of each part, by two points on it."""
+    share = float((b.u - a.u) @ axis / (axis @ axis))
+    return [(after - before) / share for before, after in zip(a.residuals, b.residuals, strict=True)]
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:

@@ -20,7 +20,7 @@ POOR, GOOD = 0.25, 0.75
 """Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
 gains more, half as much."""
 MOST_FAILURES = 3
-"""Trial points in succession that are no lower: then the Jacobian is estimated anew."""
+"""Trial points in succession that are no lower: then the Jacobian is estimated anew, and after as many more it ends."""
 
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
@@ -98,10 +98,12 @@ def search(
             lowest, base, failures = squares, number, 0
         else:
             failures += 1
-        has_failed = failures == MOST_FAILURES
-        at = problem.estimated(at.u) if has_failed else points.linearised(base)
-        if has_failed or points.are_many:
-            points, base, failures = TrialPoints(problem, weights, at), 0, 0
+        if failures == 2 * MOST_FAILURES:
+            break
+        is_stuck = failures == MOST_FAILURES
+        at = problem.estimated(at.u) if is_stuck else points.linearised(base)
+        if is_stuck or points.are_many:
+            points, base = TrialPoints(problem, weights, at), 0
         if share < POOR:
             damping = max(10.0 * damping, FIRST_DAMPING)
         elif share > GOOD:
