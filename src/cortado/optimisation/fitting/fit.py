@@ -1,23 +1,27 @@
 """`cortado.fit`: the parameters of measured experiments, with error bars."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from cortado.arrays import require_function, require_table, whole_number
-from cortado.errors import InputError, shown
+from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.optimisation.fitting.bar_slopes import over_the_bars
 from cortado.optimisation.fitting.certainty import Certainty, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.doubts import doubts
+from cortado.optimisation.fitting.doubts import doubts_of
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.fitted import Fit
+from cortado.optimisation.fitting.fitted import Fit, Tried
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.other_starts import elsewhere, misfit, other_starts, other_valleys
 from cortado.optimisation.fitting.search import least, search
 from cortado.scene.parameters.parameter import Range
 
 POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
+OTHERS = 3
+"""Starts besides the one that was given, for a fit that ends in doubt."""
 ROUGHLY = 1e-3
 """Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
 
@@ -28,6 +32,7 @@ def fit(
     bounds: Mapping[str, tuple[Any, Any]] | None = None,
     iterations: int = 50,
     on_trial: Callable[[], None] | None = None,
+    starts: int | None = None,
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, and say how certain they are.
 
@@ -44,6 +49,10 @@ def fit(
             bounds are the same is not searched.
         iterations: greatest number of trial points of each of the two fits.
         on_trial: called after each trial point.
+        starts: from how many starts to search; all but the first are chosen by forward runs over the bounds, or over
+            two decades to both sides of a positive number. If left out, the fit searches from `start` alone, and from
+            three others where that ends in doubt. The fit with the least residuals is returned, and where all of the
+            searches ended is its ``tried``.
 
     Raises:
         InputError: a start, bounds or experiments that do not fit.
@@ -58,6 +67,7 @@ def fit(
     require_table("start", start, "{'viscosity': 1.0}")
     require_function("on_trial", on_trial)
     iterations = whole_number("iterations", iterations, 1)
+    starts = None if starts is None else whole_number("starts", starts, 1)
     known = each[0].simulation.known
     own = {name: value for one in each for name, value in one.start.items()}
     given = {**start, **{name: value for name, value in own.items() if name not in start}}
@@ -67,17 +77,46 @@ def fit(
     unseen = {name: mask for one in each for name, mask in one.unseen.items()}
     coordinates = Coordinates.of(given, positive, bounds, unseen)
     problem = LeastSquares(each, coordinates, on_trial)
-    at = problem.estimated(coordinates.start)
+    found = _from(problem, coordinates.start, iterations)
+    if starts == 1 or (starts is None and not found.in_doubt):
+        return found
+    return _best(problem, found, iterations, starts)
+
+
+def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
+    """From one start: a first search, with residuals as they are, and a second one with weights that they ask for."""
+    at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
-    return _ended(problem, search(problem, at, weights, iterations, ROUGHLY).at, weights, iterations)
-
-
-def _ended(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], iterations: int) -> Fit:
-    """From where a first search ended: the second one, with weights that the residuals ask for, and the bars."""
+    at = search(problem, at, weights, iterations, ROUGHLY).at
     weights = noise_of(problem, at, weights)
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
+    return _fitted(problem, at, weights, converged if settled is None else settled, start)
+
+
+def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
+    """Of this fit and of those from other starts that with the least residuals. Where it is not said how many, one
+    without doubt is the last, or one that ends where all others did."""
+    tried = list(found.tried)
+    for start in other_starts(problem, OTHERS if starts is None else starts - 1):
+        try:
+            other = _from(problem, start, iterations)
+        except (ComputationError, DivergedError):  # there, nothing is told
+            continue
+        tried += other.tried
+        if other.tried[0].misfit < min(one.misfit for one in found.tried):
+            found = other
+        if starts is None and not (found.in_doubt and elsewhere(found, tried)):
+            break
+    doubts = (*found.doubts, *other_valleys(found, tried))
+    return replace(found, tried=tuple(tried), doubts=doubts, runs=problem.runs, tangents=problem.tangents)
+
+
+def _fitted(
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], converged: bool, start: np.ndarray
+) -> Fit:
+    """With the covariance, and what the residuals say of the noise and of the model."""
     found = Certainty.of(problem, at, weights)
     return Fit(
         coordinates=problem.coordinates,
@@ -86,8 +125,9 @@ def _ended(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], 
         naive_covariance=counted_covariance(problem, at, weights),
         degrees_of_freedom=found.degrees_of_freedom,
         parts=found.parts,
-        doubts=doubts(problem, at, weights, found.scores, problem.coordinates.labels),
-        converged=converged if settled is None else settled,
+        doubts=doubts_of(problem, at, weights, found),
+        converged=converged,
+        tried=(Tried(start, at.u, misfit(problem, at.residuals)),),
         runs=problem.runs,
         tangents=problem.tangents,
         sum_of_squares=problem.sum_of_squares(at.residuals, weights),
