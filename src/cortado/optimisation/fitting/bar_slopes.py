@@ -37,6 +37,7 @@ def over_the_bars(
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
+    at = Linearised(at.u, problem.residuals(at.u), at.jacobians)  # the end of a search was not run
     for _ in range(MOST_ROUNDS):
         at, tried = _differences(problem, at, weights, axes)
         point, _ = next_point(problem, at, weights)
