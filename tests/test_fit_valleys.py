@@ -128,6 +128,15 @@ def test_what_is_hardly_told_is_a_doubt():
     assert any("hardly tells viscosity" in one for one in found.doubts)
 
 
+def test_what_is_explained_to_the_last_bit_is_not_doubted():
+    made = Formula(behind_a_wall, 2.0)
+    made.observations["gauge"].measured = made.predicted({"viscosity": np.array(2.0)})["gauge"]
+    made.observations["gauge"].noise = None
+    for start in (2.0, 1.5):
+        found = cortado.fit(made, {"viscosity": start}, starts=3)
+        assert not found.in_doubt and found.values["viscosity"] == pytest.approx(2.0, rel=1e-4)
+
+
 @pytest.mark.parametrize("starts", [0, 1.5, "many"])
 def test_wrong_starts_are_a_sentence(starts):
     with pytest.raises(InputError, match="starts is") as error:

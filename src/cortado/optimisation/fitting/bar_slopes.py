@@ -2,7 +2,7 @@
 
 What particles predict is a rough function of a parameter: the height of a surface moves in small jumps, as particles
 pass each other. Its derivative at a point may be many times as steep as what a change by a standard error does, and
-bars from it are as many times too small. So a forward run for each number looks one standard error away. Where that is
+bars from it are as many times too small. So a forward run for each number looks two standard errors away. Where that is
 not what the tangents say, differences over the width of the bars replace them, until the bars that follow are those
 that the differences were taken over.
 """
@@ -18,15 +18,19 @@ from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised,
 from cortado.optimisation.fitting.search import GREATEST_LOGARITHM, TINY, next_point
 
 REACH = 2.0
-"""Standard errors: to the ends of the intervals of 95 %."""
+"""Standard errors, to about the ends of intervals of 95 %: how far away it looks."""
 STRAIGHT = 0.3
-"""Of what tangents say of one standard error: by so much less it may be off."""
+"""Of what tangents say of the change up to there: by so much it may be off."""
 ROUNDING = 1e-5
 """Of the largest number measured: bars that change what is predicted by less are not looked at."""
 MOST_ROUNDS = 8
 """Of differences, each over the bars of the one before."""
 SETTLED = 0.3
-"""Of a standard error: a round that moves the estimate by less, and changes no bar by more, is the last."""
+"""Of that distance: a round that moves the estimate by less, and changes no bar by more of itself, is the last."""
+LEAST_SHARE = 0.1
+"""Of that distance: nearer points, as at a bound, tell no difference."""
+ROUND_OFF = 1e-12
+"""Of a variance."""
 
 
 def over_the_bars(
@@ -53,15 +57,16 @@ def over_the_bars(
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """(free, free) columns of independent moves by a standard error each, none longer than a step of a search."""
-    axes = REACH * np.linalg.cholesky(Certainty.of(problem, at, weights).covariance)
+    """(free, free) columns of independent moves by so many standard errors, none longer than a step of a search."""
+    covariance = Certainty.of(problem, at, weights).covariance
+    axes = REACH * np.linalg.cholesky(covariance + (ROUND_OFF * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.logarithmic[problem.coordinates.free]
     longest = np.abs(axes[logarithmic]).max(axis=0, initial=TINY)
     return np.asarray(axes * np.minimum(1.0, GREATEST_LOGARITHM / longest))
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
-    """Whether a standard error away it is as the tangents say, on the side to which the search did not get."""
+    """Whether at the end of an axis it is as the tangents say, on the side to which the search did not get."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= ROUNDING * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -85,19 +90,18 @@ def _differences(
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
-        slopes = [_difference(a, b, axis) for a, b in combinations([at, *ends], 2)]
-        columns.append(
-            min(slopes or [[J @ axis for J in at.jacobians]], key=lambda one: problem.sum_of_squares(one, weights))
-        )
+        pairs = [(a, b, float((b.u - a.u) @ axis / (axis @ axis))) for a, b in combinations([at, *ends], 2)]
+        slopes = [_difference(a, b, share) for a, b, share in pairs if abs(share) > LEAST_SHARE]
+        slopes = slopes or [[J @ axis for J in at.jacobians]]
+        columns.append(min(slopes, key=lambda one: problem.sum_of_squares(one, weights)))
         tried += ends
     inverse = np.linalg.inv(axes)
     jacobians = [np.stack(part, axis=-1) @ inverse for part in zip(*columns, strict=True)]
     return Linearised(at.u, at.residuals, jacobians), tried
 
 
-def _difference(a: Linearised, b: Linearised, axis: np.ndarray) -> list[np.ndarray]:
-    """What changes along a whole axis, of each part, by two points on it."""
-    share = float((b.u - a.u) @ axis / (axis @ axis))
+def _difference(a: Linearised, b: Linearised, share: float) -> list[np.ndarray]:
+    """What changes along a whole axis, of each part, by two points that are a share of it apart."""
     return [(after - before) / share for before, after in zip(a.residuals, b.residuals, strict=True)]
 
 

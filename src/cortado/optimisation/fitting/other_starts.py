@@ -17,6 +17,8 @@ APART = 0.2
 """Of the range of some number: by less no two starts differ."""
 FAR = 3.0
 """Standard errors: searches that end further apart ended in different valleys."""
+SAME = 1e-3
+"""Of a number: ends that are nearer are the same, however small the bars are."""
 NO_LESS_LIKELY = 9.0
 """Of twice the logarithm of how much likelier one of two valleys is: three standard errors."""
 TINY = 1e-300
@@ -46,8 +48,8 @@ def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
         except DivergedError:
             continue
     for _, point in sorted(found, key=lambda one: one[0]):
-        range_ = np.maximum(upper - lower, TINY)
-        if len(chosen) < count and all(np.abs((point - one) / range_).max() > APART for one in chosen):
+        away = [np.abs(point - one) / np.maximum(upper - lower, TINY) for one in chosen]
+        if len(chosen) < count and all(one.max() > APART for one in away):
             chosen.append(point)
     return chosen
 
@@ -68,7 +70,8 @@ def _sequence(searched: np.ndarray) -> np.ndarray:
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
     """The searches that ended in other valleys, the lowest one first."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
-    others = [one for one in tried if (np.abs(one.end - found.u) > FAR * bars).any()]
+    near = SAME * np.where(found.coordinates.logarithmic[found.coordinates.free], 1.0, np.abs(found.u))
+    others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
     return sorted(others, key=lambda one: one.misfit)
 
 
