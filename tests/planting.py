@@ -225,9 +225,11 @@ TWINS: dict = {}
 
 def is_right(problem, point) -> bool:
     """What `cortado.certify` says, of which no more is made than the verdict takes: neither which parameters are wrong
-    if the check of all together has failed, nor how long a right gradient is useful; a problem in float32 is made in
-    float64 but once."""
+    if the check of all together has failed, and on a corner that beside it, nor how long a right gradient is useful; a
+    problem in float32 is made in float64 but once."""
     from unittest.mock import patch
+
+    import numpy as np
 
     import cortado.certificate.certificate as certificate
 
@@ -235,8 +237,13 @@ def is_right(problem, point) -> bool:
         TWINS[problem] = certificate.in_float64(problem)
     check, judge_all = certificate.check_consistency, certificate._consistency
 
-    def first_check(*arguments):
-        found = check(*arguments)
+    corners = []
+
+    def first_check(history, values, gradient, along):
+        found = check(history, values, gradient, along)
+        if not found.right and found.is_on_a_corner and not corners:
+            corners.append(found)
+            return certificate._beside(history, values, along, np.random.default_rng(0))
         if not found.right:
             raise Verdict(False)
         return found

@@ -17,6 +17,7 @@ from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.consistency import balanced
 from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
+from cortado.certificate.loss_history import LossHistory
 from cortado.certificate.twin import in_float64
 from cortado.forward_pass import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer
@@ -302,6 +303,43 @@ def test_on_a_corner_differences_decide_as_far_as_both_sides_agree():
     assert found.right and found.consistency.corner[-1] > 1e-4 and "on a corner" in str(found)
     moving = certify(problem_of(plane(), 10))
     assert moving.right and moving.consistency.corner[-1] < 1e-4 and "corner" not in str(moving)
+
+
+def resists_approach(x_ij, v_ij, k):
+    """An own force, as of an artificial viscosity: fluid at rest is on the corner of each pair."""
+    return -k * wp.min(wp.dot(v_ij, x_ij), 0.0) * x_ij
+
+
+def corners(seed):
+    force = cortado.forces.Pair(resists_approach, name="own", k=2e4)
+    simulation = Simulation(plane(), precision="float64", forces=[force])
+    goal = simulation.positions + [0.02, 0.0]
+    return certify(Problem(simulation, 16, losses.FinalPositions(goal)), {"own.k": 2e4}, seed=seed)
+
+
+ON_ITS_CORNERS = 2
+"""A seed with which the slopes to both sides are nearer to each other than to the derivative."""
+
+
+def test_a_corner_of_an_own_force_is_no_error():
+    found = corners(ON_ITS_CORNERS)
+    assert found.right and not found.consistency.right and found.beside.right
+    assert "on a corner of the loss" in str(found) and "beside it" in str(found)
+    assert found.as_dict()["beside"]["steps"]
+
+
+@pytest.mark.parametrize("in_both_modes", [False, True])
+def test_a_sign_flipped_is_found_on_a_corner(in_both_modes, monkeypatch):
+    back, tangent = ProblemForwardPass.back, LossHistory.tangent
+
+    def flipped(values):
+        return {name: -value if name == "viscosity" else value for name, value in values.items()}
+
+    monkeypatch.setattr(ProblemForwardPass, "back", lambda *arguments: flipped(back(*arguments)))
+    if in_both_modes:
+        monkeypatch.setattr(LossHistory, "tangent", lambda self, at, along: tangent(self, at, flipped(along)))
+    found = corners(ON_ITS_CORNERS)
+    assert "viscosity" in found.wrong and found.beside is None
 
 
 # ---- verdicts ----------------------------------------------------------------------------------------------------

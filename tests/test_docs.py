@@ -1,6 +1,7 @@
 """The code in the documents runs as printed, and what they link to is there."""
 
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -40,6 +41,15 @@ def test_the_code_runs_as_printed(name, tmp_path, monkeypatch):
     exec(compile("\n".join(CODE[name]), name, "exec"), {"__name__": "__main__"})
     matplotlib.pyplot.close("all")
     assert len(shown) == (1 if name in TUTORIALS else 0)
+
+
+def test_the_force_with_kernels_runs_as_printed(tmp_path, monkeypatch):
+    """From a file, as Warp wants the text of kernels."""
+    (program,) = re.findall(r"^```py\n(.*?)^```$", DOCUMENTS["adding_parts.md"], re.DOTALL | re.MULTILINE)
+    file = tmp_path / "follow.py"
+    file.write_text(program, encoding="utf-8")
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(file), run_name="__main__")
 
 
 @pytest.mark.parametrize("name", TUTORIALS)

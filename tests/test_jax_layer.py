@@ -549,6 +549,15 @@ def test_within_a_compiled_program_the_error_has_the_sentence(jax, layer, simula
     with pytest.raises(InputError, match=r"parameter gravity has shape \(3,\)"):
         jax.jit(lambda g: layer.value(problem)({"gravity": g}))(jax.numpy.zeros(3))
     assert loss(jax.numpy.asarray(10.0)) > 0.0
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_an_error_that_is_not_ours_has_its_traceback(jax, layer, problem, capfd, monkeypatch):
+    loss = jax.jit(lambda m: layer.value(problem)({"viscosity": m}))
+    monkeypatch.setattr("cortado.optimisation.layers.residuals.evaluate", lambda *given: 1 / 0)
+    with pytest.raises(Exception, match="ZeroDivisionError"):
+        loss(jax.numpy.asarray(10.0)).block_until_ready()
+    assert "Traceback" in capfd.readouterr().out
 
 
 def test_float64_needs_a_jax_that_has_it(jax, layer, problem):

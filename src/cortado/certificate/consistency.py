@@ -15,6 +15,8 @@ MODE_TOLERANCE = 1e-8
 """Relative distance at most of reverse mode from forward mode in float64; both are exact to round-off."""
 PLATEAU = 1e-3
 """Relative distance at most of the central differences of two successive steps h for them to count as converged."""
+CORNER = 1e-4
+"""Relative distance of the slopes to both sides from which on the loss has a corner."""
 SLACK = 10.0
 """Distance at most of forward mode from a central difference, in units of the least distance of two successive ones."""
 RESOLUTION = 1e-6
@@ -78,6 +80,13 @@ class Consistency(ShortRepr):
         """(sample_steps,) the least relative distance of differences to one side and to the other, the greatest up to
         there. It is small in the limit of small h but on a corner of the loss, where both have limits of their own."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
+
+    @property
+    def is_on_a_corner(self) -> bool:
+        """Whether reverse mode agrees with forward mode, and differences to one side and to the other have limits of
+        their own, up to where they converge."""
+        slopes = self.corner[self.converged]
+        return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
     @property
     def converged(self) -> np.ndarray:

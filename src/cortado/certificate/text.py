@@ -6,7 +6,7 @@ from math import log10
 from typing import Any
 
 from cortado.certificate.alignment import Alignment
-from cortado.certificate.consistency import PLATEAU, Consistency
+from cortado.certificate.consistency import Consistency
 from cortado.certificate.horizon import Horizon
 
 WIDTH = 110
@@ -23,14 +23,16 @@ def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str]) -> 
     return _table(["parameter", "a perturbation changes the loss by", "adjoint"], rows)
 
 
-def consistency_words(c: Consistency) -> str:
+def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
     """To how many digits reverse mode, forward mode and central differences agree, and whether that is on a corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"
-    on_it = float(c.corner[c.converged][-1])
-    corner = f" (on a corner of the loss: slopes of both sides differ by {on_it:.1%})" if on_it > PLATEAU else ""
-    return f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}{corner}"
+    slopes = f"on a corner of the loss: slopes of both sides differ by {100.0 * c.corner[c.converged][-1]:.2g} %"
+    if beside is not None:
+        return f"{digits}, {slopes}; beside it, {consistency_words(beside)}"
+    found = f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}"
+    return f"{found} ({slopes})" if c.is_on_a_corner else found
 
 
 def horizon_table(horizons: Sequence[Horizon]) -> str:

@@ -109,9 +109,10 @@ class _Lines:
         if now - self._last_line < self._interval and not finished_late:
             return
         self._last_line = now
-        words = [f"{self._description} {self._done}/{self._total}"]
-        if self._done > skipped:
-            left = (now - begun) * max(self._total - self._done, 0) / (self._done - skipped)
+        known = self._done <= self._total  # else there was more to do than was thought
+        words = [f"{self._description} {self._done}/{self._total}" if known else f"{self._description} {self._done}"]
+        if known and self._done > skipped:
+            left = (now - begun) * (self._total - self._done) / (self._done - skipped)
             words.append(f"{_clock(left)} left")
         print(", ".join([*words, *filter(None, [_text(fields)])]), file=self._stream, flush=True)
 

@@ -31,7 +31,8 @@ def fit_task(
         noted: dict[str, Any] = {"kind": "fit", "settings": settings, "device": device}
         folder = RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
         with track(2 * task.fit.iterations, "fit") as advance:
-            fitted = fit(experiments, task.fit.start, task.fit.bounds, task.fit.iterations, lambda: advance(1))
+            given = task.fit
+            fitted = fit(experiments, given.start, given.bounds, given.iterations, lambda: advance(1), given.starts)
         announce(str(fitted))
         profiles = _profiles(task, fitted)
         write_report(folder, task.scene.name, sections(task, fitted, profiles, folder.figures))
@@ -41,7 +42,8 @@ def fit_task(
             f"The fit has not converged in {task.fit.iterations} trial points: give fit.iterations more, or a start "
             f"nearer to what you expect. The results are in {folder.path}."
         )
-    return f"The results are in {folder.path}; open report.html."
+    doubted = " They are in doubt, as said above." if fitted.in_doubt else ""
+    return f"The results are in {folder.path}; open report.html.{doubted}"
 
 
 def _profiles(task: FitTask, fitted: Fit) -> list[Profile]:

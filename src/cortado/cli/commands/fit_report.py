@@ -28,7 +28,7 @@ def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Pa
         ),
         Section("Profiles", figures=profile_figure(profiles, folder / "profiles.png")),
         Section("Correlations", head=("", *fitted.labels), rows=_correlations(fitted)),
-        Section("The fit", [_effort(fitted)]),
+        Section("The fit", [_effort(fitted)], head=_START_HEAD, rows=_starts(fitted)),
     ]
 
 
@@ -89,10 +89,26 @@ def _correlations(fitted: Fit) -> list[tuple[object, ...]]:
     return [(a, *(round(float(c), 3) for c in row)) for a, row in zip(fitted.labels, fitted.correlation, strict=True)]
 
 
+_START_HEAD = ("start", "where the search ended", "residuals, relative to the least")
+
+
+def _starts(fitted: Fit) -> list[tuple[object, ...]]:
+    if len(fitted.tried) < 2:
+        return []
+    least = min(one.misfit for one in fitted.tried)
+
+    def in_words(u: np.ndarray) -> str:
+        each = zip(fitted.labels, fitted.coordinates.numbers(u), strict=True)
+        return ", ".join(f"{label.replace('_', ' ')} {number:.4g}" for label, number in each)
+
+    return [(in_words(one.start), in_words(one.end), float(np.exp(one.misfit - least))) for one in fitted.tried]
+
+
 def _effort(fitted: Fit) -> str:
-    ended = "converged" if fitted.converged else "ended after its last trial point"
+    converged = "converged, but there is doubt," if fitted.doubts else "converged"
+    ended = converged if fitted.converged else "ended after its last trial point"
     runs, tangents = counted(fitted.runs, "forward run"), counted(fitted.tangents, "run")
-    return f"The fit {ended} after {runs} and {tangents} along a tangent."
+    return f"The fit {ended} after {runs} and {tangents} along a tangent, from {counted(len(fitted.tried), 'start')}."
 
 
 def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
@@ -110,6 +126,14 @@ def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
         "converged": fitted.converged,
         "runs": fitted.runs,
         "tangents": fitted.tangents,
+        "starts": [
+            {
+                "start": fitted.coordinates.numbers(one.start),
+                "end": fitted.coordinates.numbers(one.end),
+                "misfit": one.misfit,
+            }
+            for one in fitted.tried
+        ],
         "residuals": {one.label: one.spread for one in fitted.parts},
         "profiles": {one.label: {"values": one.values, "deviance": one.deviance} for one in profiles},
     }

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cortado.optimisation.fitting.certainty import Certainty
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
 from cortado.optimisation.fitting.noise import ScoreCovariance
 
@@ -15,26 +16,34 @@ FEW_STILL = 20
 """Numbers that stay as they are; of fewer nothing is said."""
 TOO_LARGE_IN_MOTION = 2.0
 """Residuals of the numbers that change over those of the numbers that stay as they are."""
+EXACT = 1e-4
+"""Of the largest number measured: residuals that are smaller are those of a simulation, of which nothing is said."""
 ROUNDING = 0.002
 """Of the largest number measured: half a step of 8 bits, below which residuals say nothing."""
 TOO_SLOW = 0.35
 """Correlation time of residuals, over the length of the record."""
+VAGUE = 1.0
+"""Standard error of a logarithm."""
+GREATEST = 20.0
+"""Of these logarithms, in a sentence."""
 TOO_FAR = 3.0
 """Distance between what two halves of a record say, over its error."""
 
 
-def doubts(
+def doubts_of(
     problem: LeastSquares,
     at: Linearised,
     weights: Sequence[Weighting],
-    scores: Sequence[ScoreCovariance],
-    labels: Sequence[str],
+    certainty: Certainty,
 ) -> tuple[str, ...]:
-    """None where the residuals look like noise."""
-    found = []
+    """None where the residuals look like noise, and tell the parameters."""
+    found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise = part.observation.times, part.observation.noise
         size = float(np.sqrt((r**2).sum() / max(np.count_nonzero(r), 1)))
+        if size <= EXACT * np.nanmax(np.abs(part.observation.measured)):
+            continue
+        is_exact = False
         if noise is not None and size > TOO_LARGE * noise:
             found.append(
                 f"The residuals of {part.label} are {size / noise:.2g} times the noise that was given "
@@ -54,7 +63,8 @@ def doubts(
                 f"{weight.correlation_time:.2g} s of a record of {length:.2g} s, which noise seldom is. The model is "
                 f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
-    return (*found, *_halves(problem, at, weights, scores, labels))
+    halves = [] if is_exact else _halves(problem, at, weights, certainty.scores)
+    return (*found, *halves, *_vague(problem, at, certainty))
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
@@ -69,12 +79,22 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return max(quiet, ROUNDING * float(np.nanmax(np.abs(measured)))), moving
 
 
+def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
+    """Of positive numbers that may as well be many times as large."""
+    coordinates = problem.coordinates
+    bars = np.where(coordinates.logarithmic[coordinates.free], np.sqrt(np.diag(certainty.covariance)), 0.0)
+    return [
+        f"What was measured hardly tells {label}: one standard error is a factor of {np.exp(min(bar, GREATEST)):.2g}."
+        for label, bar in zip(coordinates.labels, bars, strict=True)
+        if bar > VAGUE
+    ]
+
+
 def _halves(
     problem: LeastSquares,
     at: Linearised,
     weights: Sequence[Weighting],
     scores: Sequence[ScoreCovariance],
-    labels: Sequence[str],
 ) -> list[str]:
     """Where the first and the second half of the frames say different things: one step of Gauss and Newton for each."""
     size = len(at.u)
@@ -97,6 +117,6 @@ def _halves(
     return [
         f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the "
         "error of the difference. The model is wrong, in a way that changes over time."
-        for label, off in zip(labels, away, strict=True)
+        for label, off in zip(problem.coordinates.labels, away, strict=True)
         if off > TOO_FAR
     ]

@@ -85,6 +85,18 @@ class FittedNumber:
         return f"{self.label.replace('_', ' ')} {with_error(self.value, self.error)}{_unit(self.label)}"
 
 
+@dataclass(frozen=True)
+class Tried:
+    """A start of a fit, and where the search from it ended."""
+
+    start: np.ndarray
+    """(free,) coordinates."""
+    end: np.ndarray
+    """(free,) coordinates."""
+    misfit: float
+    """The logarithm of the size of the residuals there, the mean over all numbers that were measured."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters that were fitted to experiments, with their error bars."""
@@ -103,7 +115,9 @@ class Fit:
     doubts: tuple[str, ...] = field(repr=False)
     """Sentences about where the residuals do not look like noise, so that the model is wrong by more than the bars."""
     converged: bool = True
-    """Whether it ended where the sum of squares is least, and not after the last iteration."""
+    """Whether it ended where the sum of squares is least around it, and not after the last iteration."""
+    tried: tuple[Tried, ...] = field(default=(), repr=False)
+    """The starts, and where the searches from them ended, this fit among them."""
     runs: int = 0
     """Forward runs, each of one experiment."""
     tangents: int = 0
@@ -220,8 +234,13 @@ class Fit:
             for one in self.numbers(confidence)
         ]
 
+    @property
+    def in_doubt(self) -> bool:
+        """Whether it has not converged, or there are doubts."""
+        return not self.converged or bool(self.doubts)
+
     def __repr__(self) -> str:
-        ended = "" if self.converged else "; not converged"
+        ended = ("; in doubt" if self.doubts else "") if self.converged else "; not converged"
         return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
 
     def _repr_html_(self) -> str:

@@ -20,12 +20,14 @@ POOR, GOOD = 0.25, 0.75
 """Shares of the predicted gain: after a step that gains less, the next one is damped ten times as much; after one that
 gains more, half as much."""
 MOST_FAILURES = 3
-"""Trial points in succession that are no lower: then the Jacobian is estimated anew."""
+"""Trial points in succession that are no lower: then the Jacobian is estimated anew, and after as many more it ends."""
 
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
 ENOUGH = 0.01
 """The same of the end: a tenth of a standard error."""
+AS_NEAR_AS_CAN_BE = 0.1
+"""The same where no step lowers a rough sum of squares any more: three tenths of a standard error."""
 ONE_BAR = 1.0
 """The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
 MOST_JACOBIANS = 4
@@ -46,7 +48,8 @@ class Searched:
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
-    """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found: a search
+    """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found, else the
+    lowest point that was run: a search
     up to where its estimate of the Jacobian serves, tangents, and a search from there with these."""
     for _ in range(MOST_JACOBIANS):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
@@ -60,8 +63,10 @@ def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], t
         is_near = bool(((J @ (found.next - exact.u)) ** 2).sum() <= ONE_BAR)
         if is_near or not found.converged:
             break
+    if not found.converged:
+        return Linearised(at.u, at.residuals, exact.jacobians), found.gain <= AS_NEAR_AS_CAN_BE
     residuals = [r + J @ (found.next - at.u) for r, J in zip(at.residuals, at.jacobians, strict=True)]
-    return Linearised(found.next, residuals, exact.jacobians), found.converged and is_near
+    return Linearised(found.next, residuals, exact.jacobians), is_near
 
 
 def search(
@@ -98,10 +103,12 @@ def search(
             lowest, base, failures = squares, number, 0
         else:
             failures += 1
-        has_failed = failures == MOST_FAILURES
-        at = problem.estimated(at.u) if has_failed else points.linearised(base)
-        if has_failed or points.are_many:
-            points, base, failures = TrialPoints(problem, weights, at), 0, 0
+        if failures == 2 * MOST_FAILURES:
+            break
+        is_stuck = failures == MOST_FAILURES
+        at = problem.estimated(at.u) if is_stuck else points.linearised(base)
+        if is_stuck or points.are_many:
+            points, base = TrialPoints(problem, weights, at), 0
         if share < POOR:
             damping = max(10.0 * damping, FIRST_DAMPING)
         elif share > GOOD:

@@ -17,6 +17,9 @@ class FitTable(Table):
     """By the name of a parameter the lower and the upper bound; a number whose bounds are the same is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
     """Trial points at most, of each of the two fits."""
+    starts: Annotated[int, count(1, 100)] | None = None
+    """From how many starts the fit searches; if left out, from the one that is given, and from three others where that
+    ends in doubt. Others lie within the bounds, or within two decades of a positive number."""
     profiles: Annotated[int, count(0, 100)] = 7
     """Points of the profile of each number, each with a fit of all others; 0 for no profiles."""
 

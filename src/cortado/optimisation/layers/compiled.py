@@ -2,6 +2,7 @@
 a GPU, in its stream."""
 
 import inspect
+import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -64,7 +65,7 @@ def _callable(given: tuple[Kind, ...], made: tuple[Kind, ...]) -> Any:
         with WARP, _in_order(results[0].device):
             try:
                 found = _FUNCTIONS[number]([_as_array(array) for array in arrays])
-            except CortadoError as error:  # Warp prints where it comes from
+            except CortadoError as error:
                 raise error.with_traceback(None) from None
             for result, own in zip(results, found, strict=True):
                 if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
@@ -79,7 +80,16 @@ def _callable(given: tuple[Kind, ...], made: tuple[Kind, ...]) -> Any:
     )
     call.__annotations__ = types
     call.__qualname__ = f"call_{uuid4().hex}"  # a program that was kept on disk does not find it in another process
-    return wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
+    found = wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
+    vars(sys.modules[type(found).__module__])["print"] = _print
+    return found
+
+
+def _print(*words: Any, **options: Any) -> None:
+    """What Warp's foreign functions print, which is the traceback of each error, but for errors of ours: JAX raises
+    them with their sentence, and their traceback says nothing more. Warp has no setting for it."""
+    if not isinstance(sys.exc_info()[1], CortadoError):
+        print(*words, **options)
 
 
 def _in_order(device: Any) -> AbstractContextManager[Any]:
