@@ -131,20 +131,26 @@ class Parameters(Arrays):
 
     def __init__(self, arrays: Mapping[str, wp.array]):
         super().__init__(arrays)
-        self._written: dict[str, np.ndarray] = {}
-        """What `set` has written last, and need not write again."""
+        self._written: dict[str, np.ndarray | wp.array] = {}
+        """What `set` has written last, and need not write again; of what it copied on the device the copy."""
 
     @property
-    def written(self) -> Mapping[str, np.ndarray]:
+    def written(self) -> Mapping[str, np.ndarray | wp.array]:
         """What `set` has written, by name; `set_row` writes to it."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some by name, the same for all members or with an axis of them: a vector (d,) or vectors
-        (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""
+        (steps, d); numbers or arrays of them; or a Warp array like the own one. Nothing else may write to arrays that
+        are set again."""
         for name, value in values.items():
-            array, given = self[name], np.array(value, dtype=np.float64)
-            if name in self._written and np.array_equal(self._written[name], given):
+            array, last = self[name], self._written.get(name)
+            if isinstance(value, wp.array):
+                wp.copy(array, value)
+                self._written[name] = array
+                continue
+            given = np.array(value, dtype=np.float64)
+            if isinstance(last, np.ndarray) and np.array_equal(last, given):
                 continue
             self._written[name] = given
             if hasattr(array.dtype, "_shape_"):

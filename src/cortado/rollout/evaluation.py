@@ -2,6 +2,8 @@
 
 from typing import Protocol
 
+import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from cortado.particles.state import Parameters, State
@@ -40,7 +42,7 @@ class PutAside:
 
     def __init__(self, rollout: Evaluated):
         self._first = rollout.initial.copy()
-        self._parameters = {name: value.copy() for name, value in rollout.parameters.written.items()}
+        self._parameters = {name: _copied(value) for name, value in rollout.parameters.written.items()}
         self._sizes = rollout.step_sizes.recorded()
         self._time_steps, self._log = rollout.time_steps.copy(), rollout.solver.new_log(rollout.steps)
         self._log.assign(rollout.log)
@@ -55,6 +57,10 @@ class PutAside:
         rollout.step_sizes.assign(self._sizes)
         for name, value in self._replaced.items():
             setattr(rollout, name, value)
+
+
+def _copied(value: np.ndarray | wp.array) -> np.ndarray | wp.array:
+    return wp.clone(value) if isinstance(value, wp.array) else value.copy()
 
 
 class Pending(Protocol):

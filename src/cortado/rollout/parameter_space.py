@@ -1,7 +1,7 @@
 """Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -216,10 +216,7 @@ class ParameterSpace:
 
     def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
         """(members,) from the adjoints of the parameters those of the times at which the first states are."""
-        dimension = self._simulation.dimension
-        over_time = [name for name in self._known.over_time if name in self._known.run]
-        run = {name: parameters[name].numpy().astype(np.float64) for name in over_time}
-        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
+        run = self._read(parameters, {name for own in self._different(values) for name in self._one.changing(own)})
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
         return np.array([self._one.time_adjoint(own, _entry(run, b), clock) for b, (own, clock) in members])
 
@@ -230,14 +227,21 @@ class ParameterSpace:
         times = self.time_adjoints(rollout, values, parameters)
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
 
-    def gradient(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+    def gradient(
+        self,
+        rollout: Rollout,
+        values: Arrays,
+        state: State,
+        parameters: Parameters,
+        elsewhere: Collection[str] = (),
+    ) -> Arrays:
         """Adjoints of the first state, unless it was given, and of the parameters, for the names and in the shapes of
-        ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one."""
+        ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one.
+        Those of names ``elsewhere`` are left out."""
         dimension = self._simulation.dimension
         read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
-        run = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in read}
-        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
+        run = self._read(parameters, read.difference(elsewhere))
         fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]
         fields = [] if rollout.goes_on else fields
         first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
@@ -248,6 +252,12 @@ class ParameterSpace:
             [self._one.gradient(own, _entry(first, b), _entry(run, b), clock) for b, (own, clock) in members]
         )
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
+
+    def _read(self, parameters: Parameters, names: Collection[str]) -> Arrays:
+        """Of what steps depend on those of some names, in float64, with an axis for the scenes."""
+        found = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in names}
+        vectors = {name: found[name] for name in self._known.vectors if name in found}
+        return found | {name: array[..., : self._simulation.dimension] for name, array in vectors.items()}
 
     def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
         check_known(name, self._simulation.scene, what, self._known)

@@ -201,15 +201,20 @@ class SceneParameters:
         moved |= {name: moved.get(name, along[name]) + time_dot * rate for name, rate in later.items()}
         return first, self.run({**along, **moved})
 
+    def changing(self, values: Arrays) -> set[str]:
+        """The names of what steps depend on that changes by itself while they are taken."""
+        return {"gravity" if name == "tilt" else name for name in self.courses(values)}
+
     def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
-        """From the adjoints of what steps depend on to that of the time at which they begin."""
+        """From the adjoints of what steps depend on, of those that are `changing`, to that of the time at which they
+        begin."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
         return sum(float((run[name] * rate).sum()) for name, rate in rates.items())
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
         """From the adjoints of what steps depend on and of those fields of the first state that depend on parameters,
-        which is at a clock, to those of ``values``, in their shapes."""
-        found = {name: run[name].copy() for name in self._known.run if name in values}
+        which is at a clock, to those of ``values``, in their shapes; what ``run`` leaves out is left out."""
+        found = {name: run[name].copy() for name in self._known.run if name in values and name in run}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:
                 if self._known[field.first].axis is Axis.STEP:  # the field begins as its first row
@@ -225,7 +230,7 @@ class SceneParameters:
             later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values, clock).items())
             found["time_step"] = found["time_step"] + later
         for name in self._known.over_time:
-            if name in values and values[name].ndim == self._known[name].rank:
+            if name in found and values[name].ndim == self._known[name].rank:
                 found[name] = found[name].sum(axis=0)
         if DENSITY in first and not values.keys().isdisjoint(COMPOSITION):
             bars = reference_density_adjoint(*self._composition(values), first[DENSITY])

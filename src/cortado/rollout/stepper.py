@@ -1,18 +1,20 @@
 """Steps of a simulation as a function of a state and of parameters, with its derivatives."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+import warp as wp
 
 from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import Parameters, State
 from cortado.rollout.adjoint_step import AdjointStep
+from cortado.rollout.device_rows import DeviceRows
 from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.host_states import Given, HostStates, States
 from cortado.rollout.outcome import trouble
@@ -37,7 +39,9 @@ class StepResidual:
 
     evaluation: Residual
     values: Arrays
-    """The parameters that were given."""
+    """The parameters that were given, with stand-ins for rows on the device."""
+    rows: Mapping[str, wp.array]
+    """Those of them that are on the device."""
     place: HostStates
     """Where its states are, and the derivatives with respect to them."""
 
@@ -56,6 +60,7 @@ class Stepper:
     def __init__(self, simulation: Steppable, steps: int):
         """``steps`` may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
+        self._rows = DeviceRows(simulation, self._space, steps)
         self.rollout = Rollout(simulation.solver, steps)
         """What takes the steps, with the parameters of the last ones."""
 
@@ -74,7 +79,7 @@ class Stepper:
     def on_device(self, state: Given | DeviceState, fields: Values, parameters: Values | None = None) -> DeviceState:
         """A state of a run with these parameters in arrays of its own on the device, with other ``fields``."""
         values, place = self._checked(parameters), DeviceStates(self._simulation)
-        self._begin(state, values)
+        self._begin(state, values, {})
         found = place.state(self.rollout, self.rollout.initial, 0)
         return place.replaced(self._space, found, fields) if fields else found
 
@@ -87,8 +92,13 @@ class Stepper:
 
     @in_turn
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
-        """The state after the steps, on the device if the one before them is."""
-        place = self._begin(state, self._checked(parameters))
+        """The state after the steps, on the device if the one before them is.
+
+        A parameter over time may be a Warp array on the device, in the simulation's precision: it stays there, and is
+        not looked at.
+        """
+        values, rows = self._given(parameters)
+        place = self._begin(state, values, rows)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps)
 
     @in_turn
@@ -109,22 +119,23 @@ class Stepper:
 
         Any number of residuals may be held at a time, each with states of its own. ``along`` are further parameters
         that `jvp` will be given directions of; only the mobility has to be said before, as where it is 0 nothing
-        diffuses.
+        diffuses. Parameters may be on the device as those of `advance`.
         """
-        values = self._checked(parameters)
-        place = self._begin(state, values, {*values, *self._space.checked_names("along", along)})
+        values, rows = self._given(parameters)
+        place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)})
         last = place.state(self.rollout, self._forward(keep=True), self.rollout.steps)
-        return last, StepResidual(Residual(self.rollout), values, place)
+        return last, StepResidual(Residual(self.rollout), values, rows, place)
 
     @in_turn
-    def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], Arrays]:
+    def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], dict[str, Any]]:
         """Reverse mode: from the adjoint of the state after the steps to those of the state before them and of the
         parameters that were given.
 
         The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
         ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
-        all else that is returned is in float64. A batch has a first axis for the scenes. Raises `InputError` for fields
-        that the state does not have, or that have other shapes.
+        all else that is returned is in float64. A batch has a first axis for the scenes. A parameter on the device has
+        its adjoint there, in its own shape. Raises `InputError` for fields that the state does not have, or that have
+        other shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         times = place.write("state_bar", state_bar, self._bar)
@@ -132,18 +143,20 @@ class Stepper:
         first = rollout.backward(self._adjoint, {rollout.steps: self._bar})
         found = self._adjoint.parameters()
         before = self._shaped(space.time_adjoints(rollout, values, found)) + times
-        gradient = space.gradient(rollout, values, first, found)
+        gradient = space.gradient(rollout, values, first, found, elsewhere=residual.rows)
         if "time_step" in gradient:  # a longer step ends later
             gradient["time_step"] = gradient["time_step"] + rollout.steps * times
         time_bar = without_lost(rollout, {STATE_TIME: before})
-        return {**place.read(rollout, first), **time_bar}, without_lost(rollout, gradient)
+        rows = self._rows.adjoints(residual.rows, found, rollout.lost)
+        return {**place.read(rollout, first), **time_bar}, {**without_lost(rollout, gradient), **rows}
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
         """Forward mode: from tangents of the state before the steps and of any parameters that it does not hold to that
         of the state after them; as `vjp` takes and returns adjoints."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
-        along = space.checked({} if parameter_dots is None else parameter_dots, "direction")
+        looked_at, rows = self._rows.split(parameter_dots, "direction")
+        along = space.checked(looked_at, "direction")
         space.check_directions(along)
         dot, parameters_dot = self._dots
         times = place.write("state_dot", state_dot, dot)
@@ -154,6 +167,7 @@ class Stepper:
                 'mobility is 0: step(..., along=["mobility"]).'
             )
         space.set_direction(rollout, values, along, dot, parameters_dot, np.broadcast_to(times, len(rollout.clocks)))
+        self._rows.write(rows, parameters_dot)
         rollout.tangent(dot, parameters_dot, lambda number, state: None)
         sizes = along.get("time_step", np.zeros(()))
         later = times + rollout.steps * np.broadcast_to(sizes, times.shape)
@@ -187,14 +201,26 @@ class Stepper:
         require(solver.gradient_memory(self.rollout.log), "take a larger spacing", solver.device)
         return AdjointStep(self.rollout, solver.adjoint(self.rollout.steps))
 
-    def _begin(self, state: Given | DeviceState, values: Arrays, varied: Iterable[str] = ()) -> HostStates:
+    def _begin(
+        self,
+        state: Given | DeviceState,
+        values: Arrays,
+        rows: Mapping[str, wp.array],
+        varied: Iterable[str] = (),
+    ) -> HostStates:
         """Give the rollout a first state and parameters; returns where the state is."""
         place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
+        self._rows.write(rows, self.rollout.parameters)
         return place
 
     def _checked(self, parameters: Values | None) -> Arrays:
         return self._space.checked({} if parameters is None else parameters)
+
+    def _given(self, parameters: Values | None) -> tuple[Arrays, dict[str, wp.array]]:
+        """Checked, with stand-ins for those that are on the device, and these."""
+        looked_at, rows = self._rows.split(parameters)
+        return self._space.checked(looked_at) | self._rows.stand_ins(rows), rows
 
     def _forward(self, keep: bool) -> State:
         """Take the steps; ``keep`` checkpoints for a way back. Warnings and errors as of `Simulation.run`."""

@@ -1,9 +1,13 @@
 """Parameters of a layer: their shapes, one for all evaluations or one for each, and their derivatives in these."""
 
+from collections.abc import Mapping
+
 import numpy as np
+import warp as wp
 
 from cortado.errors import InputError
 from cortado.optimisation.layers.layer import PARAMETER, Array, Named, Shapes, named, on_host, part
+from cortado.rollout.device_rows import DeviceRows
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.scene.parameters.values import Arrays
 from cortado.simulation import Simulation
@@ -19,6 +23,7 @@ class LayerParameters:
     def __init__(self, simulation: Simulation, steps: int, each: bool):
         self._simulation, self._each = simulation, each
         self._space = ParameterSpace(simulation, steps)
+        self._rows = DeviceRows(simulation, self._space, steps)
 
     def check(self, given: Shapes, with_state: bool) -> None:
         """Raises `InputError` for arrays that no parameters have."""
@@ -30,19 +35,30 @@ class LayerParameters:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
     def values(self, given: Named) -> Arrays:
-        """As problems take them."""
-        return {name: self._value(name, array) for name, array in part(given, PARAMETER).items()}
+        """As problems take them, in float64."""
+        own = part(given, PARAMETER)
+        return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
-    def _value(self, name: str, array: Array) -> np.ndarray:
-        """One of them, in float64. Of each evaluation, one that is the same in all steps gets an axis for them."""
-        found, shapes = on_host(array).astype(np.float64), self._space.shapes(name)
-        if self._each and name in self._simulation.known.over_time and found.ndim == len(shapes[0]) + 1:
-            return found[:, None]
-        return found.reshape(()) if found.shape == (1,) and (1,) not in shapes else found
+    def on_device(self, given: Named) -> dict[str, Array]:
+        """As steppers take them: those over time that are on the device stay there."""
+        own = part(given, PARAMETER)
+        stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
+        others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
+        return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
 
-    def adjoints(self, found: Arrays, values: Arrays) -> Named:
-        """Derivatives with respect to values, of a batch with a first axis for the scenes, in their shapes."""
-        return named(PARAMETER, {name: _shared(bar, values[name].shape) for name, bar in found.items()})
+    def _shaped(self, name: str, array: Array) -> Array:
+        """Of each evaluation, one that is the same in all steps gets an axis for them."""
+        shapes = self._space.shapes(name)
+        if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
+            return array.reshape((array.shape[0], 1, *array.shape[1:]))
+        is_number = isinstance(array, np.ndarray) and array.shape == (1,) and (1,) not in shapes
+        return array.reshape(()) if is_number else array
+
+    def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
+        """Derivatives with respect to values, of a batch with a first axis for the scenes, in their shapes; those on
+        the device have them."""
+        shared = {name: _shared(bar, values[name].shape) for name, bar in found.items() if isinstance(bar, np.ndarray)}
+        return named(PARAMETER, {**found, **shared})
 
 
 def _shared(bar: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

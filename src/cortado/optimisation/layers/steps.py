@@ -50,7 +50,7 @@ class Steps(Layer):
 
     @in_turn
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        values = self._parameters.values(given)
+        values = self._parameters.on_device(given)
         state = self.states.state(part(given, STATE), values)
         residual: StepResidual | None = None
         if keep:
@@ -67,7 +67,7 @@ class Steps(Layer):
 
     @in_turn
     def push(self, residual: StepResidual, dots: Named) -> Named:
-        return self._named(self._stepper.jvp(residual, self._derivatives(dots), self._parameters.values(dots)))
+        return self._named(self._stepper.jvp(residual, self._derivatives(dots), self._parameters.on_device(dots)))
 
     def check_mapped(self) -> None:
         if self._simulation.batch is not None:
