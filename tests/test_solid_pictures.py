@@ -103,6 +103,13 @@ def test_a_solid_in_the_plane_has_its_colour_where_it_is():
     assert is_orange(image)[off < -0.005].all() and not is_orange(image)[off > 0.005].any()
 
 
+def test_what_is_spilt_in_the_plane_takes_no_room():
+    """The grid of the fluid ends with the picture: else it would have 10^12 nodes here."""
+    scene, spilt = scene_of(2, PILLAR), [[0.1, -1e9], [3.0, 0.1]]
+    np.testing.assert_allclose(drawn(scene, [*COLUMN[2], *spilt]), drawn(scene, COLUMN[2]), atol=1e-12)
+    assert not is_blue(drawn(scene, spilt)).any()
+
+
 def test_a_solid_in_space_has_its_colour_where_it_is():
     scene = scene_of(3, BALL, picture=FRONT)
     image = is_orange(drawn(scene, COLUMN[3]))

@@ -26,8 +26,8 @@ PROJECTION = ("solver={kind = 'projection', time_step = 'auto'}",)
 NEW = ("solver.time_step=auto",)
 """Templates have steps for wider spacings."""
 
-FOAM = "phase.milk.rest_density=600", "phase.milk.viscosity=0.2", "phase.coffee.viscosity=0.1"
-"""Milk that stays on the coffee."""
+MIXED = "mixture={free_energy = 'miscible', mobility = 5e-7, mobility_form = 'constant'}"
+"""Milk and coffee that mix by Fick's law, where single particles of either would be dots."""
 DROP = "fluid.1.velocity=[0, -1.2, 0]", "phase.0.viscosity=0.05", "phase.1.viscosity=0.05", "picture.field_of_view=21"
 """One that is slow enough for its crown to hold together."""
 
@@ -71,21 +71,21 @@ ENTRIES = {
     "pillar": Entry(TEMPLATES / "pillar.toml", 0.0125, 1.3, 0.35, NEW),
     "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
     "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
-    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, (ORBIT,)),
-    "jug": Entry(FIGURES / "jug.toml", 0.002, 1.8, 0.45),
+    "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, ("solver.time_step=0.0005", ORBIT)),
+    "jug": Entry(FIGURES / "jug.toml", 0.00125, 1.8, 0.5),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
-    "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, "container.colour=[0.8, 0.78, 0.72]")),
-    "latte_art": Entry(TEMPLATES / "pour.toml", 0.0015, 0.9, 1.0, (*NEW, *FOAM)),
+    "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, MIXED, "container.colour=[0.8, 0.78, 0.72]")),
+    "latte_art": Entry(FIGURES / "latte_art.toml", 0.0011, 1.8, 1.0),
     "rotor": Entry(FIGURES / "rotor.toml", 0.0026, 1.5, 0.7),
     "fountain": Entry(FIGURES / "fountain.toml", 0.004, 1.1, 0.8),
     "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.2, 0.4, (*NEW, *DROP)),
     "raft": Entry(TEMPLATES / "raft.toml", 0.016, 1.8, 0.5, NEW),
     "baffles": Entry(FIGURES / "baffles.toml", 0.0065, 1.7, 0.4),
     "shaken": Entry(FIGURES / "shaken.toml", 0.0045, 0.75, 0.5, PROJECTION),
-    "ring": Entry(FIGURES / "ring.toml", 0.0032, 0.6, 0.5),
+    "ring": Entry(FIGURES / "ring.toml", 0.002, 2.3, 0.9),
     "beach": Entry(FIGURES / "beach.toml", 0.015, 3.0, 0.5),
     "two_layers": Entry(TEMPLATES / "rayleigh_taylor.toml", 0.004, 1.4, 0.7, NEW),
-    "jet": Entry(TEMPLATES / "jet.toml", 0.005, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
+    "jet": Entry(TEMPLATES / "jet.toml", 0.003, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
     "surface_tension": Entry(FIGURES / "surface_tension.toml", 0.0006, 0.4, 0.1),
 }
 

@@ -56,6 +56,11 @@ class PlanePainter:
         positions, colours = positions[order], colours[order]
         wet, of = self._wetting(positions)
         reach, cell = 2.0 * SUPPORT * self.stage.spacing, self.stage.spacing / GRID
+        near = self.stage.is_near(wet, 2.0 * reach)  # the grid would be as large as what is spilt comes far
+        wet, of = wet[near], of[near]
+        if not len(wet):
+            empty = np.zeros(self.stage.pixels[0].shape)
+            return empty, np.zeros((*empty.shape, 3))
         wet_tree = cKDTree(wet)
         own = _weight(_distances(wet_tree, wet, reach), reach)
         strength = np.minimum(1.0 / own.sum(axis=1), DROP)

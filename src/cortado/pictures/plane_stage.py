@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.pictures.gloss import glossy
@@ -89,6 +90,11 @@ class PlaneStage:
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
+
+    def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
+        """(n,) which points (n, 2) [m] are in the picture, or no further from it than a margin [m]."""
+        half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
+        return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
 
     def on_screen(self, points: Points) -> Points:
         """As `Stage.on_screen`, of points (n, 2) [m]."""
