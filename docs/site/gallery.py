@@ -75,7 +75,6 @@ ENTRIES = {
     "jug": Entry(FIGURES / "jug.toml", 0.00125, 1.8, 0.5),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
     "stirred": Entry(TEMPLATES / "stirred.toml", 0.0018, 1.2, 0.5, (*NEW, MIXED, "container.colour=[0.8, 0.78, 0.72]")),
-    "latte_art": Entry(FIGURES / "latte_art.toml", 0.0011, 1.8, 1.0),
     "rotor": Entry(FIGURES / "rotor.toml", 0.0026, 1.5, 0.7),
     "fountain": Entry(FIGURES / "fountain.toml", 0.004, 1.1, 0.8),
     "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.2, 0.4, (*NEW, *DROP)),
@@ -85,7 +84,7 @@ ENTRIES = {
     "ring": Entry(FIGURES / "ring.toml", 0.002, 2.3, 0.9),
     "beach": Entry(FIGURES / "beach.toml", 0.015, 3.0, 0.5),
     "two_layers": Entry(TEMPLATES / "rayleigh_taylor.toml", 0.004, 1.4, 0.7, NEW),
-    "jet": Entry(TEMPLATES / "jet.toml", 0.003, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
+    "jet": Entry(TEMPLATES / "jet.toml", 0.005, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
     "surface_tension": Entry(FIGURES / "surface_tension.toml", 0.0006, 0.4, 0.1),
 }
 
