@@ -33,7 +33,7 @@ SPACINGS = {
     "pour": 0.007,
     "recover_gravity": 0.25,
     "recover_gravity_small": 0.25,
-    "ring": 0.014,
+    "ring": 0.009,
     "rotor": 0.0095,
     "shaken": 0.03,
     "shear": 0.04,

@@ -312,14 +312,14 @@ def test_progress_on_a_file_is_a_line_now_and_then():
     assert chatty.getvalue() == "run 1/4, loss 0.1235\nrun 4/4, 0:00:00 left\n"
 
 
-def test_no_time_is_left_after_more_than_was_expected(monkeypatch):
+def test_no_time_is_told_after_more_than_was_expected(monkeypatch):
     """As of an optimiser that evaluates more than once an iteration."""
     seconds, chatty = itertools.count(0.0, 30.0), io.StringIO()
     monkeypatch.setattr("time.monotonic", lambda: next(seconds))
     with track(2, "optimise", stream=chatty, interval=0.0) as advance:
         for _ in range(3):
             advance()
-    assert chatty.getvalue().splitlines() == ["optimise 1/2", *(f"optimise {k}/2, 0:00:00 left" for k in (2, 3))]
+    assert chatty.getvalue().splitlines() == ["optimise 1/2", "optimise 2/2, 0:00:00 left", "optimise 3"]
 
 
 def test_the_time_left_counts_no_compiling(monkeypatch):

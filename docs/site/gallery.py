@@ -67,7 +67,7 @@ class Entry:
 
 
 ENTRIES = {
-    "shear": Entry(FIGURES / "shear.toml", 0.005, 3.0, 0.6),
+    "shear": Entry(FIGURES / "shear.toml", 0.01, 3.0, 0.6),
     "pillar": Entry(TEMPLATES / "pillar.toml", 0.0125, 1.3, 0.35, NEW),
     "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
     "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
