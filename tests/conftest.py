@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import warp as wp
 from matplotlib.image import imsave
 
 from compiling_notice import without_compiling
@@ -21,6 +22,8 @@ collect_ignore += ["test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
 
+wp.config.cpu_compiler_flags = "-march=native"
+"""LLVM's own limits of inlining: kernels are compiled in two thirds of the time, and long gradients take a fifth more."""
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 

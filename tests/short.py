@@ -1,7 +1,8 @@
 """What `make test` runs of all tests, which are those of `make test-all`.
 
 Of a test with several parameters it runs so many cases that every value of each parameter is in one of them, not all
-combinations; and of cases that take at least 3 s those in `KEPT` alone. `tests/seconds.csv` has what cases take:
+combinations; and of cases in `tests/seconds.csv` those in `KEPT` alone. They take at least 3 s, or need kernels that few
+others need, so that they take long on a new clone (`tests/cold.py`). The table is written from pytest's report:
 
     pytest --short --junitxml=suite.xml; python tests/short.py suite.xml
 """
@@ -57,7 +58,7 @@ MEASURED = _measured()
 
 
 def seconds_of(item) -> float:
-    """What a case takes, and 0 where it is less than `SLOW`. A row of a whole test is about each case of it."""
+    """What a case takes, and 0 where it has no row. A row of a whole test is about each case of it."""
     file = item.path.stem
     return MEASURED.get((file, item.name)) or MEASURED.get((file, getattr(item, "originalname", item.name)), 0.0)
 
