@@ -23,7 +23,7 @@ collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
 
 wp.config.cpu_compiler_flags = "-march=native"
-"""LLVM's own limits of inlining: kernels are compiled in two thirds of the time, and long gradients take a fifth more."""
+"""LLVM's own limits of inlining: kernels compile in two thirds of the time, and long gradients take a fifth more."""
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 

@@ -1,8 +1,8 @@
 """What `make test` runs of all tests, which are those of `make test-all`.
 
 Of a test with several parameters it runs so many cases that every value of each parameter is in one of them, not all
-combinations; and of cases in `tests/seconds.csv` those in `KEPT` alone. They take at least 3 s, or need kernels that few
-others need, so that they take long on a new clone (`tests/cold.py`). The table is written from pytest's report:
+combinations; and of cases in `tests/seconds.csv` those in `KEPT` alone. They take at least 3 s, or need kernels that
+few others need, so that they take long on a new clone (`tests/cold.py`). The table is written from pytest's report:
 
     pytest --short --junitxml=suite.xml; python tests/short.py suite.xml
 """
