@@ -8,6 +8,8 @@ import warp as wp
 
 import cortado
 from cortado.errors import DivergedError, InputError
+from cortado.optimisation.layers.layer import PARAMETER, STATE, named, on_host
+from cortado.optimisation.layers.steps import Steps
 
 STEPS = 4
 
@@ -118,3 +120,25 @@ def test_what_is_no_number_ends_the_run() -> None:
     own = simulation()
     with pytest.raises(DivergedError, match=r"diverged in step 2.*try a smaller time step than 0\.002 s"):
         own.stepper(STEPS).step(own.on_device(), {"gravity": on_device([[0, 0], [np.nan, 0], [0, 0], [0, 0]])})
+
+
+@pytest.mark.parametrize("size", [None, 3])
+@pytest.mark.parametrize("shape", [(2,), (STEPS, 2)])
+def test_a_layer_leaves_them_there(shape: tuple[int, ...], size: int | None) -> None:
+    """As layers get them on a GPU: of one evaluation, and of several that are mapped."""
+    own = simulation()
+    layer, many = Steps(own, STEPS), () if size is None else (size,)
+    layer = layer if size is None else layer.batched(size)
+    first = named(STATE, layer.states.of(own.state() if size is None else (own.state(),) * size, {}))
+    bars, name = {STATE + "positions": numbers(1, *many, 25, 2)}, PARAMETER + "gravity"
+    found = []
+    for array in (on_device, np.asarray):
+        given = {**first, name: array(numbers(0, *many, *shape))}
+        end, residual = layer.evaluate(given, keep=True)
+        bar = layer.pull(residual, bars)[name]
+        assert isinstance(bar, wp.array) == isinstance(given[name], wp.array)
+        dots = layer.push(residual, {name: array(numbers(2, *many, *shape))})
+        found.append([on_host(one) for one in (end[STATE + "positions"], bar, dots[STATE + "positions"])])
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours.reshape(theirs.shape), theirs, rtol=1e-13, atol=1e-18)
+        assert theirs.any()
