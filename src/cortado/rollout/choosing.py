@@ -9,7 +9,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import step_bounds
 from cortado.rollout.step_sizes import ChosenSteps, Fill
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameters.values import Arrays, stacked
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
 
@@ -34,6 +34,6 @@ def _fill(rollout: Rollout, parameters: SceneParameters, members: Sequence[Array
     def fill(step: int, times: NDArray, sizes: NDArray) -> None:
         each = zip(members, times.tolist(), sizes.tolist(), strict=True)
         rows = [parameters.scheduled_at(*one) for one in each]
-        rollout.parameters.set_row(step, {name: np.stack([row[name] for row in rows]) for name in rows[0]})
+        rollout.parameters.set_row(step, stacked(rows))
 
     return fill

@@ -18,7 +18,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import greatest_step
 from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
+from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.stability import divergence_advice
 from cortado.scene.viscous_forms import parameter_sentence
@@ -141,7 +141,7 @@ class ParameterSpace:
             return divergence_advice(simulation.scene, each[member], float(rollout.time_steps[member]))
 
         rollout.advice = advice
-        rollout.parameters.set(_stacked(chosen))
+        rollout.parameters.set(stacked(chosen))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:
             raise InputError(
@@ -212,13 +212,13 @@ class ParameterSpace:
         directions = [self._one.direction(*own) for own in each]
         if not rollout.goes_on:
             dot.set(self._together([first for first, _ in directions]))
-        parameters.set(_stacked([run for _, run in directions]))
+        parameters.set(stacked([run for _, run in directions]))
 
     def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
         """(members,) from the adjoints of the parameters those of the times at which the first states are."""
         run = self._read(parameters, {name for own in self._different(values) for name in self._one.changing(own)})
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
-        return np.array([self._one.time_adjoint(own, _entry(run, b), clock) for b, (own, clock) in members])
+        return np.array([self._one.time_adjoint(own, entry(run, b), clock) for b, (own, clock) in members])
 
     def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
         """Adjoints of the first state as those of its fields, by name, and of its ``time``, all in float64; in a batch
@@ -246,11 +246,9 @@ class ParameterSpace:
         fields = [] if rollout.goes_on else fields
         first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
         if self._batch is None:
-            return self._one.gradient(values, first, _entry(run, 0), rollout.clocks[0])
+            return self._one.gradient(values, first, entry(run, 0), rollout.clocks[0])
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
-        found = _stacked(
-            [self._one.gradient(own, _entry(first, b), _entry(run, b), clock) for b, (own, clock) in members]
-        )
+        found = stacked([self._one.gradient(own, entry(first, b), entry(run, b), clock) for b, (own, clock) in members])
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
 
     def _read(self, parameters: Parameters, names: Collection[str]) -> Arrays:
@@ -317,14 +315,4 @@ class ParameterSpace:
 
     def _together(self, fields: list[Arrays]) -> Arrays:
         """The fields of the states of all scenes, given those of each or once those of all."""
-        return fields[0] if self._batch is None else _stacked(fields * (self._batch // len(fields)))
-
-
-def _stacked(arrays: list[Arrays]) -> Arrays:
-    """Arrays of the same names with a first axis for each of the tables."""
-    return {name: np.stack([one[name] for one in arrays]) for name in arrays[0]}
-
-
-def _entry(arrays: Arrays, number: int) -> Arrays:
-    """One entry of the first axis of each array."""
-    return {name: array[number] for name, array in arrays.items()}
+        return fields[0] if self._batch is None else stacked(fields * (self._batch // len(fields)))

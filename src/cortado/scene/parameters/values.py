@@ -93,3 +93,13 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
         if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
             place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
             raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")
+
+
+def stacked(tables: Sequence[Arrays]) -> Arrays:
+    """Arrays of the same names with a first axis for each of the tables."""
+    return {name: np.stack([one[name] for one in tables]) for name in tables[0]}
+
+
+def entry(arrays: Arrays, number: int) -> Arrays:
+    """One entry of the first axis of each array."""
+    return {name: array[number] for name, array in arrays.items()}
