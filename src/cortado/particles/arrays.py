@@ -20,6 +20,14 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
     return wp.array(padded(values), dtype=precision.vector, device=device)
 
 
+def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
+    """The memory of numbers, vectors or matrices as an array of numbers of a shape, which keeps it."""
+    real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
+    view._ref = array
+    return view
+
+
 class Arrays:
     """Warp arrays by name."""
 

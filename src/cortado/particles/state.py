@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.device.launching import TreeReduction, sum_of
 from cortado.device.precision import Precision
-from cortado.particles.arrays import Arrays, padded, zeros
+from cortado.particles.arrays import Arrays, components, padded, zeros
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.parameters.parameter import Axis
@@ -71,11 +71,7 @@ class State(Arrays):
         shares its memory: what speaks DLPack, such as PyTorch and JAX, takes it without a copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
-        entries = getattr(field.dtype, "_shape_", ())
-        dtype = getattr(field.dtype, "_wp_scalar_type_", field.dtype)
-        view = wp.array(ptr=field.ptr, dtype=dtype, shape=(*shape, *entries), device=field.device)
-        view._ref = field  # keeps the memory
-        return view
+        return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""

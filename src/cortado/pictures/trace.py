@@ -3,9 +3,9 @@
 A ray that meets the fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid.
 What is refracted goes on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses
 the part 1 - exp(-scattering L), instead of which it gets the colour of the fluid in the light that falls on it,
-and of what remains the part colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves
-the fluid for the surroundings near the critical angle, it is split again, and what is reflected goes on. Fluid is all
-the way what it is where a ray comes into it.
+and of what remains the part colour^(absorption L) is left, by Beer and Lambert's law. Where it leaves the fluid for the
+surroundings near the critical angle, it is split again, and what is reflected goes on. Fluid is all the way what it is
+where a ray comes into it.
 """
 
 from functools import cache

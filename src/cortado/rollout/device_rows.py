@@ -11,6 +11,7 @@ import warp as wp
 from cortado.device.launching import launch
 from cortado.device.precision import Precision
 from cortado.errors import InputError
+from cortado.particles.arrays import components
 from cortado.particles.state import Parameters
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.scene_parameters import Simulated
@@ -22,13 +23,11 @@ class DeviceRows:
     """Those of one simulation over a number of steps.
 
     They are Warp arrays in the simulation's precision and on its device, of the shapes that a parameter may have, (1,)
-    in the place of ().
-    Nobody looks at them: neither whether they are finite, nor how far a solid goes in a step.
+    in the place of (). Nobody looks at them: neither whether they are finite, nor how far a solid goes in a step.
     """
 
-    def __init__(self, simulation: Simulated, space: ParameterSpace, steps: int):
+    def __init__(self, simulation: Simulated, space: ParameterSpace):
         self._simulation, self._space = simulation, space
-        self._whole = simulation.batch or 1, max(steps, 1)
         self._spread, self._fold = _kernels(simulation.precision)
 
     def split(self, given: Values | None, what: str = "parameter") -> tuple[Values, dict[str, wp.array]]:
@@ -85,20 +84,15 @@ class DeviceRows:
 
     def _in_three(self, name: str, array: wp.array) -> wp.array:
         """With an axis each for scenes and for steps, of 1 where they share rows, and for components."""
-        components = prod(self._space.shapes(name)[0])
+        each = prod(self._space.shapes(name)[0])
         of_each = array.ndim == self._simulation.known[name].rank + 2  # else all scenes of a batch share them
         members = len(array) if of_each else 1
-        return array.contiguous().reshape((members, array.size // (members * components), components))
+        return array.contiguous().reshape((members, array.size // (members * each), each))
 
 
 def _numbers(array: wp.array) -> wp.array:
     """The memory of a parameter over time, (members, steps) vectors or numbers, as numbers (members, steps, k)."""
-    real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
-    view = wp.array(
-        ptr=array.ptr, dtype=real, shape=(*array.shape, wp.types.type_size(array.dtype)), device=array.device
-    )
-    view._ref = array  # keeps the memory
-    return view
+    return components(array, (*array.shape, wp.types.type_size(array.dtype)))
 
 
 @cache

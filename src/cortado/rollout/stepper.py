@@ -60,7 +60,7 @@ class Stepper:
     def __init__(self, simulation: Steppable, steps: int):
         """``steps`` may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
-        self._rows = DeviceRows(simulation, self._space, steps)
+        self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
         """What takes the steps, with the parameters of the last ones."""
 

@@ -49,8 +49,8 @@ class Searched:
 
 def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
     """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found, else the
-    lowest point that was run: a search
-    up to where its estimate of the Jacobian serves, tangents, and a search from there with these."""
+    lowest point that was run: a search up to where its estimate of the Jacobian serves, tangents, and a search from
+    there with these."""
     for _ in range(MOST_JACOBIANS):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, NEARBY / squares)

@@ -23,7 +23,7 @@ class LayerParameters:
     def __init__(self, simulation: Simulation, steps: int, each: bool):
         self._simulation, self._each = simulation, each
         self._space = ParameterSpace(simulation, steps)
-        self._rows = DeviceRows(simulation, self._space, steps)
+        self._rows = DeviceRows(simulation, self._space)
 
     def check(self, given: Shapes, with_state: bool) -> None:
         """Raises `InputError` for arrays that no parameters have."""
