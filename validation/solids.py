@@ -23,7 +23,7 @@ from held_water import MESHES, cup_turned, meshes, stirred
 from piston_waves import piston
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
-LATE = 0.75
+LATE = 0.8
 """Of a run, from where on velocities are averaged."""
 
 
@@ -83,7 +83,7 @@ def _at(point: np.ndarray, x: np.ndarray, values: np.ndarray, width: float) -> f
 def cases(device: str) -> dict[str, Callable[[], object]]:
     """By name; only the cavity runs on the device."""
     found: dict[str, Callable[[], object]] = {}
-    for reynolds, across, duration in ((100, 50, 12.0), (400, 50, 40.0), (400, 100, 40.0)):
+    for reynolds, across, duration in ((100, 50, 15.0), (400, 50, 50.0), (400, 100, 50.0)):
         for follow, name in ((False, ""), (True, ", velocities follow")):
             case = partial(cavity, across, reynolds, duration, device, follow)
             found[f"cavity, Re {reynolds}, {across} x {across}{name}"] = case
