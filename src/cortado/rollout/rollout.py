@@ -31,6 +31,8 @@ from cortado.solvers.solver import Counts, Solver, StepTangent
 
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
+GRAPH_STEPS = 4
+"""Steps in one graph: a GPU takes the first ones while the host hands over the next."""
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
@@ -202,18 +204,20 @@ class Rollout:
         self.solver.step_number.fill_(first)
         self.step_sizes.seek(first)
         self._buffer.assign(state)
-        length = last - first
-        if is_new := length not in self._chunks:
-            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
-        self._chunks[length]()
-        if is_new:
+        length, known = last - first, len(self._graphs)
+        for begin in range(0, length, GRAPH_STEPS):
+            piece = begin, min(begin + GRAPH_STEPS, length)
+            if piece not in self._graphs:
+                self._graphs[piece] = CapturedGraph(partial(self._take, *piece), self.solver.launch)
+            self._graphs[piece]()
+        if len(self._graphs) > known:
             require_counted(self.solver, last)
         return self._chunk[:length]
 
-    def _take(self, length: int) -> None:
-        """So many steps from the state in the buffer."""
-        state = self._buffer
-        for new_state in self._chunk[:length]:
+    def _take(self, begin: int, end: int) -> None:
+        """The steps of a chunk from one to another, the first of all from the state in the buffer."""
+        state = self._chunk[begin - 1] if begin else self._buffer
+        for new_state in self._chunk[begin:end]:
             self.solver.step(state, new_state, self.parameters, self.log)
             self.step_sizes.choose(new_state)
             state = new_state
@@ -223,8 +227,8 @@ class Rollout:
         if self._generation == self.solver.generation:
             return
         self._generation = self.solver.generation
-        self._chunks: dict[int, CapturedGraph] = {}
-        """Graphs by their number of steps."""
+        self._graphs: dict[tuple[int, int], CapturedGraph] = {}
+        """By the steps of a chunk that they begin and end with."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 
