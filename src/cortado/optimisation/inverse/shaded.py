@@ -19,6 +19,7 @@ from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
+from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.page import Page, Panel
 from cortado.pictures.painter import colours_of, painter, spread
 from cortado.pictures.scenery import State
@@ -99,7 +100,7 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
         return side_by_side(images, across, names)
 
     def drawn(run: Run) -> Panel:
-        return lambda step: artist.image(*_state(made, run, step))
+        return FilmedRun(artist, partial(_state, made, run))
 
     return Page([drawn(run) for run in runs], composed)
 
