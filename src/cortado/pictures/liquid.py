@@ -110,11 +110,11 @@ Level = tuple[Any, wp.array]
 """Of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
 
 
-def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> Level:
-    """That of what particles fill."""
+def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Level, Any]:
+    """That of what particles fill, and the `NearParticles` that it is made of."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     s = near_particles(particles, ends, spacing, reach, launch)
-    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch)
+    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch), s
 
 
 def liquid_surface(

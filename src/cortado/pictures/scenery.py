@@ -65,7 +65,8 @@ def still(home: Stage, state: State, launch: BandLauncher) -> Any:
     if stage.picture.surface != "liquid" or not len(particles):
         return None
     shadow.of_fluid(particles)
-    return still_of(liquid_level(wetting(stage, s, particles, launch), stage.spacing, launch), shadow.light, launch)
+    level, near = liquid_level(wetting(stage, s, particles, launch), stage.spacing, launch)
+    return still_of(level, near, shadow.light, launch)
 
 
 def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:

@@ -13,16 +13,18 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, number_of
+from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, number_of, place_of
+from cortado.pictures.near_particles import NearParticles, count_near
 from cortado.pictures.particles import MODULE
 
 WINDOW, SHADOW_WINDOW = 30, 6
 """Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""
-LIMITS, SHADOW_LIMITS = (0.25, 0.5), (0.02, 0.04)
+LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.25, 0.5), (0.3, 0.6), (0.02, 0.04)
 """How far fluid is, in spacings, and how much the light on the floor differs, for a frame to count fully, and not at
 all."""
-OWN = wp.constant(wp.float32(0.5))
-"""XX"""
+BODY_REACH, BODY = 6.0, (10.0, 17.0)
+"""How far around a block fluid is looked for, in spacings, and how much of it makes a drop and a body of fluid: as many
+particles, those that are farther away counted less, of the 85 that there are within fluid."""
 TOUCHING = wp.constant(27)
 """Blocks: one, and those that touch it."""
 
@@ -38,6 +40,8 @@ class Still:
     """The first block, counted from the origin."""
     means: wp.array(dtype=wp.float32)
     """(blocks that the surface may pass,) of the level"""
+    bodies: wp.array(dtype=wp.float32)
+    """(blocks that the surface may pass,) 1 where much fluid is around, and 0 in drops"""
     light: wp.array2d(dtype=wp.vec3)
     """(nodes, nodes) that the fluid leaves on the floor"""
 
@@ -69,12 +73,22 @@ def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_means(first: wp.int32, levels: wp.array2d(dtype=wp.float32), means: wp.array(dtype=wp.float32)):
+def find_means(
+    first: wp.int32,
+    own: Still,
+    s: NearParticles,
+    reach: wp.float32,
+    means: wp.array(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.float32),
+):
     n = first + wp.tid()
     total = wp.float32(0.0)
     for k in range(CUBES):
-        total += levels[n, k]
+        total += own.b.levels[n, k]
     means[n] = total / float(CUBES)
+    at = wp.float32(WIDTH) * (wp.vec3(block_at(own.b, own.blocks[n])) + wp.vec3(0.5))
+    near = count_near(s, place_of(own.b, at[0], at[1], at[2]), reach)
+    bodies[n] = 1.0 - share(near, wp.static(wp.vec2(*BODY)))
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -111,6 +125,7 @@ def find_shares(
     first: wp.int32,
     touching: wp.array2d(dtype=wp.int32),
     ways: wp.array2d(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.float32),
     before: wp.int32,
     window: wp.int32,
     limits: wp.vec2,
@@ -118,10 +133,10 @@ def find_shares(
 ):
     """Of the others in each block, by the root mean square of the ways in it and in those that touch it."""
     n = first + wp.tid()
-    left = wp.float32(1.0)
+    left = bodies[n]
     for j in range(ways.shape[1]):
         if j == before:
-            left = 1.0
+            left = bodies[n]
         if left > 0.0:
             total = wp.float32(0.0)
             weights = wp.float32(0.0)
@@ -132,7 +147,7 @@ def find_shares(
                     weight = 1.0 / float(1 << off)
                     total += weight * ways[m, j] * ways[m, j]
                     weights += weight
-            left *= share(wp.max(wp.sqrt(total / weights), OWN * ways[n, j]), limits)
+            left *= share(wp.sqrt(total / weights), limits)
         shares[n, j] = left * nearness(j, before, window)
 
 
@@ -141,6 +156,8 @@ def average_level(
     first: wp.int32,
     own: Still,
     others: wp.array(dtype=Still),
+    before: wp.int32,
+    limits: wp.vec2,
     indices: wp.array2d(dtype=wp.int32),
     shares: wp.array2d(dtype=wp.float32),
     levels: wp.array2d(dtype=wp.float32),
@@ -150,11 +167,15 @@ def average_level(
     level = own.b.levels[n, k]
     total = wp.float32(0.0)
     weights = wp.float32(1.0)
+    left = wp.float32(1.0)
     for j in range(others.shape[0]):
-        weight = shares[n, j]
-        if weight > 0.0 and indices[n, j] >= 0:
-            total += weight * (others[j].b.levels[indices[n, j], k] - level)
-            weights += weight
+        if j == before:
+            left = 1.0
+        if left > 0.0 and shares[n, j] > 0.0 and indices[n, j] >= 0:
+            change = others[j].b.levels[indices[n, j], k] - level
+            left *= share(wp.abs(change), limits)
+            total += left * shares[n, j] * change
+            weights += left * shares[n, j]
     levels[n, k] = level + total / weights
 
 
@@ -186,14 +207,16 @@ def average_light(
     found[i, k] = light + total / weights
 
 
-def still_of(level: tuple[Any, wp.array], light: wp.array, launch: BandLauncher) -> Any:
-    """`Still` of a level, `Blocks` and the numbers of those that the surface may pass, and of the light on the floor."""
+def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandLauncher) -> Any:
+    """`Still` of a level, `Blocks` and the numbers of those that the surface may pass, with the `NearParticles` that it
+    is made of, and of the light on the floor."""
     found = Still()
     found.b, found.blocks = level
     wide = found.b.cube * float(WIDTH)
     found.first, found.light = wp.vec3i(*(round(end / wide) for end in found.b.lower)), light
-    found.means = wp.empty(len(found.blocks), dtype=wp.float32, device=launch.device)
-    launch(find_means, len(found.means), levels=found.b.levels, means=found.means)
+    means, bodies = (wp.empty(len(found.blocks), dtype=wp.float32, device=launch.device) for _ in range(2))
+    launch(find_means, len(means), own=found, s=s, reach=BODY_REACH * s.spacing, means=means, bodies=bodies)
+    found.means, found.bodies = means, bodies
     return found
 
 
@@ -210,9 +233,10 @@ def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: flo
     own_ways = {"indices": indices, "touching": touching, "ways": ways}
     launch(find_ways, count, own=own, **others, width=own.b.cube * float(WIDTH) / spacing, **own_ways)
     given = {"before": len(before), "limits": wp.vec2(*LIMITS), "window": WINDOW}
-    launch(find_shares, count, touching=touching, ways=ways, **given, shares=shares)
+    launch(find_shares, count, touching=touching, ways=ways, bodies=own.bodies, **given, shares=shares)
     found.b.levels, found.light = wp.empty_like(own.b.levels), wp.empty_like(own.light)
-    launch(average_level, own.b.levels.size, own=own, **others, indices=indices, shares=shares, levels=found.b.levels)
+    given = {"before": len(before), "limits": wp.vec2(*LEVEL_LIMITS), "indices": indices, "shares": shares}
+    launch(average_level, own.b.levels.size, own=own, **others, **given, levels=found.b.levels)
     given = {"before": len(before), "limits": wp.vec2(*SHADOW_LIMITS), "window": SHADOW_WINDOW}
     launch(average_light, own.light.size, own=own, **others, **given, found=found.light)
     return found
