@@ -1,9 +1,9 @@
 """Fluid at rest is drawn at rest: what is drawn of it is averaged over those frames of a film in which it stays.
 
-Particles of water at rest go on swimming about, and move its surface by parts of a spacing. Of each block of the lattice
-the mean level tells how far the fluid in it is from where it is in the frames before and after. Frames in which that is
-less than a part of a spacing, one after the other without a gap, have a share in the level that is drawn. Where fluid
-moves further from frame to frame no other frame has one, and the level stays as it is, to the bit.
+Particles of water at rest go on swimming about, and move its surface by parts of a spacing. In each block of the
+lattice the mean level tells how far the fluid is from where it is in the frames before and after. Frames in which that
+is less than a part of a spacing, one after the other without a gap, have a share in the level that is drawn. Where
+fluid moves further from frame to frame, and in drops, no other frame has one, and the level stays as it is, to the bit.
 """
 
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, number_of, place_of
+from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 from cortado.pictures.near_particles import NearParticles, count_near
 from cortado.pictures.particles import MODULE
 
 WINDOW, SHADOW_WINDOW = 30, 6
 """Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""
-LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.25, 0.5), (0.3, 0.6), (0.02, 0.04)
-"""How far fluid is, in spacings, and how much the light on the floor differs, for a frame to count fully, and not at
-all."""
-BODY_REACH, BODY = 6.0, (10.0, 17.0)
+LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
+"""How far the fluid in a block is, in spacings, and how much the level at a node and the light on the floor differ, for
+a frame to count fully, and not at all."""
+BODY_REACH, BODY = 6.0, (7.0, 12.0)
 """How far around a block fluid is looked for, in spacings, and how much of it makes a drop and a body of fluid: as many
 particles, those that are farther away counted less, of the 85 that there are within fluid."""
 TOUCHING = wp.constant(27)
@@ -44,18 +44,6 @@ class Still:
     """(blocks that the surface may pass,) 1 where much fluid is around, and 0 in drops"""
     light: wp.array2d(dtype=wp.vec3)
     """(nodes, nodes) that the fluid leaves on the floor"""
-
-
-@wp.func
-def index_of(b: Blocks, at: wp.vec3i):
-    """That of a block in ``levels``; -1 where it has none, and -2 outside the lattice."""
-    if wp.min(at) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
-        return -2
-    block = number_of(b, at[0], at[1], at[2])
-    before = wp.int32(0)
-    if block > 0:
-        before = b.places[block - 1]
-    return wp.where(b.places[block] > before, before, -1)
 
 
 @wp.func
@@ -147,7 +135,7 @@ def find_shares(
                     weight = 1.0 / float(1 << off)
                     total += weight * ways[m, j] * ways[m, j]
                     weights += weight
-            left *= share(wp.sqrt(total / weights), limits)
+            left *= share(wp.max(wp.sqrt(total / weights), ways[n, j]), limits)
         shares[n, j] = left * nearness(j, before, window)
 
 

@@ -134,7 +134,6 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
 def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
     """The pictures of a panel of the frames that are shown, with a name and a time on them."""
 
-
     def drawn(k: int, around: Around) -> Points:
         before, after = (tuple(int(shown.nearest[n]) for n in side) for side in around)
         return labelled(panel(int(shown.nearest[k]), (before, after)), name, shown.time_in_words(k))

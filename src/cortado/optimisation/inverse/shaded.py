@@ -16,10 +16,10 @@ from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.film import film
+from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
-from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.page import Page, Panel
 from cortado.pictures.painter import colours_of, painter, spread
 from cortado.pictures.scenery import State
