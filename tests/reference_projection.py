@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import reference
+from cortado.discretise.calibration import SKIN
 
 
 def between(H, first, second):
@@ -27,6 +28,7 @@ class Projection:
     periods: np.ndarray
     iterations: int = 4
     repairs: int = 2
+    follow: bool = False
 
     @classmethod
     def of(cls, simulation):
@@ -40,7 +42,8 @@ class Projection:
         )
         kernel, spacing = solver.discretisation.smoothing, scene.discretisation.spacing
         periods = np.array(scene.container.periods(d)[1])
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods)
+        follow = getattr(scene.solver, "velocities_follow", False)
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, follow=follow)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -54,8 +57,13 @@ class Projection:
         a = self.volume * sigma / self.support**2 * reference.slope(self.kernel.name, q)
         return apart, W, a[..., None] * apart
 
-    def density(self, x):
+    def density(self, x, before=None):
+        """Over the neighbours that particles have at positions before a step."""
         W, wall = self.pairs(x, x)[1], self.pairs(x, self.walls)[1]
+        if before is not None:
+            near, beside = (np.linalg.norm(self.pairs(before, y)[0], axis=-1) for y in (before, self.walls))
+            reach = (1 + SKIN) * self.support
+            W, wall = W * (near < reach), wall * (beside < reach)
         return W.sum(1) + wall @ self.wall_weights
 
     def constants(self, d):
@@ -127,10 +135,13 @@ class Projection:
         moved = x + dt * v + self.shift(x, v, dt)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
-        for _ in range(self.repairs):
-            z = c + omega * (self.density(now) - 1) / a
+        for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
+            z = c + omega * 3 / (2 - root) * (self.density(now, x) - 1) / a
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+        if self.follow:
+            slopes = -np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
+            v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, k
 
     def shift(self, x, v, dt):

@@ -18,6 +18,7 @@ from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.following import following_kernels
 from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
@@ -66,8 +67,11 @@ class ProjectionSteps(ParticleSolver):
     density_power = 0
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER),)
 
-    def __init__(self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int):
-        """Of so many iterations of the pressure and of the repair of density in every step."""
+    def __init__(
+        self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int, follow: bool
+    ):
+        """Of so many iterations of the pressure and of the repair of density in every step; velocities ``follow`` the
+        shift and the repairs, or stay as they are."""
         super().__init__(system)
         self.constants = constants
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -86,10 +90,15 @@ class ProjectionSteps(ParticleSolver):
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
         self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
+        """Those of velocities that follow the shift and the repairs; None where they do not."""
+        self.v_end = self.vectors() if follow else self.v_new
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
         self.momenta = momenta(iterations)
+        self.repair_relaxations = constants.repair_relaxations(repairs)
+        """omega of each repair."""
         limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
         names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
         self.loops = tuple(
@@ -119,9 +128,9 @@ class ProjectionSteps(ParticleSolver):
         projection, repair = self.loops
         projection.run(lambda k: self.iterate(context, k, 0, 0))
         self.move(context, 0)
-        repair.run(lambda k: self.mend(context, 0, 0))
+        repair.run(lambda k: self.mend(context, k, 0, 0))
         self._finish(context, 0, 0, new_state)
-        self.end_step(self.repaired[0]["x_now"], self.v_new, new_state, log)
+        self.end_step(self.repaired[0]["x_now"], self.v_end, new_state, log)
 
     def reserve(self, counts: Counts) -> None:
         iterations, repairs = counts
@@ -138,7 +147,7 @@ class ProjectionSteps(ParticleSolver):
             self.iterate(context, k, k, k + 1)
         self.move(context, iterations)
         for k in range(repairs):
-            self.mend(context, k, k + 1)
+            self.mend(context, k, k, k + 1)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
         iterations, repairs = counts
@@ -188,17 +197,21 @@ class ProjectionSteps(ParticleSolver):
         moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
 
-    def mend(self, context: StepContext, before: int, after: int) -> None:
-        """A repair, from the positions of one slot to those of another."""
+    def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
+        """Repair k, from the positions of one slot to those of another."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
-        context.launch(kernels.measure.forward, self.around, self.relaxed, measured, error=self.loops[1].errors)
+        relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}
+        context.launch(kernels.measure.forward, self.around, measured, relaxed)
         moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"]}
         context.launch(kernels.move.forward, self.around, moved)
 
     def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> None:
-        ends = {IMPULSE: self.iterates[iterations]["k"]}
-        self.unsort(context, self.repaired[repairs]["x_now"], self.v_new, new_state, **ends)
+        ends, x_now = {IMPULSE: self.iterates[iterations]["k"]}, self.repaired[repairs]["x_now"]
+        if self.following is not None:
+            moved = {"x_now": x_now, "v_new": self.v_new, "v_end": self.v_end}
+            context.launch(self.following.forward, self.around, self.kept, moved)
+        self.unsort(context, x_now, self.v_end, new_state, **ends)
 
 
 def momenta(iterations: int) -> list[float]:
