@@ -22,6 +22,7 @@ SPACINGS = {
     "drop_large": 0.012,
     "fountain": 0.014,
     "identify": 0.01,
+    "ink": 0.05,
     "latte_art": 0.006,
     "latte_art_heart": 0.006,
     "latte_art_large": 0.008,

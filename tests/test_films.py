@@ -261,6 +261,28 @@ def test_a_fluid_at_rest_does_not_flicker():
     assert (np.abs(one - other).max(axis=2) > 1.0 / 255.0).mean() < 1e-3
 
 
+def test_water_that_a_solver_keeps_at_rest_does_not_flicker_in_a_film():
+    """Though its particles go on swimming. A film that was stopped goes on with the same pictures."""
+    box = {"shape": "box", "lower": [0.0, 0.0, 0.0]}
+    water = scene(
+        fluid=[{**box, "upper": [0.3, 0.3, 0.2], "phase": "water"}],
+        container={**box, "upper": [0.3, 0.5, 0.2]},
+        solver={"kind": "projection", "time_step": 0.005},
+        picture=SMALL,
+    )
+    trajectory = cortado.Simulation(water).run(98, record_every=7)
+    page = run_page(water, trajectory, "cpu")
+    frames = range(len(trajectory))
+    film, alone = list(page.images(frames, begin=8)), [page.image(k) for k in frames[8:]]
+    changed, as_drawn = (
+        (np.abs(np.diff(np.array(images) ** (1.0 / 2.4), axis=0)).max(axis=3) > 1.0 / 255.0).mean()
+        for images in (film, alone)
+    )
+    assert as_drawn > 5e-3 and changed < 1e-3, (as_drawn, changed)
+    (last,) = run_page(water, trajectory, "cpu").images(frames, begin=len(frames) - 1)
+    np.testing.assert_array_equal(last, film[-1])
+
+
 def test_an_option_says_the_kind_of_a_camera_and_set_the_rest():
     replaced = scene().replaced(*camera_override("orbit"), "picture.camera_path.turns=0.25")
     assert replaced.picture.camera_path == Orbit(turns=0.25)

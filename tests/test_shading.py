@@ -271,7 +271,7 @@ def test_contrast_is_found_between_neighbours_alone():
 
 def page_of(picture, fingerprint=""):
     """A page that shows what a function returns for the number of a frame."""
-    return Page([picture], fingerprint=fingerprint)
+    return Page([lambda frame, around: picture(frame)], fingerprint=fingerprint)
 
 
 def test_light_has_no_edge_where_reflection_within_water_becomes_total():
@@ -291,9 +291,11 @@ def test_light_has_no_edge_where_reflection_within_water_becomes_total():
 
 
 def test_a_page_shows_its_panels_side_by_side():
-    page = Page([lambda k: k, lambda k: 10 * k], tuple)
+    page = Page([lambda k, around: k, lambda k, around: 10 * k], tuple)
     assert page.image(3) == (3, 30)
-    assert list(page.images([1, 2])) == [(1, 10), (2, 20)]
+    assert list(page.images([1, 2])) == [(1, 10), (2, 20)] and list(page.images([1, 2], begin=1)) == [(2, 20)]
+    around = next(Page([lambda k, around: around]).images(range(0, 80, 2), begin=31))
+    assert around[0] == tuple(range(60, 0, -2)) and around[1] == tuple(range(64, 80, 2))
 
 
 def test_a_lattice_in_a_round_cup_reaches_its_glass():

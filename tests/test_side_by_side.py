@@ -12,7 +12,7 @@ from cortado.errors import InputError, SceneError
 from cortado.pictures import Orbit
 from cortado.pictures.grid import framed_together, in_a_row
 from cortado.pictures.labels import labelled
-from cortado.pictures.page import Page
+from cortado.pictures.page import ALONE, Page
 from cortado.pictures.stage import Stage
 from cortado.runs.colouring import coloured_by
 from cortado.runs.common_clock import ShownFrames, common_times
@@ -108,7 +108,7 @@ def test_a_run_that_ends_stands_still_and_frames_are_the_nearest(runs):
     assert across == 2
     panel = each[1].panel(stages[1], "cpu", None)
     for k, frame, told in ((0, 0, "0.000 s"), (4, 2, "0.008 s"), (6, 2, "stands still at 0.008 s")):
-        wanted = labelled(panel(frame), "short", told)[1:-1, 1:]
+        wanted = labelled(panel(frame, ALONE), "short", told)[1:-1, 1:]
         np.testing.assert_array_equal(page.image(k)[1:-1, -wanted.shape[1] :], wanted)
     assert '"short" ends at 0.0084 s and stands still' in page.notes and "at most 0.0021 s away" in page.notes
     assert runs_page(each[:1], ["long"], "cpu")[0].notes == ""

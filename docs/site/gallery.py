@@ -85,6 +85,7 @@ ENTRIES = {
     "beach": Entry(FIGURES / "beach.toml", 0.015, 3.0, 0.5),
     "two_layers": Entry(TEMPLATES / "rayleigh_taylor.toml", 0.004, 1.4, 0.7, NEW),
     "jet": Entry(TEMPLATES / "jet.toml", 0.005, 0.9, 0.8, (*NEW, "picture.colour=speed", "container.upper=[1.2, 0.7]")),
+    "ink": Entry(FIGURES / "ink.toml", 0.0125, 1.8, 0.4),
     "surface_tension": Entry(FIGURES / "surface_tension.toml", 0.0006, 0.4, 0.1),
 }
 

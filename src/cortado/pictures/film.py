@@ -65,7 +65,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            images = page.images(shown[there:], partial(_ahead, len(page.panels)))
+            images = page.images(shown, partial(_ahead, len(page.panels)), there)
             for image, time in zip(images, pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()

@@ -54,22 +54,25 @@ def block_at(b: Blocks, number: wp.int32):
 
 
 @wp.func
-def entry_of(b: Blocks, node: wp.vec3i):
-    """Of a node in ``levels``, as one number; -1 where it has none."""
-    i = node[0] / WIDTH
-    j = node[1] / WIDTH
-    k = node[2] / WIDTH
-    if i >= b.shape[0] or j >= b.shape[1] or k >= b.shape[2]:
-        return -1
-    block = number_of(b, i, j, k)
-    place = b.places[block]
+def index_of(b: Blocks, at: wp.vec3i):
+    """That of a block in ``levels``; -1 where it has none, and -2 outside the lattice."""
+    if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
+        return -2
+    block = number_of(b, at[0], at[1], at[2])
     before = wp.int32(0)
     if block > 0:
         before = b.places[block - 1]
-    if place == before:
+    return wp.where(b.places[block] > before, before, -1)
+
+
+@wp.func
+def entry_of(b: Blocks, node: wp.vec3i):
+    """Of a node in ``levels``, as one number; -1 where it has none."""
+    index = index_of(b, node / WIDTH)
+    if index < 0:
         return -1
     within = ((node[2] % WIDTH) * WIDTH + node[1] % WIDTH) * WIDTH + node[0] % WIDTH
-    return before * CUBES + within
+    return index * CUBES + within
 
 
 @wp.func

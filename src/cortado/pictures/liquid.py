@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -105,18 +106,29 @@ def find_looks(
     media[v] = wp.vec2(wp.exp(near[3] / weight) - CLEAREST, wp.exp(near[4] / weight) - CLEAREST)
 
 
-def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -> LiquidSurface:
+Level = tuple[Any, wp.array]
+"""Of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
+
+
+def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Level, Any]:
+    """That of what particles fill, and the `NearParticles` that it is made of."""
+    reach, ends = REACH * spacing, _shown(particles, spacing, launch)
+    s = near_particles(particles, ends, spacing, reach, launch)
+    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch), s
+
+
+def liquid_surface(
+    particles: Particles, spacing: float, launch: BandLauncher, level: Level | None = None
+) -> LiquidSurface:
     """The surface of what particles fill: a level of their density, smoothed by weights that keep thin sheets (Löschner
-    et al. 2023), that looks like the nearest particles.
+    et al. 2023), that looks like the nearest particles. ``level``: theirs if left out, or one that differs little.
 
     Raises:
         ComputationError: there is none.
     """
     device, reach, ends = launch.device, REACH * spacing, _shown(particles, spacing, launch)
-    cube = next(width for most, width in CUBE_WIDTHS if len(particles) <= most) * spacing
     s = near_particles(particles, ends, spacing, reach, launch)
-    b, blocks = level_blocks(s, ends, cube, reach, launch)
-    net = net_of(b, blocks, launch)
+    net = net_of(*(level or level_blocks(s, ends, _cube(particles) * spacing, reach, launch)), launch)
     points, count = net.points, len(net.points)
     if not count:
         raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
@@ -127,6 +139,11 @@ def liquid_surface(particles: Particles, spacing: float, launch: BandLauncher) -
     launch(find_looks, count, s=s, reach=REACH_OF_COLOURS * spacing, points=points, colours=colours, media=media)
     triangles, normals = triangles_of(net, points, launch), normals_of(net, points, launch)
     return LiquidSurface(points, triangles, normals, colours, media, net.neighbours)
+
+
+def _cube(particles: Particles) -> float:
+    """The width of a cube, in spacings."""
+    return next(width for most, width in CUBE_WIDTHS if len(particles) <= most)
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:

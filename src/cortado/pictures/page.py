@@ -5,10 +5,14 @@ from dataclasses import dataclass
 from itertools import islice
 
 from cortado.discretise.shapes import Points
+from cortado.pictures.steady import WINDOW
 
 Ahead = Callable[[Iterator[Points]], Iterator[Points]]
-Panel = Callable[[int], Points]
-"""From a frame, a number, to a picture (rows, columns, 3), linear from 0 to 1."""
+Around = tuple[tuple[int, ...], tuple[int, ...]]
+"""Numbers of the frames that a film shows before and after one, nearest first."""
+ALONE: Around = (), ()
+Panel = Callable[[int, Around], Points]
+"""From a frame, a number, and those around it to a picture (rows, columns, 3), linear from 0 to 1."""
 
 
 def alone(images: list[Points]) -> Points:
@@ -31,9 +35,15 @@ class Page:
 
     def image(self, frame: int) -> Points:
         """(rows, columns, 3), linear from 0 to 1."""
-        return self.composed([panel(frame) for panel in self.panels])
+        return self.composed([panel(frame, ALONE) for panel in self.panels])
 
-    def images(self, frames: Sequence[int], ahead: Ahead = iter) -> Iterator[Points]:
-        """The `image` of each frame in their order; ``ahead``: from the pictures that they are made of to the same."""
-        drawn = ahead(panel(frame) for frame in frames for panel in self.panels)
-        return (self.composed(list(islice(drawn, len(self.panels)))) for _ in frames)
+    def images(self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0) -> Iterator[Points]:
+        """Those of a film of so many frames in their order, from one of them on; ``ahead``: from the pictures that they
+        are made of to the same."""
+        shown = range(begin, len(frames))
+        drawn = ahead(panel(frames[n], _around(frames, n)) for n in shown for panel in self.panels)
+        return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)
+
+
+def _around(frames: Sequence[int], n: int) -> Around:
+    return tuple(frames[max(n - WINDOW, 0) : n][::-1]), tuple(frames[n + 1 : n + 1 + WINDOW])

@@ -11,10 +11,11 @@ from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.environment import environment_of
-from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.liquid import Level, liquid_level, liquid_surface
 from cortado.pictures.particles import Particles
 from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.stage import Stage
+from cortado.pictures.steady import still_of
 from cortado.pictures.surface import spheres
 from cortado.pictures.wetting import particles_of, wetting
 from cortado.scene.camera_paths import View
@@ -48,21 +49,41 @@ class Scenery:
     shadow: FloorShadow
 
 
-def scenery(home: Stage, state: State, launch: BandLauncher) -> Scenery:
-    """That of a state in 3-D."""
+def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
+    """That of a state in 3-D; ``steady``: `Still` of the state that is drawn in the place of its own."""
+    stage, s, particles, shadow = _placed(home, state, launch)
+    if steady is None:
+        shadow.of_fluid(particles)
+        return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
+    shadow.light = steady.light
+    return Scenery(stage, s, _surface(stage, s, particles, launch, (steady.b, steady.blocks)), shadow)
+
+
+def still(home: Stage, state: State, launch: BandLauncher) -> Any:
+    """`Still` of a state in 3-D; None where its fluid is not drawn with a surface around it."""
+    stage, s, particles, shadow = _placed(home, state, launch)
+    if stage.picture.surface != "liquid" or not len(particles):
+        return None
+    shadow.of_fluid(particles)
+    level, near = liquid_level(wetting(stage, s, particles, launch), stage.spacing, launch)
+    return still_of(level, near, shadow.light, launch)
+
+
+def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:
+    """The stage of a state, its `Environment`, its particles, and a floor without a shadow."""
     stage = home.at(state.pose, state.view)
     s, shadow = environment_of(stage), FloorShadow(stage, launch)
     s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
-    particles = particles_of(stage, state.positions, state.colours, launch, state.fractions)
-    shadow.of_fluid(particles)
-    return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
+    return stage, s, particles_of(stage, state.positions, state.colours, launch, state.fractions), shadow
 
 
-def _surface(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> DeviceSurface:
+def _surface(
+    stage: Stage, s: Any, particles: Particles, launch: BandLauncher, level: Level | None = None
+) -> DeviceSurface:
     if not len(particles):
         return _nothing(stage, launch.device)
     if stage.picture.surface == "liquid":
-        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch)
+        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, level)
         softened = partial(found.softened, launch=launch)
         surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
         surface.lit.media = found.media

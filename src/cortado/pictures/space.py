@@ -1,5 +1,6 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,11 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lighting import illuminate_kernel
 from cortado.pictures.marked import list_marked, marked
-from cortado.pictures.scenery import Scenery, State, scenery
+from cortado.pictures.scenery import Scenery, State, scenery, still
 from cortado.pictures.shadow import cast
 from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
+from cortado.pictures.steady import steadied
 from cortado.pictures.trace import Eye, find_contrast, trace_kernel
 from cortado.pictures.wetting import turn
 
@@ -65,6 +67,18 @@ class SpacePainter:
         with WARP:
             compile_ahead(self, self.device)
             return self._rays(scenery(self.stage, State(*state), self._launch))
+
+    def still(self, state: State) -> Any:
+        """What other frames of a film need of a `State`; None where nothing is steadied. See `still`."""
+        with WARP:
+            compile_ahead(self, self.device)
+            return still(self.stage, state, self._launch)
+
+    def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
+        """The picture of a state as one frame of a film, in which fluid at rest is drawn at rest; see `steadied`."""
+        with WARP:
+            steady = steadied(own, before, after, self.stage.spacing, self._launch)
+            return self._rays(scenery(self.stage, state, self._launch, steady))
 
     def _rays(self, fluid: Scenery) -> Points:
         stage, seen, s, solids = fluid.stage, fluid.surface, fluid.environment, list[DeviceSurface]()

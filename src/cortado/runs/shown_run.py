@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
+from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.page import Panel
 from cortado.pictures.painter import colours_of, painter_on, stage_of
 from cortado.pictures.plane_stage import PlaneStage
@@ -46,8 +47,7 @@ class ShownRun:
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
         """Its pictures by the number of the frame, on a stage that is its own but for the camera."""
-        draws = painter_on(stage, device)
-        return lambda k: draws.image(*self._state(k, stage, scale))
+        return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
 
     @property
     def fingerprint(self) -> str:

@@ -17,7 +17,7 @@ from cortado.pictures.film import Film, film, lacking
 from cortado.pictures.grid import MOST, framed_together
 from cortado.pictures.labels import labelled, side_by_side
 from cortado.pictures.pace import pace_of
-from cortado.pictures.page import Page, Panel
+from cortado.pictures.page import Around, Page, Panel
 from cortado.pictures.scale import Scale
 from cortado.runs.colouring import coloured_by
 from cortado.runs.common_clock import SAME, ShownFrames, common_times, interval_of
@@ -133,7 +133,12 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
 
 def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
     """The pictures of a panel of the frames that are shown, with a name and a time on them."""
-    return lambda k: labelled(panel(int(shown.nearest[k])), name, shown.time_in_words(k))
+
+    def drawn(k: int, around: Around) -> Points:
+        before, after = (tuple(int(shown.nearest[n]) for n in side) for side in around)
+        return labelled(panel(int(shown.nearest[k]), (before, after)), name, shown.time_in_words(k))
+
+    return drawn
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:

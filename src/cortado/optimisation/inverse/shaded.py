@@ -16,6 +16,7 @@ from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.film import film
+from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
@@ -99,7 +100,7 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
         return side_by_side(images, across, names)
 
     def drawn(run: Run) -> Panel:
-        return lambda step: artist.image(*_state(made, run, step))
+        return FilmedRun(artist, partial(_state, made, run))
 
     return Page([drawn(run) for run in runs], composed)
 

@@ -1,0 +1,230 @@
+"""Fluid at rest is drawn at rest: what is drawn of it is averaged over those frames of a film in which it stays.
+
+Particles of water at rest go on swimming about, and move its surface by parts of a spacing. In each block of the
+lattice the mean level tells how far the fluid is from where it is in the frames before and after. Frames in which that
+is less than a part of a spacing, one after the other without a gap, have a share in the level that is drawn. Where
+fluid moves further from frame to frame, and in drops, no other frame has one, and the level stays as it is, to the bit.
+"""
+
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
+from cortado.pictures.near_particles import NearParticles, count_near
+from cortado.pictures.particles import MODULE
+
+WINDOW, SHADOW_WINDOW = 30, 6
+"""Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""
+LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
+"""How far the fluid in a block is, in spacings, and how much the level at a node and the light on the floor differ, for
+a frame to count fully, and not at all."""
+BODY_REACH, BODY = 6.0, (7.0, 12.0)
+"""How far around a block fluid is looked for, in spacings, and how much of it makes a drop and a body of fluid: as many
+particles, those that are farther away counted less, of the 85 that there are within fluid."""
+TOUCHING = wp.constant(27)
+"""Blocks: one, and those that touch it."""
+
+
+@wp.struct
+class Still:
+    """The fluid in one frame of a film, as the others need it."""
+
+    b: Blocks
+    blocks: wp.array(dtype=wp.int32)
+    """Numbers of those that the surface may pass."""
+    first: wp.vec3i
+    """The first block, counted from the origin."""
+    means: wp.array(dtype=wp.float32)
+    """(blocks that the surface may pass,) of the level"""
+    bodies: wp.array(dtype=wp.float32)
+    """(blocks that the surface may pass,) 1 where much fluid is around, and 0 in drops"""
+    light: wp.array2d(dtype=wp.vec3)
+    """(nodes, nodes) that the fluid leaves on the floor"""
+
+
+@wp.func
+def share(way: wp.float32, limits: wp.vec2):
+    """1 for ways up to the first limit, 0 from the second on."""
+    x = wp.clamp((limits[1] - way) / (limits[1] - limits[0]), 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+@wp.func
+def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
+    """Of one of the others, of which so many are ``before``, each nearest first: it falls evenly from 1 to 0."""
+    away = wp.where(j < before, j, j - before) + 1
+    return 1.0 - float(away) / float(window + 1)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_means(
+    first: wp.int32,
+    own: Still,
+    s: NearParticles,
+    reach: wp.float32,
+    means: wp.array(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.float32),
+):
+    n = first + wp.tid()
+    total = wp.float32(0.0)
+    for k in range(CUBES):
+        total += own.b.levels[n, k]
+    means[n] = total / float(CUBES)
+    at = wp.float32(WIDTH) * (wp.vec3(block_at(own.b, own.blocks[n])) + wp.vec3(0.5))
+    near = count_near(s, place_of(own.b, at[0], at[1], at[2]), reach)
+    bodies[n] = 1.0 - share(near, wp.static(wp.vec2(*BODY)))
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_ways(
+    first: wp.int32,
+    own: Still,
+    others: wp.array(dtype=Still),
+    width: wp.float32,
+    touching: wp.array2d(dtype=wp.int32),
+    indices: wp.array2d(dtype=wp.int32),
+    ways: wp.array2d(dtype=wp.float32),
+):
+    """How far the fluid in each block, of a width in spacings, is from where it is in the others, in spacings; which
+    block of theirs it is; and which blocks touch it."""
+    n = first + wp.tid()
+    at = block_at(own.b, own.blocks[n])
+    for k in range(TOUCHING):
+        touching[n, k] = index_of(own.b, at + wp.vec3i(k % 3 - 1, (k / 3) % 3 - 1, k / 9 - 1))
+    for j in range(others.shape[0]):
+        other = others[j]
+        there = at + own.first - other.first
+        index = index_of(other.b, there)
+        mean = wp.float32(0.0)
+        if index >= 0:
+            mean = other.means[index]
+        elif index == -1:
+            mean = other.b.corners[there[0], there[1], there[2]]
+        indices[n, j] = index
+        ways[n, j] = width * wp.abs(mean - own.means[n])
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_shares(
+    first: wp.int32,
+    touching: wp.array2d(dtype=wp.int32),
+    ways: wp.array2d(dtype=wp.float32),
+    bodies: wp.array(dtype=wp.float32),
+    before: wp.int32,
+    window: wp.int32,
+    limits: wp.vec2,
+    shares: wp.array2d(dtype=wp.float32),
+):
+    """Of the others in each block, by the root mean square of the ways in it and in those that touch it."""
+    n = first + wp.tid()
+    left = bodies[n]
+    for j in range(ways.shape[1]):
+        if j == before:
+            left = bodies[n]
+        if left > 0.0:
+            total = wp.float32(0.0)
+            weights = wp.float32(0.0)
+            for k in range(TOUCHING):
+                m = touching[n, k]
+                if m >= 0:
+                    off = wp.abs(k % 3 - 1) + wp.abs((k / 3) % 3 - 1) + wp.abs(k / 9 - 1)
+                    weight = 1.0 / float(1 << off)
+                    total += weight * ways[m, j] * ways[m, j]
+                    weights += weight
+            left *= share(wp.max(wp.sqrt(total / weights), ways[n, j]), limits)
+        shares[n, j] = left * nearness(j, before, window)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def average_level(
+    first: wp.int32,
+    own: Still,
+    others: wp.array(dtype=Still),
+    before: wp.int32,
+    limits: wp.vec2,
+    indices: wp.array2d(dtype=wp.int32),
+    shares: wp.array2d(dtype=wp.float32),
+    levels: wp.array2d(dtype=wp.float32),
+):
+    n = (first + wp.tid()) / CUBES
+    k = (first + wp.tid()) % CUBES
+    level = own.b.levels[n, k]
+    total = wp.float32(0.0)
+    weights = wp.float32(1.0)
+    left = wp.float32(1.0)
+    for j in range(others.shape[0]):
+        if j == before:
+            left = 1.0
+        if left > 0.0 and shares[n, j] > 0.0 and indices[n, j] >= 0:
+            change = others[j].b.levels[indices[n, j], k] - level
+            left *= share(wp.abs(change), limits)
+            total += left * shares[n, j] * change
+            weights += left * shares[n, j]
+    levels[n, k] = level + total / weights
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def average_light(
+    first: wp.int32,
+    own: Still,
+    others: wp.array(dtype=Still),
+    before: wp.int32,
+    window: wp.int32,
+    limits: wp.vec2,
+    found: wp.array2d(dtype=wp.vec3),
+):
+    i = (first + wp.tid()) / found.shape[1]
+    k = (first + wp.tid()) % found.shape[1]
+    light = own.light[i, k]
+    total = wp.vec3(0.0)
+    weights = wp.float32(1.0)
+    left = wp.float32(1.0)
+    for j in range(others.shape[0]):
+        if j == before:
+            left = 1.0
+        if left > 0.0 and wp.min(light) < 1.0:
+            change = others[j].light[i, k] - light
+            left *= share(wp.max(wp.abs(change)), limits)
+            weight = left * wp.max(nearness(j, before, window), 0.0)
+            total += weight * change
+            weights += weight
+    found[i, k] = light + total / weights
+
+
+def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandLauncher) -> Any:
+    """`Still` of a level, `Blocks` and the numbers of those that the surface may pass, with the `NearParticles` that it
+    is made of, and of the light on the floor."""
+    found = Still()
+    found.b, found.blocks = level
+    wide = found.b.cube * float(WIDTH)
+    found.first, found.light = wp.vec3i(*(round(end / wide) for end in found.b.lower)), light
+    means, bodies = (wp.empty(len(found.blocks), dtype=wp.float32, device=launch.device) for _ in range(2))
+    launch(find_means, len(means), own=found, s=s, reach=BODY_REACH * s.spacing, means=means, bodies=bodies)
+    found.means, found.bodies = means, bodies
+    return found
+
+
+def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
+    """`Still` of one frame, averaged with those of the frames before and after it, nearest first, as far as their
+    lattices have the same cubes; ``spacing``: of the particles [m]."""
+    before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
+    if not before and not after:
+        return own
+    device, count, shape = launch.device, len(own.blocks), (len(own.blocks), len(before) + len(after))
+    found, others = own.to(device), {"others": wp.array([*before, *after], dtype=Still, device=device)}
+    touching, indices = (wp.empty(size, dtype=wp.int32, device=device) for size in ((count, int(TOUCHING)), shape))
+    ways, shares = (wp.empty(shape, dtype=wp.float32, device=device) for _ in range(2))
+    own_ways = {"indices": indices, "touching": touching, "ways": ways}
+    launch(find_ways, count, own=own, **others, width=own.b.cube * float(WIDTH) / spacing, **own_ways)
+    given = {"before": len(before), "limits": wp.vec2(*LIMITS), "window": WINDOW}
+    launch(find_shares, count, touching=touching, ways=ways, bodies=own.bodies, **given, shares=shares)
+    found.b.levels, found.light = wp.empty_like(own.b.levels), wp.empty_like(own.light)
+    given = {"before": len(before), "limits": wp.vec2(*LEVEL_LIMITS), "indices": indices, "shares": shares}
+    launch(average_level, own.b.levels.size, own=own, **others, **given, levels=found.b.levels)
+    given = {"before": len(before), "limits": wp.vec2(*SHADOW_LIMITS), "window": SHADOW_WINDOW}
+    launch(average_light, own.light.size, own=own, **others, **given, found=found.light)
+    return found
