@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import reference
+from cortado.discretise.calibration import SKIN
 
 
 def between(H, first, second):
@@ -54,8 +55,13 @@ class Projection:
         a = self.volume * sigma / self.support**2 * reference.slope(self.kernel.name, q)
         return apart, W, a[..., None] * apart
 
-    def density(self, x):
+    def density(self, x, before=None):
+        """Over the neighbours that particles have at positions before a step."""
         W, wall = self.pairs(x, x)[1], self.pairs(x, self.walls)[1]
+        if before is not None:
+            near, beside = (np.linalg.norm(self.pairs(before, y)[0], axis=-1) for y in (before, self.walls))
+            reach = (1 + SKIN) * self.support
+            W, wall = W * (near < reach), wall * (beside < reach)
         return W.sum(1) + wall @ self.wall_weights
 
     def constants(self, d):
@@ -127,8 +133,8 @@ class Projection:
         moved = x + dt * v + self.shift(x, v, dt)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
-        for _ in range(self.repairs):
-            z = c + omega * (self.density(now) - 1) / a
+        for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
+            z = c + omega * 3 / (2 - root) * (self.density(now, x) - 1) / a
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
         return now, v, k

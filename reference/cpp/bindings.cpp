@@ -106,9 +106,9 @@ NB_MODULE(_engine, m) {
         .def_rw("density_tolerance", &Scene::density_tolerance)
         .def_rw("maximum_density_tolerance", &Scene::maximum_density_tolerance)
         .def_rw("projection", &Scene::projection)
-        .def_rw("repairs", &Scene::repairs)
         .def_rw("spacing", &Scene::spacing)
         .def_rw("relaxation", &Scene::relaxation)
+        .def_rw("repair_relaxations", &Scene::repair_relaxations)
         .def_rw("least_diagonal", &Scene::least_diagonal)
         .def_rw("nearest_weight", &Scene::nearest_weight);
 

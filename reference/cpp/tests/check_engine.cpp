@@ -51,9 +51,9 @@ Scene box(int d, const std::string& kernel, const std::string& viscosity, bool p
     s.density_tolerance = 1e-3;
     s.maximum_density_tolerance = 1e-2;
     s.projection = projection;
-    s.repairs = 2;
     s.spacing = 0.05;
     s.relaxation = 0.4;
+    s.repair_relaxations = {0.9, 0.4};
     s.least_diagonal = d == 2 ? 60 : 40;
     s.nearest_weight = 0.1;
     return s;

@@ -96,8 +96,8 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
         return {
             "projection": scene.forces.pressure,
             "maximum_iterations": solver.iterations,
-            "repairs": solver.repairs,
             "relaxation": constants.relaxation,
+            "repair_relaxations": constants.repair_relaxations(solver.repairs),
             "least_diagonal": constants.least_diagonal,
             "nearest_weight": constants.nearest_weight,
         }

@@ -42,9 +42,9 @@ struct Scene {
     int minimum_iterations, maximum_iterations;
     double density_tolerance, maximum_density_tolerance;
     bool projection;                     // in the place of PCISPH: `maximum_iterations` of its pressures, and
-    int repairs;                         // of density
     double spacing;                      // [m]
     double relaxation;                   // omega
+    std::vector<double> repair_relaxations;  // that of each repair of the density
     double least_diagonal;               // 0.05 a_0 [1 / m2]
     double nearest_weight;               // V W(s)
 };

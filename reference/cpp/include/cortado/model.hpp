@@ -24,9 +24,9 @@ struct Model {
     int minimum_iterations, maximum_iterations;
     Real density_tolerance, maximum_density_tolerance;
     bool projection;
-    int repairs;
     Scalar spacing, relaxation, least_diagonal, nearest_weight;
     Values<Scalar> momenta;  // beta of the projection's iterations (Nesterov 1983), and 0 of the last
+    Values<Scalar> repair_relaxations;
     Vectors<Real, D> wall_positions, wall_normals;
     Values<Real> wall_depths;  // behind the surface
     Values<Scalar> wall_weights;
@@ -60,12 +60,12 @@ struct Model {
           density_tolerance(Real(s.density_tolerance)),
           maximum_density_tolerance(Real(s.maximum_density_tolerance)),
           projection(s.projection),
-          repairs(s.repairs),
           spacing(Real(s.spacing)),
           relaxation(Real(s.relaxation)),
           least_diagonal(Real(s.least_diagonal)),
           nearest_weight(Real(s.nearest_weight)),
           momenta(s.maximum_iterations, Scalar(0)),
+          repair_relaxations(s.repair_relaxations.begin(), s.repair_relaxations.end()),
           wall_positions(joined_vectors<Real, D>(high_only(s.wall_positions))),
           wall_normals(joined_vectors<Real, D>(high_only(s.wall_feet))),
           wall_depths(wall_normals.size()),

@@ -42,6 +42,10 @@ struct Projection {
 
     // omega / a
     Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
+    // The same of a repair.
+    Scalar repair_step_of(const Model<Scalar, D>& model, std::size_t repair, std::size_t i) const {
+        return model.repair_relaxations[repair] / effects[i].a;
+    }
     // b, for a density n
     Scalar wanted(const Model<Scalar, D>& model, std::size_t i, const Scalar& n) const {
         const Scalar one(1);
@@ -51,7 +55,8 @@ struct Projection {
     // From lists over a state, its densities n and predicted velocities.
     void take(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
               const State<Scalar, D>& state, const Values<Scalar>& n, const Vectors<Scalar, D>& v_star) {
-        const std::size_t count = state.x.size(), iterations = model.maximum_iterations, repairs = model.repairs;
+        const std::size_t count = state.x.size(), iterations = model.maximum_iterations;
+        const std::size_t repairs = model.repair_relaxations.size();
         const auto sized = [count](auto& all, std::size_t length) {
             all.resize(length);
             for (auto& one : all) one.resize(count);
@@ -158,7 +163,7 @@ private:
         each_particle(count, model.threads, [&](std::size_t i) {
             const Scalar weights = model.self_weight + model.weights(i, fluid, walls, x_now[at]);
             excess[at][i] = model.volume * weights - Scalar(1);
-            const Scalar z = c[at][i] + step_of(model, i) * excess[at][i];
+            const Scalar z = c[at][i] + repair_step_of(model, at, i) * excess[at][i];
             c[at + 1][i] = z < Scalar(0) ? Scalar(effects[i].repaired * z) : z;
         });
         Real sum(0);

@@ -71,7 +71,7 @@ private:
                     z_bar += g.dot(f_ij);
                     bent = (c[i] + c[j]) * f_ij;
                 });
-                const Real per = at_.step_of(model_, i), excess = at_.excess[k][i];
+                const Real per = at_.repair_step_of(model_, k, i), excess = at_.excess[k][i];
                 const Real z = at_.c[k][i] + per * excess;
                 if (z < 0) {
                     effects_bar_[i].repaired += z * z_bar;

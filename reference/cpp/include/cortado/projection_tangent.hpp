@@ -125,7 +125,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     for (std::size_t k = 0; k < at.excess.size(); ++k) {
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
-            const Real per = at.step_of(model, i), excess = at.excess[k][i];
+            const Real per = at.repair_step_of(model, k, i), excess = at.excess[k][i];
             const Real dn_now = model.volume * weights_tangent(model, i, step, at.x_now[k], dx_now);
             const Real z = at.c[k][i] + per * excess, dz = dc[i] + per * (dn_now - change.a / of.a * excess);
             dc[i] = z < 0 ? Real(of.repaired * dz + change.repaired * z) : dz;

@@ -12,6 +12,8 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 """By how much the relaxation stays below that of the lattice's stiffest wave."""
+SMOOTHED = 1.0 / 3.0
+"""From which part of the stiffest wave's stiffness on waves of the density are repaired evenly."""
 DEPARTURE = 0.05
 """Part of a_0 that is added to the diagonal: particles with few neighbours have a small one."""
 
@@ -44,6 +46,14 @@ class ProjectionConstants:
         stiffest = float(((np.sin(waves @ offsets.T) @ gradients) ** 2).sum(axis=1).max()) / square
         nearest = volume * float(kernel.weight(np.array([spacing]), dimension, support)[0])
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
+
+    def repair_relaxations(self, repairs: int) -> list[float]:
+        """omega of each of so many repairs of the density, by Chebyshev's roots (Golub and Varga 1961): of the errors
+        of all waves between `SMOOTHED` and 1 of the stiffest they leave the least part that so many Jacobi iterations
+        can. The longest comes first, as the last ones smooth what it stirs up."""
+        middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
+        roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
+        return [self.relaxation / float(middle - half * root) for root in roots]
 
 
 def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:

@@ -58,11 +58,12 @@ class ProjectionTangent(ParticleTangent):
         moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "delta_dot": self._delta_dot}
         begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
         context.launch(kernels.moving.tangent, *known, moved, begun)
+        omegas = solver.repair_relaxations
         for k in range(counts[1]):
             at, new = solver.repaired[k], solver.repaired[k + 1]
             measured = {"x_now": at["x_now"], "c_in": at["c"], "excess": at["excess"]}
             change = {"x_now_dot": self._x_now_dot, "c_in_dot": self._c_dot, "c_out_dot": self._c_dot}
-            context.launch(kernels.repair.measure.tangent, *known, solver.relaxed, measured, change)
+            context.launch(kernels.repair.measure.tangent, *known, measured, change, omega=omegas[k])
             there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"]}
             change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
             context.launch(kernels.repair.move.tangent, *known, there, change)
@@ -187,7 +188,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(begin, *known, bars, x_now=new["x_now"], x_moved=solver.x_moved)
             measured = {"c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
             own = {"c_bar": self._c_bar, "n_now_bar": self._n_now_bar, "f": self._f}
-            context.launch(move, *known, solver.relaxed, measured, own)
+            context.launch(move, *known, measured, own, omega=solver.repair_relaxations[k])
             own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
             context.launch(kernels.measure.adjoint, *known, own)
             densities = partial(density_solid_kernel, solver.discretisation, solver.topic)

@@ -192,7 +192,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)
         solver.move(context, 0)
         for k in range(repairs):
-            solver.mend(context, k, k + 1)
+            solver.mend(context, k, k, k + 1)
         self.arrive(state)
 
     def _pull_by(self, context: StepContext, p: wp.array, y: wp.array, T: wp.array) -> None:

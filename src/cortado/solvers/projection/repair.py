@@ -1,11 +1,12 @@
 """Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
 
-    lambda' = z if z > 0, else r z,   z = lambda + omega (n(x_k) - 1) / a,
+    lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     x_k+1 = x' - (sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m.
 
-Velocities stay as they are: in them a repair would be a force that acts once more in the next step. r of
-`cortado.solvers.projection.surroundings` lets low densities be repaired in the interior alone. g and a are those of
-the start of the step, n is that of the positions, over the neighbours of the start.
+omega_k is another one in each (`cortado.solvers.projection.constants`). Velocities stay as they are: in them a repair
+would be a force that acts once more in the next step. r of `cortado.solvers.projection.surroundings` lets low densities
+be repaired in the interior alone. g and a are those of the start of the step, n is that of the positions, over the
+neighbours of the start.
 """
 
 from dataclasses import dataclass

@@ -90,6 +90,8 @@ class ProjectionSteps(ParticleSolver):
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
         self.momenta = momenta(iterations)
+        self.repair_relaxations = constants.repair_relaxations(repairs)
+        """omega of each repair."""
         limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
         names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
         self.loops = tuple(
@@ -119,7 +121,7 @@ class ProjectionSteps(ParticleSolver):
         projection, repair = self.loops
         projection.run(lambda k: self.iterate(context, k, 0, 0))
         self.move(context, 0)
-        repair.run(lambda k: self.mend(context, 0, 0))
+        repair.run(lambda k: self.mend(context, k, 0, 0))
         self._finish(context, 0, 0, new_state)
         self.end_step(self.repaired[0]["x_now"], self.v_new, new_state, log)
 
@@ -138,7 +140,7 @@ class ProjectionSteps(ParticleSolver):
             self.iterate(context, k, k, k + 1)
         self.move(context, iterations)
         for k in range(repairs):
-            self.mend(context, k, k + 1)
+            self.mend(context, k, k, k + 1)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
         iterations, repairs = counts
@@ -188,11 +190,12 @@ class ProjectionSteps(ParticleSolver):
         moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
 
-    def mend(self, context: StepContext, before: int, after: int) -> None:
-        """A repair, from the positions of one slot to those of another."""
+    def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
+        """Repair k, from the positions of one slot to those of another."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
-        context.launch(kernels.measure.forward, self.around, self.relaxed, measured, error=self.loops[1].errors)
+        relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}
+        context.launch(kernels.measure.forward, self.around, measured, relaxed)
         moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"]}
         context.launch(kernels.move.forward, self.around, moved)
 
