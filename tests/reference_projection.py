@@ -101,13 +101,11 @@ class Projection:
         N = N / ((gamma**2).sum(1) + 0.01 * 0.05 * square)[:, None, None]
         P = np.eye(d) - N
         across = P @ M @ N
-        j = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None]
-        C = (j + 0.05 * j * (j - 1)) * (across + across.transpose(0, 2, 1))
-        K = inverse + 0.05 * between(H, 0.8, 0.95)[:, None, None] * (inverse @ (inverse - np.eye(d)))
+        C = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None] * (across + across.transpose(0, 2, 1))
         t = 0.2 * (1.05 / ((M * P).sum((1, 2)) / (d - 1) + 0.05) - 1)[:, None, None]
         beside = t * P - (1 + t) * C
         B, full = B[:, None, None], between(H + nu, 0.1, 0.5)
-        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (K - np.eye(d)) + (1 - B) * beside)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) + (1 - B) * beside)
         B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m

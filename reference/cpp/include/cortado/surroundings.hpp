@@ -108,9 +108,7 @@ struct Surroundings {
     Scalar away;              // B
     Scalar direction, lean;   // the denominators of N and C
     Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
-    Scalar lean_share, lean_slope;  // q, and the derivative of log q by M : N
-    Matrix<Scalar, D> J, K, N, P, C;
-    Matrix<Scalar, D> late;    // 0.05 J (J - 1)
+    Matrix<Scalar, D> K, N, P, C;
     Matrix<Scalar, D> beside;  // t P - (1 + t) C
     Matrix<Scalar, D> bare;   // (L - 1) / c
     Vector<Scalar, D> own;    // L g + gamma
@@ -126,17 +124,12 @@ struct Surroundings {
         const Scalar one(1), m = model.rest_density, ratio = of.nu / hundredths<Scalar>(5);
         const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
         away = one / (one + ratio * ratio * ratio * ratio);
-        J = regular_inverse<Scalar, D>(of.M);
-        late = hundredths<Scalar>(5) * J * (J - unit);
-        K = J + repaired.value * late;
+        K = regular_inverse<Scalar, D>(of.M);
         direction = of.gamma.dot(of.gamma) + hundredths<Scalar>(1) * model.least_diagonal;
         N = of.gamma * of.gamma.transpose() / direction;
         lean = of.M.cwiseProduct(N).sum() + hundredths<Scalar>(5);
         const Matrix<Scalar, D> across = (unit - N) * of.M * N;
-        const Scalar j = hundredths<Scalar>(105) / lean, newton = hundredths<Scalar>(95) + hundredths<Scalar>(5) * j;
-        lean_share = j * newton;
-        lean_slope = -(newton + hundredths<Scalar>(5) * j) / (newton * lean);
-        C = lean_share * (across + across.transpose());
+        C = hundredths<Scalar>(105) / lean * (across + across.transpose());
         P = unit - N;
         below = of.M.cwiseProduct(P).sum() / Scalar(D - 1) + hundredths<Scalar>(5);
         lack = hundredths<Scalar>(20) * (hundredths<Scalar>(105) / below - one);

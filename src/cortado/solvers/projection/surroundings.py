@@ -8,10 +8,8 @@ the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,
-    L = I + c (B (K - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
-    K = J + 0.05 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
-    C = q (P M N + N M P), q = j + 0.05 j (j - 1), j = 1.05 / (M : N + 0.05),
-    N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
+    L = I + c (B (1.05 (M + 0.05 I)^-1 - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
+    C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
 """
@@ -36,10 +34,7 @@ TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8
 WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
 REGULAR = 0.05
-"""What is added to the diagonal of M before it is inverted. Where M is nearly I, as inside of the fluid, the inverse is
-then 5 % of the way from I short, so that rows that pass one another seem to be squeezed, which holds back films on a
-gentle slope: a step of Newton's method, J + J (I - M J) = J + 0.05 J (J - I), takes that out. At surfaces, where M is
-far from I, it would widen jets."""
+"""What is added to the diagonal of M before it is inverted."""
 ALONG = 0.2
 """How much of what gradients along a wall lack beside it is made up. On the lattice, with Wendland C2, the first row
 lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
@@ -114,18 +109,16 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
         """t P - (1 + t) C; M_zz = 1 of the plane does not count."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
-        P, whole, one = unit() - N, real(1.0) + regular, real(1.0)
-        t = along * (whole / ((wp.ddot(M, P) - besides) / axes + regular) - one)
-        j = whole / (wp.ddot(M, N) + regular)
-        C = (j + regular * j * (j - one)) * (across + wp.transpose(across))
-        return t * P - (one + t) * C
+        P, whole = unit() - N, real(1.0) + regular
+        t = along * (whole / ((wp.ddot(M, P) - besides) / axes + regular) - real(1.0))
+        C = whole / (wp.ddot(M, N) + regular) * (across + wp.transpose(across))
+        return t * P - (real(1.0) + t) * C
 
     @wp.func
     def correction(M: matrix, gamma: vector, nu: real, least: real) -> matrix:
-        H, B, J = fullness(M), away(nu), inverse(M)
-        c, K = smoothstep(H, c_0, c_1), J + (regular * smoothstep(H, r_0, r_1)) * (J * (J - unit()))
+        c, B = smoothstep(fullness(M), c_0, c_1), away(nu)
         beside = (real(1.0) - B) * walled_correction(M, gamma, least)
-        return unit() + c * (B * (K - unit()) + beside)
+        return unit() + c * (B * (inverse(M) - unit()) + beside)
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
