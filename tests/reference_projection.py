@@ -28,6 +28,7 @@ class Projection:
     periods: np.ndarray
     iterations: int = 4
     repairs: int = 2
+    follow: bool = False
 
     @classmethod
     def of(cls, simulation):
@@ -41,7 +42,8 @@ class Projection:
         )
         kernel, spacing = solver.discretisation.smoothing, scene.discretisation.spacing
         periods = np.array(scene.container.periods(d)[1])
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods)
+        follow = getattr(scene.solver, "velocities_follow", False)
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, follow=follow)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -137,6 +139,9 @@ class Projection:
             z = c + omega * 3 / (2 - root) * (self.density(now, x) - 1) / a
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+        if self.follow:
+            slopes = -np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
+            v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, k
 
     def shift(self, x, v, dt):

@@ -27,6 +27,7 @@ UNNAMED = {
     "sph.surface_stress": {"tension_functions.stress_derivative"},
     "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.shifting": {"shift_functions.back"},
+    "solvers.projection.following": {"change_functions.back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),
         *("projection_sums.divergence_back", "projection_sums.push_back", "projection_sums.crowding_back"),
@@ -202,6 +203,7 @@ SCENES = {
     ),
     "stress": (small("stress"), "everything"),
     "projection": (small("pairwise", solver=PROJECTION), "everything"),
+    "velocities that follow": (small("pairwise", solver={**PROJECTION, "velocities_follow": True}), "positions"),
     "projection in the open": (
         plane(
             discretisation={"spacing": 0.05, "support": 2.6},  # second rows are neither full nor at the surface

@@ -9,12 +9,15 @@ from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
+FOLLOW = {**SOLVER, "velocities_follow": True}
 C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
 CASES = {
     "plane": lambda: plane(solver=SOLVER),
     "space": lambda: scene(solver=SOLVER),
     "periodic": lambda: plane(solver=SOLVER, container=PERIODIC, discretisation=C2),
     "three phases": lambda: plane_of_three(solver=SOLVER, mixture={"mobility": 0.0}),
+    "velocities follow": lambda: plane(solver=FOLLOW),
+    "velocities follow in space": lambda: scene(solver=FOLLOW),
 }
 
 

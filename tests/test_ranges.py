@@ -49,6 +49,9 @@ CASES = {
     ),
     "forces of one's own": splash,
     "the projection": lambda: two_layers(solver={"kind": "projection", "time_step": 0.0021}),
+    "velocities that follow": lambda: two_layers(
+        solver={"kind": "projection", "time_step": 0.0021, "velocities_follow": True}
+    ),
     "a solid that moves": lambda: scene(solid=[BALL], solver={"kind": "projection", "time_step": 0.0021}),
     "a solid that moves, PCISPH, stress": lambda: scene(
         forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress"}, solid=[BALL]

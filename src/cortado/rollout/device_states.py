@@ -118,7 +118,8 @@ class DeviceStates(HostStates):
     def _require_judged(self, state: DeviceState) -> None:
         """Arrays on the device are not looked at: they are those of a step of this simulation, in which no scene was
         lost."""
-        others = [b for b, scene in enumerate(state.scenes) if scene not in self._simulation.judged_states]
+        unknown = {scene for scene in set(state.scenes) if scene not in self._simulation.judged_states}
+        others = [b for b, scene in enumerate(state.scenes) if scene in unknown] if unknown else []
         if len(others) == len(state.scenes):
             advice = "simulation.on_host(state) is taken by any of the same scene"
             raise InputError(f"state is of another simulation, but must be of this one: {advice}.")

@@ -134,7 +134,8 @@ class ParameterSpace:
         self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0]))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [self._origin(one["rest_density"]) for one in chosen]
-        rollout.origins = origins * (len(rollout.clocks) // len(origins))
+        shared = {one: one for one in origins}  # one object where they are equal: a batch has hundreds
+        rollout.origins = [shared[one] for one in origins] * (len(rollout.clocks) // len(origins))
         each = members * (len(rollout.clocks) // len(members))
 
         def advice(member: int) -> str:

@@ -65,7 +65,8 @@ class Scene(SceneTables):
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
         aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
-        aside["solver"] = unused if getattr(self.solver, "shifting", True) else unused | {"shifting"}
+        off = {name for name in ("shifting", "velocities_follow") if not getattr(self.solver, name, True)}
+        aside["solver"] = unused | off
         aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}
         aside["container"] = {"material", "colour"}
         return json.dumps(self.model_dump(mode="json", exclude=aside, context="colours"), indent=2)

@@ -83,6 +83,9 @@ class ProjectionSolver(SolverTable):
     """Iterations of the pressure in every step, each from that of the step before."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
+    velocities_follow: Flag = False
+    """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
+    containers lose less of their speed, and those with a surface can gain energy."""
     smoothing: ClassVar[Mapping[str, Any]] = {"kernel": "wendland_c2", "support": 2.6}
     """What [discretisation] has if it names neither; `docs/projection.md` has the figures of each kernel."""
 

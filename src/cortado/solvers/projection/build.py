@@ -23,7 +23,8 @@ class ProjectionMaker:
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
-        return Projection(system, lattice_constants(setting.scene, setting.discrete), table.iterations, table.repairs)
+        counts = table.iterations, table.repairs
+        return Projection(system, lattice_constants(setting.scene, setting.discrete), *counts, table.velocities_follow)
 
 
 maker = ProjectionMaker

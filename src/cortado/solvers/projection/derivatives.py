@@ -35,6 +35,7 @@ class ProjectionTangent(ParticleTangent):
         self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
         self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
+        self._v_end_dot = self._v_new_dot if solver.following is None else solver.vectors()
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
@@ -67,7 +68,11 @@ class ProjectionTangent(ParticleTangent):
             there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"]}
             change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
             context.launch(kernels.repair.move.tangent, *known, there, change)
-        self.unsort(context, self._x_now_dot, self._v_new_dot, state_dot, **{IMPULSE: self._k_dot})
+        ends = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "x_now_dot": self._x_now_dot}
+        if solver.following is not None:
+            ends |= {"x_now": solver.repaired[counts[1]]["x_now"], "v_end_dot": self._v_end_dot}
+            context.launch(solver.following.tangent, *known, solver.kept, solver.shifted, ends)
+        self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **{IMPULSE: self._k_dot})
 
     def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
         """As that of `PressureTangent`."""
@@ -114,6 +119,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
         self._kept = named({name: wp.zeros_like(array) for name, array in solver.kept.items()}, "bar")
         self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
+        if solver.following is not None:
+            self._A_bar = wp.zeros_like(solver.kept["A"])
         pull = solver.new_arrays(T=solver.pull.dtype, S=solver.pull.dtype)
         self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
@@ -158,12 +165,19 @@ class ProjectionAdjoint(ParticleAdjoint):
         """From there to the adjoint of the state."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
+        if solver.following is not None:
+            ends = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_now_bar": self._x_now_bar}
+            ends |= {"x_now": solver.repaired[counts[1]]["x_now"], "A_bar": self._A_bar}
+            context.launch(solver.following.adjoint, *known, solver.kept, ends)
         self._mend(context, known, counts[1])
         moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
         context.launch(kernels.moving.adjoint, *known, moved)
         flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "delta_bar": self._x_moved_bar}
-        for kernel in kernels.shift.adjoint:
-            context.launch(kernel, *known, self._kept, solver.kept, solver.shifted, flow)
+        own, sums = kernels.shift.adjoint
+        context.launch(own, *known, self._kept, solver.kept, solver.shifted, flow)
+        if solver.following is not None:
+            add(self._A_bar, self._kept["A_bar"])
+        context.launch(sums, *known, self._kept, solver.kept, solver.shifted, flow)
         self._project(context, known, counts[0])
         start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)

@@ -18,6 +18,7 @@ from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.following import following_kernels
 from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
@@ -66,8 +67,11 @@ class ProjectionSteps(ParticleSolver):
     density_power = 0
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER),)
 
-    def __init__(self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int):
-        """Of so many iterations of the pressure and of the repair of density in every step."""
+    def __init__(
+        self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int, follow: bool
+    ):
+        """Of so many iterations of the pressure and of the repair of density in every step; velocities ``follow`` the
+        shift and the repairs, or stay as they are."""
         super().__init__(system)
         self.constants = constants
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -86,6 +90,9 @@ class ProjectionSteps(ParticleSolver):
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
         self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
+        """Those of velocities that follow the shift and the repairs; None where they do not."""
+        self.v_end = self.vectors() if follow else self.v_new
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
@@ -123,7 +130,7 @@ class ProjectionSteps(ParticleSolver):
         self.move(context, 0)
         repair.run(lambda k: self.mend(context, k, 0, 0))
         self._finish(context, 0, 0, new_state)
-        self.end_step(self.repaired[0]["x_now"], self.v_new, new_state, log)
+        self.end_step(self.repaired[0]["x_now"], self.v_end, new_state, log)
 
     def reserve(self, counts: Counts) -> None:
         iterations, repairs = counts
@@ -200,8 +207,11 @@ class ProjectionSteps(ParticleSolver):
         context.launch(kernels.move.forward, self.around, moved)
 
     def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> None:
-        ends = {IMPULSE: self.iterates[iterations]["k"]}
-        self.unsort(context, self.repaired[repairs]["x_now"], self.v_new, new_state, **ends)
+        ends, x_now = {IMPULSE: self.iterates[iterations]["k"]}, self.repaired[repairs]["x_now"]
+        if self.following is not None:
+            moved = {"x_now": x_now, "v_new": self.v_new, "v_end": self.v_end}
+            context.launch(self.following.forward, self.around, self.kept, moved)
+        self.unsort(context, x_now, self.v_end, new_state, **ends)
 
 
 def momenta(iterations: int) -> list[float]:
