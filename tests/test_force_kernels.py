@@ -299,6 +299,7 @@ ELSEWHERE = {
     "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
     "velocity_kernels": "the same",
     "shift_kernels": "the same",
+    "following_kernels": "the same",
     "moving_kernels": "the same",
     "free_kernels": "of bodies that are free: whole steps in tests/test_free_bodies.py",
     "motion_kernels": "the same",
