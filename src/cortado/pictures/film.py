@@ -15,8 +15,13 @@ from cortado.files.progress import track
 from cortado.pictures.notebook import with_video
 from cortado.pictures.pace import Pace
 from cortado.pictures.page import Page
+from cortado.pictures.steady import WINDOW
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
+
+SLOW = 0.1
+"""Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
+seen."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
         there = video.frames
         with track(len(shown) - there, "film") as advance:
-            images = page.images(shown, partial(_ahead, len(page.panels)), there)
+            window = 0 if pace.speed is not None and pace.speed < SLOW else WINDOW
+            images = page.images(shown, partial(_ahead, len(page.panels)), there, window)
             for image, time in zip(images, pace.times[there:], strict=True):
                 video.add(image, time)
                 advance()

@@ -37,13 +37,15 @@ class Page:
         """(rows, columns, 3), linear from 0 to 1."""
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
-    def images(self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0) -> Iterator[Points]:
-        """Those of a film of so many frames in their order, from one of them on; ``ahead``: from the pictures that they
-        are made of to the same."""
+    def images(
+        self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0, window: int = WINDOW
+    ) -> Iterator[Points]:
+        """Those of a film of so many frames in their order, from one of them on, each given so many before and after
+        it; ``ahead``: from the pictures that they are made of to the same."""
         shown = range(begin, len(frames))
-        drawn = ahead(panel(frames[n], _around(frames, n)) for n in shown for panel in self.panels)
+        drawn = ahead(panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels)
         return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)
 
 
-def _around(frames: Sequence[int], n: int) -> Around:
-    return tuple(frames[max(n - WINDOW, 0) : n][::-1]), tuple(frames[n + 1 : n + 1 + WINDOW])
+def _around(frames: Sequence[int], n: int, window: int) -> Around:
+    return tuple(frames[max(n - window, 0) : n][::-1]), tuple(frames[n + 1 : n + 1 + window])
