@@ -104,10 +104,11 @@ class Projection:
         P = np.eye(d) - N
         across = P @ M @ N
         C = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None] * (across + across.transpose(0, 2, 1))
+        K = inverse + 0.033 * between(H, 0.8, 0.95)[:, None, None] * (inverse @ (inverse - np.eye(d)))
         t = 0.2 * (1.05 / ((M * P).sum((1, 2)) / (d - 1) + 0.05) - 1)[:, None, None]
         beside = t * P - (1 + t) * C
         B, full = B[:, None, None], between(H + nu, 0.1, 0.5)
-        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) + (1 - B) * beside)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (K - np.eye(d)) + (1 - B) * beside)
         B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m

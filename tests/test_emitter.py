@@ -267,3 +267,26 @@ def test_a_column_in_a_wall_is_named_where_the_pressure_does_not_converge():
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
         Simulation(Scene(**box, emitter={**nozzle, "length": 0.1})).run(3)
+
+
+def test_a_column_is_jittered_along_its_opening_with_the_projection_alone():
+    lattice, projected = (pour(**solver) for solver in ({}, {"solver": {"kind": "projection", "time_step": 0.002}}))
+    spacing = lattice.discretisation.spacing
+    assert (lattice.emitter.jitter, projected.emitter.jitter) == (0.0, 0.05)
+    known, found = (one.emitter.sample(spacing) for one in (lattice, projected))
+    np.testing.assert_array_equal(found.upstream, known.upstream)
+    moved = found.offsets - known.offsets
+    np.testing.assert_allclose(moved @ np.array(lattice.emitter.direction), 0.0, atol=1e-15)
+    assert 0.03 * spacing < np.linalg.norm(moved, axis=1).max() <= 0.05 * np.sqrt(2.0) * spacing
+    np.testing.assert_array_equal(projected.emitter.sample(spacing).positions, found.positions)
+    lower, upper = projected.emitter.extent(spacing)
+    assert (lower <= found.positions + 1e-12).all() and (found.positions <= upper + 1e-12).all()
+    assert Scene.from_json(projected.to_json()) == projected
+    assert "jitter" in projected.computed_json() and "jitter" not in lattice.computed_json()
+
+
+def test_a_jitter_that_is_given_stays():
+    solver = {"kind": "projection", "time_step": 0.002}
+    nozzle = pour().emitter.model_dump(exclude={"jitter"})
+    assert pour(solver=solver, emitter={**nozzle, "jitter": 0.0}).emitter.jitter == 0.0
+    assert pour(emitter={**nozzle, "jitter": 0.1}).emitter.jitter == 0.1

@@ -6,6 +6,7 @@ import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
 from cortado.device.cells import CellSort, Grid
+from cortado.device.lanes import COUNTS
 from cortado.device.launching import sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.pictures.painter import painter
@@ -27,10 +28,10 @@ def over_time(point, steps):
     return {k: np.multiply.outer(grows, 1.0 + v) if k.endswith(ends) else v for k, v in point.items()}
 
 
-def evaluate(made, device, precision="float64", steps=60, estimator=EXACT):
+def evaluate(made, device, precision="float64", steps=60, estimator=EXACT, lanes=None):
     """Last positions, iterations, loss and gradient, from a first state with scatter: of a block that falls freely the
     derivative with respect to the viscosity would be round-off."""
-    simulation = Simulation(made, device, precision)
+    simulation = Simulation(made, device, precision, lanes=lanes)
     problem = Problem(simulation, steps, losses.FinalPositions(simulation.positions))
     point = {**simulation.parameters(), **thrown(simulation), "gravity": GRAVITY[: simulation.dimension]}
     point.pop("colours")
@@ -170,22 +171,18 @@ def test_same_bits_twice(made, precision):
         assert first.tobytes() == second.tobytes()
 
 
-@pytest.mark.parametrize("lanes", [1, 2, 4, 8, 16, 32])
+@pytest.mark.parametrize("lanes", COUNTS)
 @pytest.mark.parametrize("name", SCENES)
-def test_any_number_of_lanes_computes_the_same(name, lanes, monkeypatch):
+def test_any_number_of_lanes_computes_the_same(name, lanes):
     wanted = evaluate(SCENES[name], "cpu", steps=20)
-    monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device: lanes)
-    for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20), wanted, strict=True):
+    for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20, lanes=lanes), wanted, strict=True):
         assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
 
 
 @pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(), gradients.FrozenGeometry()], ids=repr)
 @pytest.mark.parametrize("name", ["fixed", "two fluids"])
-def test_estimators_compute_the_same_with_lanes(name, estimator, monkeypatch):
-    found = []
-    for lanes in (1, 8):
-        monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device, lanes=lanes: lanes)
-        found.append(evaluate(SCENES[name], "cuda:0", steps=20, estimator=estimator))
+def test_estimators_compute_the_same_with_lanes(name, estimator):
+    found = [evaluate(SCENES[name], "cuda:0", steps=20, estimator=estimator, lanes=lanes) for lanes in (1, 8)]
     for one, several in zip(*found, strict=True):
         assert np.linalg.norm(several - one) <= 1e-9 * np.linalg.norm(one)
 
@@ -193,10 +190,10 @@ def test_estimators_compute_the_same_with_lanes(name, estimator, monkeypatch):
 @pytest.mark.parametrize("estimator", [gradients.ImplicitPressure(), gradients.AdjointViscosity()], ids=repr)
 @pytest.mark.parametrize("name", ["projection", "projection in the plane"])
 @pytest.mark.parametrize("lanes", [1, 8])
-def test_estimators_of_the_projection_are_those_of_the_cpu(name, lanes, estimator, monkeypatch):
+def test_estimators_of_the_projection_are_those_of_the_cpu(name, lanes, estimator):
     wanted = evaluate(SCENES[name], "cpu", steps=20, estimator=estimator)
-    monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device: lanes)
-    for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20, estimator=estimator), wanted, strict=True):
+    found_on_gpu = evaluate(SCENES[name], "cuda:0", steps=20, estimator=estimator, lanes=lanes)
+    for found, one in zip(found_on_gpu, wanted, strict=True):
         assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
 
 

@@ -22,7 +22,7 @@ from cortado.scene.rheology import AnyRheology
 from cortado.scene.schedule import Schedule
 from cortado.scene.sensors import AnySensor
 from cortado.scene.solid_shapes import AnySolid
-from cortado.scene.solvers import AnySolver, smoothing_of
+from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.tables import Table
 
 OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
@@ -43,7 +43,7 @@ class DiscretisationTable(Table):
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """How far a particle of a body is from its first place at most, along each axis and in spacings, at random but the
     same in every run: a fluid on a lattice is stiffer than one without order, and its derivatives at rest have corners.
-    Points of files and the particles of an emitter stay where they are."""
+    Points of files stay where they are, and an emitter has a jitter of its own."""
 
     @property
     def support_radius(self) -> float:
@@ -150,15 +150,17 @@ class SceneTables(Table):
 
     @model_validator(mode="before")
     @classmethod
-    def _choose_smoothing(cls, data: Any) -> Any:
-        """The kernel and the support that suit the solver, where neither is given."""
+    def _choose_for_solver(cls, data: Any) -> Any:
+        """The kernel with its support, and the jitter of an emitter, that suit the solver, where they are not given."""
         if not isinstance(data, Mapping):
             return data
-        given, chosen = data.get("discretisation"), smoothing_of(data.get("solver"))
-        if isinstance(given, DiscretisationTable) and not given.model_fields_set & set(chosen):
-            return {**data, "discretisation": given.model_copy(update=chosen)}
-        if isinstance(given, Mapping) and not set(given) & set(chosen):
-            return {**data, "discretisation": {**given, **chosen}}
+        data = dict(data)
+        for name, chosen in what_suits(data.get("solver")).items():
+            given = data.get(name)
+            if isinstance(given, Table) and not given.model_fields_set & set(chosen):
+                data[name] = given.model_copy(update=chosen)
+            elif isinstance(given, Mapping) and not set(given) & set(chosen):
+                data[name] = {**given, **chosen}
         return data
 
     @field_validator("picture")

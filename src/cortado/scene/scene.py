@@ -62,7 +62,8 @@ class Scene(SceneTables):
         shifting that is off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid") if not getattr(self, name)}
-        aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
+        jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
+        aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
         aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = {name for name in ("shifting", "velocities_follow") if not getattr(self.solver, name, True)}

@@ -86,8 +86,11 @@ class ProjectionSolver(SolverTable):
     velocities_follow: Flag = False
     """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
     containers lose less of their speed, and those with a surface can gain energy."""
-    smoothing: ClassVar[Mapping[str, Any]] = {"kernel": "wendland_c2", "support": 2.6}
-    """What [discretisation] has if it names neither; `docs/projection.md` has the figures of each kernel."""
+    suits: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "discretisation": {"kernel": "wendland_c2", "support": 2.6},
+        "emitter": {"jitter": 0.05},
+    }
+    """What other tables have if they name none of it; `docs/projection.md` has the figures of each kernel."""
 
 
 class PackageSolver(SolverTable, PackageTable):
@@ -101,9 +104,9 @@ class PackageSolver(SolverTable, PackageTable):
     advice = f"{' or '.join(f'{chr(34)}{name}{chr(34)}' for name in OWN)}, or "
 
 
-def smoothing_of(solver: Any) -> Mapping[str, Any]:
-    """What a solver, or a table that will be one, wants in [discretisation] if neither kernel nor support is given."""
-    return ProjectionSolver.smoothing if _table_of(solver) == "ProjectionSolver" else {}
+def what_suits(solver: Any) -> Mapping[str, Mapping[str, Any]]:
+    """What a solver, or a table that will be one, wants of other tables, by their names, where none of it is given."""
+    return ProjectionSolver.suits if _table_of(solver) == "ProjectionSolver" else {}
 
 
 def _table_of(solver: Any) -> str:

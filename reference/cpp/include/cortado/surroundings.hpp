@@ -100,6 +100,12 @@ Matrix<Scalar, D> regular_inverse(const Matrix<Scalar, D>& M) {
     return hundredths<Scalar>(105) * sum.inverse();
 }
 
+// Of 1.05 (M + 0.05)^-1 = J, how much of J (J - 1) brings it nearer to the inverse of M inside of the fluid.
+template <class Scalar>
+Scalar newton() {
+    return hundredths<Scalar>(33) / Scalar(10);
+}
+
 // The effects of moments, with what is between them.
 template <class Scalar, int D>
 struct Surroundings {
@@ -108,7 +114,8 @@ struct Surroundings {
     Scalar away;              // B
     Scalar direction, lean;   // the denominators of N and C
     Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
-    Matrix<Scalar, D> K, N, P, C;
+    Matrix<Scalar, D> J, K, N, P, C;
+    Matrix<Scalar, D> late;    // 0.033 J (J - 1)
     Matrix<Scalar, D> beside;  // t P - (1 + t) C
     Matrix<Scalar, D> bare;   // (L - 1) / c
     Vector<Scalar, D> own;    // L g + gamma
@@ -124,7 +131,9 @@ struct Surroundings {
         const Scalar one(1), m = model.rest_density, ratio = of.nu / hundredths<Scalar>(5);
         const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
         away = one / (one + ratio * ratio * ratio * ratio);
-        K = regular_inverse<Scalar, D>(of.M);
+        J = regular_inverse<Scalar, D>(of.M);
+        late = newton<Scalar>() * J * (J - unit);
+        K = J + repaired.value * late;
         direction = of.gamma.dot(of.gamma) + hundredths<Scalar>(1) * model.least_diagonal;
         N = of.gamma * of.gamma.transpose() / direction;
         lean = of.M.cwiseProduct(N).sum() + hundredths<Scalar>(5);

@@ -11,10 +11,10 @@ Matrix<Real, D> even(const Matrix<Real, D>& A) {
     return (A + A.transpose()) / Real(2);
 }
 
-// From a change of M, and from an adjoint of K = 1.05 (M + 0.05)^-1: both are -K A K / 1.05.
+// From a change of M, and from an adjoint of J = 1.05 (M + 0.05)^-1: both are -J A J / 1.05.
 template <class Real, int D>
-Matrix<Real, D> inverse_change(const Matrix<Real, D>& K, const Matrix<Real, D>& A) {
-    return -K * A * K / hundredths<Real>(105);
+Matrix<Real, D> inverse_change(const Matrix<Real, D>& J, const Matrix<Real, D>& A) {
+    return -J * A * J / hundredths<Real>(105);
 }
 
 // The derivative of the effects of moments, at these moments.
@@ -36,7 +36,8 @@ public:
         const Matrix<Real, D> across = at_.P * dot.M * at_.N + at_.P * of_.M * dN - dN * of_.M * at_.N;
         const Real lean_dot = dot.M.cwiseProduct(at_.N).sum() + of_.M.cwiseProduct(dN).sum();
         const Matrix<Real, D> dC = (hundredths<Real>(210) * even<Real, D>(across) - lean_dot * at_.C) / at_.lean;
-        const Matrix<Real, D> dK = inverse_change<Real, D>(at_.K, dot.M);
+        const Matrix<Real, D> dK =
+            of_inverse(inverse_change<Real, D>(at_.J, dot.M)) + at_.repaired.slope * dH * at_.late;
         const Real lack_dot = lack_slope_ * (dot.M.cwiseProduct(at_.P).sum() - of_.M.cwiseProduct(dN).sum());
         const Matrix<Real, D> beside_dot = lack_dot * (at_.P - at_.C) - at_.lack * dN - (1 + at_.lack) * dC;
         const Matrix<Real, D> change = dB * mixed_ + at_.away * dK + (1 - at_.away) * beside_dot;
@@ -62,9 +63,11 @@ public:
         const Matrix<Real, D> L_bar = even<Real, D>(bar.L + by_a), bare_bar = at_.corrected.value * L_bar;
         found.Q = bar.a * L * L;
         found.g = L * own_bar;
+        const Matrix<Real, D> K_bar = at_.away * bare_bar;
         const Real H_bar = at_.corrected.slope * L_bar.cwiseProduct(at_.bare).sum() +
                            at_.tension.slope * at_.away * bar.tension + at_.full.slope * bar.full +
-                           at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away * bar.repaired;
+                           at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away * bar.repaired +
+                           at_.repaired.slope * K_bar.cwiseProduct(at_.late).sum();
         const Real B_bar = bare_bar.cwiseProduct(mixed_).sum() + at_.tension.value * bar.tension +
                            at_.repaired.value * bar.repaired;
         found.nu = away_slope_ * B_bar + at_.full.slope * bar.full;
@@ -76,12 +79,17 @@ public:
                                       (lean_bar - lacked) * of_.M - at_.lack * beside_bar;
         const Real along = N_bar.cwiseProduct(at_.N).sum();
         found.gamma = own_bar + 2 / at_.direction * (N_bar * of_.gamma - along * of_.gamma);
-        found.M = H_bar * at_.filling.slope + inverse_change<Real, D>(at_.K, at_.away * bare_bar) +
+        found.M = H_bar * at_.filling.slope + inverse_change<Real, D>(at_.J, of_inverse(K_bar)) +
                   even<Real, D>(at_.P * across_bar * at_.N) + lean_bar * at_.N + lacked * at_.P;
         return found;
     }
 
 private:
+    // The change of K with J, which is symmetric.
+    Matrix<Real, D> of_inverse(const Matrix<Real, D>& A) const {
+        return A + newton<Real>() * at_.repaired.value * (A * at_.J + at_.J * A - A);
+    }
+
     Real m_;
     Moments<Real, D> of_;
     Surroundings<Real, D> at_;

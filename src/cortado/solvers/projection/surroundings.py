@@ -8,7 +8,8 @@ the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,
-    L = I + c (B (1.05 (M + 0.05 I)^-1 - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
+    L = I + c (B (K - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
+    K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
     C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
@@ -35,6 +36,11 @@ WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
 REGULAR = 0.05
 """What is added to the diagonal of M before it is inverted."""
+NEWTON = 0.033
+"""Two thirds of a step of Newton's method towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Inside of the
+fluid, where M is nearly I, J follows its changes for 95 % only: rows that pass one another seem to be squeezed, which
+holds back films on a gentle slope. With a whole step they flow 1 to 2 % too fast, and water at rest moves faster. At
+surfaces, where M is far from I, it would widen jets."""
 ALONG = 0.2
 """How much of what gradients along a wall lack beside it is made up. On the lattice, with Wendland C2, the first row
 lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
@@ -78,8 +84,9 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)
-    regular, walled, direction = (wp.constant(real(value)) for value in (REGULAR, WALLED, DIRECTION))
-    along, besides, axes = (wp.constant(real(value)) for value in (ALONG, 3 - dimension, dimension - 1))
+    regular, newton, walled = (wp.constant(real(value)) for value in (REGULAR, NEWTON, WALLED))
+    along, direction = (wp.constant(real(value)) for value in (ALONG, DIRECTION))
+    besides, axes = (wp.constant(real(value)) for value in (3 - dimension, dimension - 1))
     (t_0, t_1), (c_0, c_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (TENSION, CORRECTED))
     (u_0, u_1), (r_0, r_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (SHIFTED, REPAIRED))
 
@@ -116,9 +123,10 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
 
     @wp.func
     def correction(M: matrix, gamma: vector, nu: real, least: real) -> matrix:
-        c, B = smoothstep(fullness(M), c_0, c_1), away(nu)
+        H, B, J = fullness(M), away(nu), inverse(M)
+        K = J + (newton * smoothstep(H, r_0, r_1)) * (J * (J - unit()))
         beside = (real(1.0) - B) * walled_correction(M, gamma, least)
-        return unit() + c * (B * (inverse(M) - unit()) + beside)
+        return unit() + smoothstep(H, c_0, c_1) * (B * (K - unit()) + beside)
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
