@@ -69,8 +69,10 @@ def pieces(x, reach):
 
 
 def rotating_patch(across, solver=PROJECTION, device="cpu"):
-    """A square of side 1 that turns with 1 / s for 2 s: its pieces, the radius of its corners, and energy and angular
-    momentum over the first."""
+    """A square of side 1 that turns with 1 / s for 2 s: its pieces, the radius of its corners, energy and angular
+    momentum over the first, and how many spacings the particles within 0.3 of the middle are from the nearest other."""
+    from scipy.spatial import cKDTree
+
     spacing = 1.0 / across
     steps = int(np.ceil(2.0 / (0.15 * spacing / 0.7)))
     square, timed = [box([0.0, 0.0], [1.0, 1.0])], {**solver, "time_step": 2.0 / steps}
@@ -80,7 +82,8 @@ def rotating_patch(across, solver=PROJECTION, device="cpu"):
     x, v = run.positions[-1] - run.positions[-1].mean(0), run.velocities[-1]
     turning = (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum() / -(c**2).sum()
     radius = np.sort(np.linalg.norm(x, axis=1))[-4:].mean()
-    return pieces(x, 2.0 * spacing).max() + 1, radius, (v**2).sum() / (c**2).sum(), turning
+    nearest = cKDTree(x).query(x[np.linalg.norm(x, axis=1) < 0.3], k=2)[0][:, 1].mean() / spacing
+    return pieces(x, 2.0 * spacing).max() + 1, radius, (v**2).sum() / (c**2).sum(), turning, nearest
 
 
 def elliptical_drop(across, dimension=2, time=0.0076, solver=PROJECTION, device="cpu"):

@@ -133,7 +133,7 @@ class Projection:
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
             y, k, t = new + (t - 1) / later * (new - k), new, later  # y of the last one is not used
         v = v_star - force(k) / m[:, None]
-        moved = x + dt * v + self.shift(x, v, dt)
+        moved = x + dt * v + self.shift(x, v, dt, dt * k / m)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
@@ -145,10 +145,13 @@ class Projection:
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, k
 
-    def shift(self, x, v, dt):
-        (W, g, total, gamma, _, _, H, inverse), s, d = self.around(x), self.spacing, x.shape[1]
+    def shift(self, x, v, dt, pull=0.0):
+        """By velocities, and dt^2 p / rho of every particle."""
+        (W, g, total, gamma, nu, _, H, inverse), s, d = self.around(x), self.spacing, x.shape[1]
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
+        c = between(H, 0.8, 0.95) / (1 + (nu / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
+        rate = rate + 60 * c**2 / (c + 0.01) ** 1.5
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4
         slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma

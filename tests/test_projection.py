@@ -100,7 +100,7 @@ def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(case):
         scale = max(np.abs(gradient[name] * along).sum(), 1e-6 * value)
         assert abs(np.sum(gradient[name] * along) - slope) < 1e-11 * scale, name
         errors = []
-        for step in 10.0 ** np.arange(-7.0, -2.4, 0.5):
+        for step in 10.0 ** np.arange(-8.0, -2.4, 0.5):  # the clamp of a pressure may be near
             ends = [problem.value({**at, name: at[name] + sign * step * along}) for sign in (1.0, -1.0)]
             errors.append(abs((ends[0] - ends[1]) / (2.0 * step) - slope) / scale)
         assert min(errors) < 1e-6, (name, errors)

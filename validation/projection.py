@@ -31,7 +31,7 @@ CASES: dict[str, Case] = {
     "wave of shear in space, 32": lambda device: kolmogorov(32, device=device),
     "ellipse 36": lambda device: elliptical_drop(36, device=device),
     "ball drawn out, 36": lambda device: elliptical_drop(36, 3, device=device),
-    "square that turns, 36, 72: pieces, corner, energy, momentum": lambda device: [
+    "square that turns, 36, 72: pieces, corner, energy, momentum, apart": lambda device: [
         rotating_patch(n, device=device) for n in (36, 72)
     ],
     **{

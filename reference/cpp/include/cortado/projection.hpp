@@ -46,6 +46,8 @@ struct Projection {
     Scalar repair_step_of(const Model<Scalar, D>& model, std::size_t repair, std::size_t i) const {
         return model.repair_relaxations[repair] / effects[i].a;
     }
+    // How much a particle is pulled after all iterations, by which it is shifted.
+    Scalar pulled(std::size_t i) const { return effects[i].repaired * k.back()[i]; }
     // b, for a density n
     Scalar wanted(const Model<Scalar, D>& model, std::size_t i, const Scalar& n) const {
         const Scalar one(1);
@@ -150,7 +152,7 @@ private:
                 A[i] += (v[i] - v[pair->other]) * g.transpose();
                 crowd[i] += Closeness<Scalar>(model.volume * pair->w, model.nearest_weight).value * g;
             }
-            const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i]);
+            const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i], pulled(i));
             x_moved[i] = x[i] + model.time_step * v[i] + shift.delta;
             x_now[0][i] = x_moved[i];
             c[0][i] = Scalar(0);

@@ -25,7 +25,7 @@ public:
     // that of densities n, and returns that of predicted velocities.
     Vectors<Real, D> find(State<Real, D>& bar, Values<Real>& n_bar) {
         const Vectors<Real, D> moved_bar = repairs(bar.x);
-        shift(moved_bar, bar.v);
+        shift(moved_bar, bar.v, bar.k);
         Values<Real> y_bar(count_, Real(0));
         project(bar.k, y_bar, bar.v, n_bar);
         each([&](std::size_t i) {
@@ -88,13 +88,16 @@ private:
         return moved_bar;
     }
 
-    // From the adjoint of x' to that of the new velocities, to which it adds.
-    void shift(const Vectors<Real, D>& moved_bar, Vectors<Real, D>& v_bar) {
+    // From the adjoint of x' to those of the new velocities and of k, to which it adds.
+    void shift(const Vectors<Real, D>& moved_bar, Vectors<Real, D>& v_bar, Values<Real>& k_bar) {
         std::vector<Crowding<Real, D>> bar(count_);
         each([&](std::size_t i) {
-            const ShiftSlope<Real, D> shift(model_, at_.moments[i], {at_.A[i], at_.crowd[i], at_.effects[i].shifted});
+            const Crowding<Real, D> crowding{at_.A[i], at_.crowd[i], at_.effects[i].shifted, at_.pulled(i)};
+            const ShiftSlope<Real, D> shift(model_, at_.moments[i], crowding);
             bar[i] = shift.adjoint(moved_bar[i], moments_bar_[i]);
             effects_bar_[i].shifted += bar[i].shifted;
+            effects_bar_[i].repaired += at_.k.back()[i] * bar[i].pull;
+            k_bar[i] += at_.effects[i].repaired * bar[i].pull;
             x_bar_[i] += moved_bar[i];
             v_bar[i] += model_.time_step * moved_bar[i];
         });

@@ -108,7 +108,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     const Vectors<Real, D>& v = at.u.back();
     Vectors<Real, D> dx_moved(count);
     each_particle(count, model.threads, [&](std::size_t i) {
-        Crowding<Real, D> change{Matrix<Real, D>::Zero(), Vector<Real, D>::Zero(), effects_dot[i].shifted};
+        const Real pull_dot = effects_dot[i].repaired * at.k.back()[i] + at.effects[i].repaired * dk[i];
+        Crowding<Real, D> change{Matrix<Real, D>::Zero(), Vector<Real, D>::Zero(), effects_dot[i].shifted, pull_dot};
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Vector<Real, D> dx_ij = dot.x[i] - dot.x[j], g = model.volume * pair->gradient();
@@ -117,7 +118,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             change.A += (dv[i] - dv[j]) * g.transpose() + (v[i] - v[j]) * dg.transpose();
             change.crowd += near.value * dg + near.slope * g.dot(dx_ij) * g;
         }
-        const ShiftSlope<Real, D> shift(model, at.moments[i], {at.A[i], at.crowd[i], at.effects[i].shifted});
+        const Crowding<Real, D> crowding{at.A[i], at.crowd[i], at.effects[i].shifted, at.pulled(i)};
+        const ShiftSlope<Real, D> shift(model, at.moments[i], crowding);
         dx_moved[i] = dot.x[i] + dt * dv[i] + shift.tangent(moments_dot[i], change);
     });
     Vectors<Real, D> dx_now = dx_moved;

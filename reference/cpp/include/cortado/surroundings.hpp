@@ -154,7 +154,25 @@ struct Surroundings {
     }
 };
 
-// How far a particle is shifted, from A = sum v_ij g_ij^T and the crowd of its neighbours, sum (1 + ...) g_ij.
+// How fast a particle is shifted whose pressure p pulls, 60 c^2 / (c + 0.01)^1.5 with c = dt^2 max(-p, 0) / (rho s^2),
+// of `pull` = dt p by the weight of low densities in repairs; and its derivative by `pull`.
+template <class Scalar, int D>
+struct Pulled {
+    Scalar rate{0}, slope{0};
+
+    Pulled(const Model<Scalar, D>& model, const Scalar& pull) {
+        using Real = typename RealOf<Scalar>::type;
+        if (!(real_part(pull) < Real(0))) return;
+        const Scalar per = -model.time_step / (model.rest_density * model.spacing * model.spacing);
+        const Scalar c = per * pull, weak = hundredths<Scalar>(1), above = c + weak;
+        const Scalar below = above * square_root(above);
+        rate = Scalar(60) * c * c / below;
+        slope = Scalar(30) * c * (c + Scalar(4) * weak) / (below * above) * per;
+    }
+};
+
+// How far a particle is shifted, from A = sum v_ij g_ij^T, the crowd of its neighbours, sum (1 + ...) g_ij,
+// and how much it is pulled.
 template <class Scalar, int D>
 struct Shift {
     Matrix<Scalar, D> K, G;
@@ -165,14 +183,14 @@ struct Shift {
     Scalar farthest, bound;         // [m]; sqrt(1 + |wish|^2 / farthest^2)
 
     Shift(const Model<Scalar, D>& model, const Moments<Scalar, D>& of, const Scalar& shifted,
-          const Matrix<Scalar, D>& A, const Vector<Scalar, D>& crowd) {
+          const Matrix<Scalar, D>& A, const Vector<Scalar, D>& crowd, const Scalar& pull) {
         using Real = typename RealOf<Scalar>::type;
         const Scalar one(1), dt = model.time_step, s = model.spacing, least(Real(1) / Real(1e5));
         K = regular_inverse<Scalar, D>(of.M);
         G = A * K;
         const Scalar turned = dt * dt * G.cwiseProduct(G).sum();
         root = square_root(Scalar(turned + least * least));
-        rate = Scalar(20) * turned / (root + least);
+        rate = Scalar(20) * turned / (root + least) + Pulled<Scalar, D>(model, pull).rate;
         bend = square_root(Scalar(one + Scalar(4) * rate * rate));
         out = of.g + of.gamma;
         slope = crowd + of.gamma;

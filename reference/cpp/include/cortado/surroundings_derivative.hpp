@@ -102,23 +102,25 @@ template <class Real, int D>
 struct Crowding {
     Matrix<Real, D> A;
     Vector<Real, D> crowd;
-    Real shifted;
+    Real shifted, pull;
 };
 
 template <class Real, int D>
 class ShiftSlope {
 public:
     ShiftSlope(const Model<Real, D>& model, const Moments<Real, D>& of, const Crowding<Real, D>& at)
-        : A_(at.A), shifted_(at.shifted), at_(model, of, at.shifted, at.A, at.crowd) {
+        : A_(at.A), shifted_(at.shifted), at_(model, of, at.shifted, at.A, at.crowd, at.pull) {
         const Real dt = model.time_step;
         rate_slope_ = 20 * dt * dt / at_.root;
+        pulled_slope_ = Pulled<Real, D>(model, at.pull).slope;
         scale_ = -model.spacing * model.spacing;
         strength_slope_ = 1 / (at_.bend * at_.bend * at_.bend);
     }
 
     Vector<Real, D> tangent(const Moments<Real, D>& dot, const Crowding<Real, D>& change) const {
         const Matrix<Real, D> dG = change.A * at_.K + A_ * inverse_change<Real, D>(at_.K, dot.M);
-        const Real strength_dot = strength_slope_ * rate_slope_ * at_.G.cwiseProduct(dG).sum();
+        const Real rate_dot = rate_slope_ * at_.G.cwiseProduct(dG).sum() + pulled_slope_ * change.pull;
+        const Real strength_dot = strength_slope_ * rate_dot;
         const Vector<Real, D> out_dot = dot.g + dot.gamma, slope_dot = change.crowd + dot.gamma;
         const Real part_dot =
             (out_dot.dot(at_.slope) + at_.out.dot(slope_dot) - 2 * at_.part * at_.out.dot(out_dot)) / at_.square;
@@ -136,11 +138,12 @@ public:
         const Real part_bar = -at_.out.dot(along_bar) / at_.square;
         const Vector<Real, D> slope_bar = along_bar + part_bar * at_.out;
         const Vector<Real, D> out_bar = part_bar * at_.slope - at_.part * (along_bar + 2 * part_bar * at_.out);
-        const Matrix<Real, D> G_bar = strength_slope_ * rate_slope_ * strength_bar * at_.G;
+        const Real rate_bar = strength_slope_ * strength_bar;
+        const Matrix<Real, D> G_bar = rate_slope_ * rate_bar * at_.G;
         bar.g += out_bar;
         bar.gamma += out_bar + slope_bar;
         bar.M += inverse_change<Real, D>(at_.K, even<Real, D>(A_.transpose() * G_bar));
-        return {G_bar * at_.K, slope_bar, strength() * along_wish};
+        return {G_bar * at_.K, slope_bar, strength() * along_wish, pulled_slope_ * rate_bar};
     }
 
 private:
@@ -154,7 +157,8 @@ private:
     Matrix<Real, D> A_;
     Real shifted_;
     Shift<Real, D> at_;
-    Real rate_slope_, strength_slope_, scale_;  // of r by G : dG; of the bounded r by r; -s^2
+    // Of r by G : dG and by the pull; of the bounded r by r; -s^2.
+    Real rate_slope_, pulled_slope_, strength_slope_, scale_;
 };
 
 }  // namespace cortado

@@ -101,6 +101,8 @@ class Shift(Part):
         self.layout = layout
         self.around, self.kept = self.arrays("", **entries(precision)), self.arrays("", **self._sums())
         self._free, self._delta = layout.state((POSITIONS,)).positions, self.vectors()
+        self.unpulled = self.like_pull("")
+        """No tension: the pressure is not yet known."""
 
     def _sums(self) -> dict[str, Any]:
         """Names and types of what the shift is found from."""
@@ -119,6 +121,10 @@ class Shift(Part):
         """Room for adjoints of what the shift is found from."""
         return self.arrays(suffix, **self._sums())
 
+    def like_pull(self, suffix: str) -> dict[str, wp.array]:
+        """Room for tangents or adjoints of k."""
+        return self.arrays(suffix, k=self.layout.precision.real)
+
     def vectors(self) -> wp.array:
         """(n,) vectors, all 0."""
         return self.arrays("", one=self.layout.precision.vector)["one"]
@@ -126,7 +132,7 @@ class Shift(Part):
     def settle(self, step: StepContext) -> None:
         step.launch(self.surroundings.forward, self.around, self.constants)
         flow = {"v_flow": step.fields["v"], "delta": self._delta}
-        step.launch(self.shift.forward, self.around, self.kept, self.constants, flow)
+        step.launch(self.shift.forward, self.around, self.kept, self.constants, self.unpulled, flow)
 
     def target(self, moved: State) -> State:
         return State((POSITIONS, VELOCITIES), {"positions": self._free, "velocities": moved.velocities}, moved.batch)
@@ -146,11 +152,11 @@ class ShiftTangent(PartTangent):
 
     def __init__(self, shift: Shift):
         self._shift, self._delta_dot = shift, shift.vectors()
-        self._around = shift.like_around("_dot")
+        self._around, self._unpulled = shift.like_around("_dot"), shift.like_pull("_dot")
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         shift = self._shift
-        known = (*dot.named, self._around, shift.around, shift.constants)
+        known = (*dot.named, self._around, shift.around, shift.constants, shift.unpulled, self._unpulled)
         step.launch(shift.surroundings.tangent, *known)
         flow = {"v_flow": step.fields["v"], "v_flow_dot": dot.fields["v"], "delta_dot": self._delta_dot}
         step.launch(shift.shift.tangent, *known, shift.kept, flow)
@@ -166,6 +172,7 @@ class ShiftAdjoint(PartAdjoint):
     def __init__(self, shift: Shift):
         self._shift, self._delta_bar = shift, shift.vectors()
         self._around, self._kept = shift.like_around("_bar"), shift.like_sums("_bar")
+        self._unused = shift.like_pull("_bar")
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         step.launch(self._shift.place_adjoint, x_scene_bar=moved_bar.positions, delta_bar=self._delta_bar)
@@ -175,7 +182,7 @@ class ShiftAdjoint(PartAdjoint):
         shift = self._shift
         for array in self._around.values():
             array.zero_()
-        known = (*bar.named, self._around, shift.around, shift.constants)
+        known = (*bar.named, self._around, shift.around, shift.constants, shift.unpulled, self._unused)
         flow = {"v_flow": step.fields["v"], "v_flow_bar": bar.fields["v"], "delta_bar": self._delta_bar}
         for kernel in shift.shift.adjoint:
             step.launch(kernel, *known, self._kept, shift.kept, flow)

@@ -55,6 +55,7 @@ class ProjectionTangent(ParticleTangent):
         context.launch(kernels.pressure.start.tangent, *known, start, steps)
         self._project(context, known, counts[0])
         flow = {"v_flow": solver.v_new, "v_flow_dot": self._v_new_dot, "delta_dot": self._delta_dot}
+        flow |= {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
         context.launch(kernels.shift.tangent, *known, solver.kept, solver.shifted, flow)
         moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "delta_dot": self._delta_dot}
         begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
@@ -173,6 +174,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
         context.launch(kernels.moving.adjoint, *known, moved)
         flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "delta_bar": self._x_moved_bar}
+        flow |= {"k": solver.iterates[counts[0]]["k"], "k_bar": self._k_bar}
         own, sums = kernels.shift.adjoint
         context.launch(own, *known, self._kept, solver.kept, solver.shifted, flow)
         if solver.following is not None:

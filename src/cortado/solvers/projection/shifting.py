@@ -1,11 +1,14 @@
 """Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
-2013), at a rate that follows the velocity gradient, so that a fluid at rest is not stirred:
+2013), at a rate that follows the velocity gradient and the tension, so that a fluid at rest is not stirred:
 
     delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
+    r = 20 dt |grad v| + 60 c^2 / (c + 0.01)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
-with r = 20 dt |grad v|, softly at least 0 and at most 0.5, and |delta| softly at most 0.1 s. P takes out the direction
-of the surface, g + gamma, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
-they are: with a correction by (delta . grad) v the fluid gains energy.
+with r softly at most 0.5, and |delta| softly at most 0.1 s. Where the pressure pulls, particles clump at the rate of
+sqrt(-p / rho) / s (the tensile instability, Monaghan 2000), and the shift is faster. P takes out the direction
+of the surface, g + gamma. Of the weights of `cortado.solvers.projection.surroundings`, u is 0 at surfaces, and w, that
+of low densities in repairs, near them and beside walls. Velocities stay as they are: with a correction by
+(delta . grad) v the fluid gains energy.
 """
 
 from dataclasses import dataclass
@@ -32,7 +35,11 @@ FARTHEST = 0.1
 SURFACE = 0.03
 """|g| s below which the direction of a surface is not known."""
 LEAST = 1e-5
-"""e in r = 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
+"""e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
+PULLED = 60.0
+"""How fast particles are shifted where the pressure pulls."""
+WEAK = 0.01
+"""Of c, below which a pull counts with its square."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class ShiftFunctions:
     """Warp functions of one particle."""
 
     shift: Any
-    """delta of A, the sum of g_ij in grad C, M, g, gamma, u, dt and s."""
+    """delta of A, the sum of g_ij in grad C, M, g, gamma, the weights, k = dt p, m, dt and s."""
     back: Any
     """For an adjoint of delta, those of all but s."""
 
@@ -48,24 +55,35 @@ class ShiftFunctions:
 @cache
 def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftFunctions:
     """In 2 or 3 dimensions, in a Warp module. A is sum_j v_ij g_ij^T."""
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     inverse = surrounding_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
     farthest = wp.constant(real(FARTHEST))
-    surface = wp.constant(real(SURFACE**2))
+    surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
 
     @wp.func
     def shift(
-        A: matrix, crowd: vector, M: matrix, g: vector, gamma: vector, u: real, dt: real, spacing: real
+        A: matrix,
+        crowd: vector,
+        M: matrix,
+        g: vector,
+        gamma: vector,
+        weights: weights4,
+        k: real,
+        m: real,
+        dt: real,
+        spacing: real,
     ) -> vector:
         G = A * inverse(M)
         turned = dt * dt * wp.ddot(G, G)
         strength = rate * turned / (wp.sqrt(turned + least * least) + least)
+        pull = weights[3] * dt * wp.max(-k, real(0.0)) / (m * spacing * spacing)
+        strength += pulled * pull * pull / ((pull + weak) * wp.sqrt(pull + weak))
         out, slope = g + gamma, crowd + gamma
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
         strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))
-        wish = (-strength * spacing * spacing * u) * along
+        wish = (-strength * spacing * spacing * weights[2]) * along
         most = farthest * spacing
         return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
 
@@ -76,12 +94,14 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         M: matrix,
         g: vector,
         gamma: vector,
-        u: real,
+        weights: weights4,
+        k: real,
+        m: real,
         dt: real,
         spacing: real,
         bar: vector,
     ) -> real:
-        return wp.dot(shift(A, crowd, M, g, gamma, u, dt, spacing), bar)
+        return wp.dot(shift(A, crowd, M, g, gamma, weights, k, m, dt, spacing), bar)
 
     @wp.func(module=module)
     def back(
@@ -90,15 +110,17 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         M: matrix,
         g: vector,
         gamma: vector,
-        u: real,
+        weights: weights4,
+        k: real,
+        m: real,
         dt: real,
         spacing: real,
         bar: vector,
     ):
-        by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt, _s, _bar = wp.grad(work)(
-            A, crowd, M, g, gamma, u, dt, spacing, bar
+        by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt, _s, _bar = wp.grad(work)(
+            A, crowd, M, g, gamma, weights, k, m, dt, spacing, bar
         )
-        return by_A, by_crowd, real(0.5) * (by_M + wp.transpose(by_M)), by_g, by_gamma, by_u, by_dt
+        return by_A, by_crowd, real(0.5) * (by_M + wp.transpose(by_M)), by_g, by_gamma, by_weights, by_k, by_m, by_dt
 
     return ShiftFunctions(shift, back)
 
@@ -108,7 +130,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """The kernels of delta; the adjoint are two, that of a particle's own and that of its sums."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
+    neighbourhood = neighbourhood_type(precision)
     sums = projection_sums(discretisation)
     crowding, crowding_tangent, crowding_back = sums.crowding, sums.crowding_tangent, sums.crowding_back
     topic = f"projection_{dimension}d"
@@ -118,7 +140,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     along = shift_functions(precision, dimension, tangent_module).back
     back = shift_functions(precision, dimension, adjoint_module).back
     own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "gamma", "weights")}
-    seen, bars = bundle(**own), bundle(time_step=real, **own)
+    seen, bars = bundle(**own), bundle(time_step=real, k=real, m=real, **own)
     kept = bundle(A=matrix, crowd=vector)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -131,6 +153,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v_flow: wp.array(dtype=vector),
+        k: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         of: seen,
         # out
         kept: kept,
@@ -143,7 +167,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
         kept.A[i] = A
         kept.crowd[i] = crowd
-        delta[i] = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing)
+        delta[i] = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i], k[i], m[i], dt, spacing)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def shift_tangent(
@@ -154,9 +178,11 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         time_step_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v_flow: wp.array(dtype=vector),
+        k: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         of: seen,
         kept: kept,
-        dot: bundle(x=vector, v_flow=vector, **own),
+        dot: bundle(x=vector, v_flow=vector, k=real, m=real, **own),
         # out
         delta_dot: wp.array(dtype=vector),
     ):
@@ -168,15 +194,25 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
         total = vector()
         count = int(3)  # not a number: Warp would write the gradient out for each
-        for k in range(count):
+        for axis in range(count):
             unit = vector()
-            unit[k] = real(1.0)
-            by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = along(
-                kept.A[i], kept.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing, unit
+            unit[axis] = real(1.0)
+            by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
+                kept.A[i],
+                kept.crowd[i],
+                of.M[i],
+                of.g[i],
+                of.gamma[i],
+                of.weights[i],
+                k[i],
+                m[i],
+                dt,
+                spacing,
+                unit,
             )
             entry = wp.ddot(by_A, A_dot) + wp.dot(by_crowd, crowd_dot) + wp.ddot(by_M, dot.M[i])
-            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + by_u * dot.weights[i][2]
-            total += (entry + by_dt * time_step_dot[member]) * unit
+            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + wp.dot(by_weights, dot.weights[i])
+            total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
         delta_dot[i] = total
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
@@ -184,6 +220,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         particles: int,
         spacing: real,
         time_step: wp.array(dtype=real),
+        k: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         of: seen,
         kept: kept,
         delta_bar: wp.array(dtype=vector),
@@ -194,24 +232,27 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         crowd_bar: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = back(
+        by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = back(
             kept.A[i],
             kept.crowd[i],
             of.M[i],
             of.g[i],
             of.gamma[i],
-            of.weights[i][2],
+            of.weights[i],
+            k[i],
+            m[i],
             time_step[i // particles],
             spacing,
             delta_bar[i],
         )
-        no = real(0.0)
         A_bar[i] = by_A
         crowd_bar[i] = by_crowd
         bar.M[i] = bar.M[i] + by_M
         bar.g[i] = bar.g[i] + by_g
         bar.gamma[i] = bar.gamma[i] + by_gamma
-        bar.weights[i] = bar.weights[i] + weights4(no, no, by_u, no)
+        bar.weights[i] = bar.weights[i] + by_weights
+        bar.k[i] = bar.k[i] + by_k
+        bar.m[i] = bar.m[i] + by_m
         bar.time_step[i] = bar.time_step[i] + by_dt
 
     @wp.kernel(module=adjoint_module, enable_backward=False)

@@ -192,7 +192,7 @@ class ProjectionSteps(ParticleSolver):
         if self.bodies is not None:
             self.bodies.settle(context, at["y"])
         context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
-        flow, first = {"v_flow": self.v_new, "delta": self.delta}, self.repaired[0]
+        flow, first = {"v_flow": self.v_new, "k": self.iterates[last]["k"], "delta": self.delta}, self.repaired[0]
         context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, flow)
         moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
