@@ -16,8 +16,8 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.effects import effect_functions
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import surrounding_functions
 from cortado.sph.moment_functions import matrix_type
 
 
@@ -25,7 +25,7 @@ from cortado.sph.moment_functions import matrix_type
 def change_functions(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
     """The change of a velocity by A, M and the way, and for an adjoint of it those of A, M and the way."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    inverse = surrounding_functions(precision, dimension, module).inverse
+    inverse = effect_functions(precision, dimension, module).inverse
 
     @wp.func
     def change(A: matrix, M: matrix, way: vector) -> vector:

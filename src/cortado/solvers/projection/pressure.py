@@ -26,8 +26,9 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries, weights_type
+from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
 

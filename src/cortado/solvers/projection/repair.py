@@ -4,7 +4,7 @@
     x_k+1 = x' - (sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m.
 
 omega_k is another one in each (`cortado.solvers.projection.constants`). Velocities stay as they are: in them a repair
-would be a force that acts once more in the next step. r of `cortado.solvers.projection.surroundings` lets low densities
+would be a force that acts once more in the next step. r of `cortado.solvers.projection.effects` lets low densities
 be repaired in the interior alone. g and a are those of the start of the step, n is that of the positions, over the
 neighbours of the start.
 """
@@ -18,8 +18,9 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries, weights_type
+from cortado.solvers.projection.surroundings import entries
 from cortado.sph.density import density_sums
 
 

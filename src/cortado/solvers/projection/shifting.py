@@ -6,7 +6,7 @@
 
 with r softly at most 0.5, and |delta| softly at most 0.1 s. Where the pressure pulls, particles clump at the rate of
 sqrt(-p / rho) / s (the tensile instability, Monaghan 2000), and the shift is faster. P takes out the direction
-of the surface, g + gamma. Of the weights of `cortado.solvers.projection.surroundings`, u is 0 at surfaces, and w, that
+of the surface, g + gamma. Of the weights of `cortado.solvers.projection.effects`, u is 0 at surfaces, and w, that
 of low densities in repairs, near them and beside walls. Velocities stay as they are: with a correction by
 (delta . grad) v the fluid gains energy.
 """
@@ -22,8 +22,9 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries, surrounding_functions, weights_type
+from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type
 
 RATE = 20.0
@@ -56,7 +57,7 @@ class ShiftFunctions:
 def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftFunctions:
     """In 2 or 3 dimensions, in a Warp module. A is sum_j v_ij g_ij^T."""
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
-    inverse = surrounding_functions(precision, dimension, module).inverse
+    inverse = effect_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
     farthest = wp.constant(real(FARTHEST))
     surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
