@@ -139,9 +139,13 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
-        own = {"k": solver.iterates[counts[0]]["k"], "p_bar": within.p, "k_bar": self._k_bar}
+        own = {"k": self._last_k(counts), "p_bar": within.p, "k_bar": self._k_bar}
         solver.context(parameters).launch(pressed_adjoint_kernel(solver.layout.precision), *self.bar.named, own)
         self._finish(counts, state_bar, parameters, within)
+
+    def _last_k(self, counts: Counts) -> wp.array:
+        """That of the replayed step after all iterations."""
+        return self._solver.iterates[counts[0]]["k"]
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
         """From the adjoint of the result to those of the last positions, velocities and k."""
@@ -174,7 +178,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
         context.launch(kernels.moving.adjoint, *known, moved)
         flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "delta_bar": self._x_moved_bar}
-        flow |= {"k": solver.iterates[counts[0]]["k"], "k_bar": self._k_bar}
+        flow |= {"k": self._last_k(counts), "k_bar": self._k_bar}
         own, sums = kernels.shift.adjoint
         context.launch(own, *known, self._kept, solver.kept, solver.shifted, flow)
         if solver.following is not None:

@@ -190,10 +190,14 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._end.sort(context, self._after)
         self._root.fill_(1.0)
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)
+        wp.copy(at["k"], self._end[IMPULSE])
         solver.move(context, 0)
         for k in range(repairs):
             solver.mend(context, k, k, k + 1)
         self.arrive(state)
+
+    def _last_k(self, counts: Counts) -> wp.array:
+        return self._end[IMPULSE]
 
     def _pull_by(self, context: StepContext, p: wp.array, y: wp.array, T: wp.array) -> None:
         context.launch(self._own.pull, self._solver.around, p=p, root=self._root, y=y, T=T)
