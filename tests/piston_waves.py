@@ -10,7 +10,7 @@ SOONER = 1.3
 """By how much faster than their group the first waves that come back are taken to be."""
 
 
-def piston(deep: int, depth_times_wavenumber: float, steepness: float) -> dict[str, float]:
+def piston(deep: int, depth_times_wavenumber: float, steepness: float, device: str = "cpu") -> dict[str, float]:
     """Waves on water 1 m and so many particles deep: their height over the stroke, and that over the one of linear
     theory, 2 (cosh 2kd - 1) / (sinh 2kd + 2kd), before any come back from the far end.
 
@@ -48,7 +48,7 @@ def piston(deep: int, depth_times_wavenumber: float, steepness: float) -> dict[s
         solver={"kind": "projection", "time_step": step},
     )
     every = max(int(0.02 / step), 1)
-    run = Simulation(scene).run(int(end / step), record_every=every)
+    run = Simulation(scene, device).run(int(end / step), record_every=every)
     clock = np.arange(len(run.positions)) * every * step
     settled = clock >= start
     heights = [_height(run.positions[settled], clock[settled], gauge, spacing, omega) for gauge in gauges]

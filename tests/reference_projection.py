@@ -26,9 +26,9 @@ class Projection:
     feet: np.ndarray
     """From wall particles to the surface."""
     periods: np.ndarray
-    iterations: int = 4
-    repairs: int = 2
-    follow: bool = False
+    iterations: int
+    repairs: int
+    follow: bool
 
     @classmethod
     def of(cls, simulation):
@@ -42,8 +42,9 @@ class Projection:
         )
         kernel, spacing = solver.discretisation.smoothing, scene.discretisation.spacing
         periods = np.array(scene.container.periods(d)[1])
+        counts = (getattr(scene.solver, name, 2) for name in ("iterations", "repairs"))
         follow = getattr(scene.solver, "velocities_follow", False)
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, follow=follow)
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -125,15 +126,16 @@ class Projection:
 
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         k = y = full * before
-        t = 1.0
+        t = 5.0
         for _ in range(self.iterations):
-            D = divergence(v_star - force(y) / m[:, None])
+            u = v_star - force(y) / m[:, None]
+            D = divergence(u)
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
             y, k, t = new + (t - 1) / later * (new - k), new, later  # y of the last one is not used
         v = v_star - force(k) / m[:, None]
-        moved = x + dt * v + self.shift(x, v, dt, dt * k / m)
+        moved = x + dt * v + self.shift(x, u, dt, dt * k / m)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
@@ -141,7 +143,7 @@ class Projection:
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
         if self.follow:
-            slopes = -np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
+            slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, k
 

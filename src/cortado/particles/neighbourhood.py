@@ -152,6 +152,7 @@ class PairFunctions:
     wall_velocity_dot: Any
     wall_turn_dot: Any
     wall_growth_dot: Any
+    several: Any
     vectors: Any
     numbers: Any
     sixes: Any
@@ -165,10 +166,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` (its weight if it is of
-    the given moving solid, and 0 if not); and ``vectors``, ``numbers`` and ``sixes``, which load what `UNROLL`
-    neighbours have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole
-    step).
+    list of i), ``several`` (the numbers of `UNROLL` of them from the k-th on), ``wall_position`` and others, which load
+    what a wall particle has, ``weight_in`` (its weight if it is of the given moving solid, and 0 if not); and
+    ``vectors``, ``numbers`` and ``sixes``, which load what several neighbours have before any of it is used, so that
+    the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -240,31 +241,22 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_neighbour(s.neighbours, k, i)
 
     @wp.func
-    def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
+    def several(k: int, i: int, s: neighbourhood) -> wp.vec4i:
+        return wp.vec4i(neighbour(k, i, s), neighbour(k + 1, i, s), neighbour(k + 2, i, s), neighbour(k + 3, i, s))
+
+    @wp.func
+    def vectors(a: wp.array(dtype=vector), j: wp.vec4i) -> rows:
         return wp.matrix_from_rows(
-            load_vector(a, neighbour(k, i, s)),
-            load_vector(a, neighbour(k + 1, i, s)),
-            load_vector(a, neighbour(k + 2, i, s)),
-            load_vector(a, neighbour(k + 3, i, s)),
+            load_vector(a, j[0]), load_vector(a, j[1]), load_vector(a, j[2]), load_vector(a, j[3])
         )
 
     @wp.func
-    def numbers(a: wp.array(dtype=real), k: int, i: int, s: neighbourhood) -> row:
-        return row(
-            load_number(a, neighbour(k, i, s)),
-            load_number(a, neighbour(k + 1, i, s)),
-            load_number(a, neighbour(k + 2, i, s)),
-            load_number(a, neighbour(k + 3, i, s)),
-        )
+    def numbers(a: wp.array(dtype=real), j: wp.vec4i) -> row:
+        return row(load_number(a, j[0]), load_number(a, j[1]), load_number(a, j[2]), load_number(a, j[3]))
 
     @wp.func
-    def sixes(a: wp.array(dtype=six), k: int, i: int, s: neighbourhood) -> six_rows:
-        return wp.matrix_from_rows(
-            load_six(a, neighbour(k, i, s)),
-            load_six(a, neighbour(k + 1, i, s)),
-            load_six(a, neighbour(k + 2, i, s)),
-            load_six(a, neighbour(k + 3, i, s)),
-        )
+    def sixes(a: wp.array(dtype=six), j: wp.vec4i) -> six_rows:
+        return wp.matrix_from_rows(load_six(a, j[0]), load_six(a, j[1]), load_six(a, j[2]), load_six(a, j[3]))
 
     return PairFunctions(
         separation=nearest_image if discretisation.periodic else difference,
@@ -279,6 +271,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         factor_gradient=factor_gradient,
         neighbour=neighbour,
         **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
+        several=several,
         vectors=vectors,
         numbers=numbers,
         sixes=sixes,

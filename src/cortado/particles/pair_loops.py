@@ -21,6 +21,7 @@ def {name}(i: int, {parameters}s: _neighbourhood):
 """
 OVER_FLUID = """\
     for _first in range(_lane() * _UNROLL, s.fluid_count[i], _UNROLL * _LANES):
+        _several_j = _several(_first, i, s)
         {load}
         for _more in range(_UNROLL):
             {index}
@@ -57,8 +58,8 @@ def over_fluid(
     loaded = {array: loads[kind] for array, kind in arrays.items() if kind in loads}
     of_j = {array: f"_{array}_j[_more]" if array in loaded else f"{array}[_j]" for array in arrays}
     return OVER_FLUID.format(
-        load=_lines(8, (f"_{array}_j = {load}({array}, _first, i, s)" for array, load in loaded.items())),
-        index="_j = _neighbour(_first + _more, i, s)" if numbered or len(loaded) < len(arrays) else "",
+        load=_lines(8, (f"_{array}_j = {load}({array}, _several_j)" for array, load in loaded.items())),
+        index="_j = _several_j[_more]" if numbered or len(loaded) < len(arrays) else "",
         separation=f"_x_ij = _separation(_x_i, {of_j['x']}, s)" if separated else "",
         body=_lines(12, body(of_j)),
     )
@@ -128,6 +129,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
     used = (
         "separation",
         "neighbour",
+        "several",
         "vectors",
         "numbers",
         "sixes",

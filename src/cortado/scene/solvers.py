@@ -79,7 +79,7 @@ class ProjectionSolver(SolverTable):
 
     kind: Literal["projection"]
     """Name of the algorithm."""
-    iterations: Annotated[int, count(1, 1_000)] = 4
+    iterations: Annotated[int, count(1, 1_000)] = 2
     """Iterations of the pressure in every step, each from that of the step before."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""

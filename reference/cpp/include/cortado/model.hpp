@@ -76,7 +76,7 @@ struct Model {
             wall_depths[b] = square_root(Real(wall_normals[b].dot(wall_normals[b])));
             wall_normals[b] /= wall_depths[b];
         }
-        Real t(1);
+        Real t(5);  // as the first pressure is that of the step before
         for (std::size_t k = 0; k + 1 < momenta.size(); ++k) {
             const Real later = (Real(1) + square_root(Real(Real(1) + Real(4) * t * t))) / Real(2);
             momenta[k] = Scalar((t - Real(1)) / later);

@@ -30,7 +30,7 @@ struct Projection {
     std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
-    Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of it
+    Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of the last but one
     Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
     Vectors<Scalar, D> x_moved;               // x'
     std::vector<Vectors<Scalar, D>> x_now;    // [i]: before repair i; the last is the result
@@ -48,6 +48,8 @@ struct Projection {
     }
     // How much a particle is pulled after all iterations, by which it is shifted.
     Scalar pulled(std::size_t i) const { return effects[i].repaired * k.back()[i]; }
+    // The velocities of the last iteration, by whose A particles are shifted.
+    const Vectors<Scalar, D>& flow() const { return u[u.size() - 2]; }
     // b, for a density n
     Scalar wanted(const Model<Scalar, D>& model, std::size_t i, const Scalar& n) const {
         const Scalar one(1);
@@ -145,11 +147,12 @@ private:
         for (Vectors<Scalar, D>* each : {&crowd, &x_moved}) each->resize(x.size());
         A.resize(x.size());
         each_particle(x.size(), model.threads, [&](std::size_t i) {
+            const Vectors<Scalar, D>& w = flow();
             A[i] = Matrix<Scalar, D>::Constant(Scalar(0));
             crowd[i] = Vector<Scalar, D>::Constant(Scalar(0));
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
                 const Vector<Scalar, D> g = model.volume * pair->gradient();
-                A[i] += (v[i] - v[pair->other]) * g.transpose();
+                A[i] += (w[i] - w[pair->other]) * g.transpose();
                 crowd[i] += Closeness<Scalar>(model.volume * pair->w, model.nearest_weight).value * g;
             }
             const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i], pulled(i));

@@ -19,6 +19,7 @@ public:
           effects_bar_(count_),
           x_bar_(zero_vectors<Real, D>(count_)),
           v_star_bar_(zero_vectors<Real, D>(count_)),
+          flow_bar_(zero_vectors<Real, D>(count_)),
           f_(count_) {}
 
     // From the adjoint of a step's result to that of its state but for what predicted velocities depend on; adds to
@@ -88,7 +89,7 @@ private:
         return moved_bar;
     }
 
-    // From the adjoint of x' to those of the new velocities and of k, to which it adds.
+    // From the adjoint of x' to those of the new velocities and of k, to which it adds, and of the flow.
     void shift(const Vectors<Real, D>& moved_bar, Vectors<Real, D>& v_bar, Values<Real>& k_bar) {
         std::vector<Crowding<Real, D>> bar(count_);
         each([&](std::size_t i) {
@@ -101,15 +102,15 @@ private:
             x_bar_[i] += moved_bar[i];
             v_bar[i] += model_.time_step * moved_bar[i];
         });
-        const Vectors<Real, D>& v = at_.u.back();
+        const Vectors<Real, D>& u = at_.flow();
         each([&](std::size_t i) {
             each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
                 const Matrix<Real, D> A_bar = bar[i].A + bar[j].A;
-                const Vector<Real, D> crowd_bar = bar[i].crowd - bar[j].crowd, v_ij = v[i] - v[j];
+                const Vector<Real, D> crowd_bar = bar[i].crowd - bar[j].crowd, u_ij = u[i] - u[j];
                 const Closeness<Real> near(Real(model_.volume * pair.w), model_.nearest_weight);
-                v_bar[i] += A_bar * g;
+                flow_bar_[i] += A_bar * g;
                 x_bar_[i] += near.slope * g.dot(crowd_bar) * g;
-                bent = A_bar.transpose() * v_ij + near.value * crowd_bar;
+                bent = A_bar.transpose() * u_ij + near.value * crowd_bar;
             });
         });
     }
@@ -141,7 +142,8 @@ private:
         Values<Real> d_bar(count_);
         Vectors<Real, D> u_bar(count_);
         pull(at_.y.back(), v_bar, y_bar);
-        for (int k = int(at_.divergences.size()) - 1; k >= 0; --k) {
+        const int last = int(at_.divergences.size()) - 1;
+        for (int k = last; k >= 0; --k) {
             const Real beta = model_.momenta[k];
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];
@@ -166,6 +168,7 @@ private:
                 const Vectors<Real, D>& u = at_.u[k];
                 Matrix<Real, D> L_bar = Matrix<Real, D>::Zero();
                 u_bar[i] = d_bar[i] * at_.moments[i].gamma;
+                if (k == last) u_bar[i] += flow_bar_[i];
                 each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
                     const Vector<Real, D> u_ij = u[i] - u[j];
                     const Matrix<Real, D> S = d_bar[i] * L + d_bar[j] * at_.effects[j].L;
@@ -218,7 +221,8 @@ private:
     std::size_t count_;
     std::vector<Moments<Real, D>> moments_bar_;
     std::vector<Effects<Real, D>> effects_bar_;
-    Vectors<Real, D> x_bar_, v_star_bar_, f_;  // f is -u_bar / m of a velocity, or that of a position
+    Vectors<Real, D> x_bar_, v_star_bar_, flow_bar_;
+    Vectors<Real, D> f_;  // -u_bar / m of a velocity, or that of a position
 };
 
 }  // namespace cortado

@@ -78,10 +78,10 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         effects_dot[i] = SurroundingsSlope<Real, D>(model, at.moments[i]).tangent(moments_dot[i]);
         dk[i] = dy[i] = effects_dot[i].full * state.k[i] + at.effects[i].full * dot.k[i];
     });
+    Vectors<Real, D> du;
     for (std::size_t k = 0; k < at.divergences.size(); ++k) {
         const Vectors<Real, D>& u = at.u[k];
-        const Vectors<Real, D> du =
-            pull_tangent(model, step, dot.x, moments_dot, effects_dot, at.y[k], dy, dv_star);
+        du = pull_tangent(model, step, dot.x, moments_dot, effects_dot, at.y[k], dy, dv_star);
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
             Real dD = at.moments[i].gamma.dot(du[i]) + moments_dot[i].gamma.dot(u[i]);
@@ -105,7 +105,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     }
     const Vectors<Real, D> dv =
         pull_tangent(model, step, dot.x, moments_dot, effects_dot, at.y.back(), dy, dv_star);
-    const Vectors<Real, D>& v = at.u.back();
+    const Vectors<Real, D>& u = at.flow();
     Vectors<Real, D> dx_moved(count);
     each_particle(count, model.threads, [&](std::size_t i) {
         const Real pull_dot = effects_dot[i].repaired * at.k.back()[i] + at.effects[i].repaired * dk[i];
@@ -115,7 +115,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             const Vector<Real, D> dx_ij = dot.x[i] - dot.x[j], g = model.volume * pair->gradient();
             const Vector<Real, D> dg = model.volume * pair->hessian_product(dx_ij);
             const Closeness<Real> near(Real(model.volume * pair->w), model.nearest_weight);
-            change.A += (dv[i] - dv[j]) * g.transpose() + (v[i] - v[j]) * dg.transpose();
+            change.A += (du[i] - du[j]) * g.transpose() + (u[i] - u[j]) * dg.transpose();
             change.crowd += near.value * dg + near.slope * g.dot(dx_ij) * g;
         }
         const Crowding<Real, D> crowding{at.A[i], at.crowd[i], at.effects[i].shifted, at.pulled(i)};

@@ -20,6 +20,7 @@ from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.surroundings import entries, surrounding_kernels
+from cortado.solvers.projection.velocity_gradient import velocity_gradient_kernels
 from cortado.solvers.solver import StepAdjoint
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type
@@ -90,23 +91,20 @@ class Shift(Part):
     def __init__(self, maker: ShiftMaker, layout: Layout):
         precision, own = layout.precision, (maker.discretisation, maker.dimension)
         self.discretisation = maker.discretisation
-        self.surroundings, self.shift = surrounding_kernels(*own), shift_kernels(*own)
+        self.surroundings, self.gradient = surrounding_kernels(*own), velocity_gradient_kernels(*own)
+        self.shift = shift_kernels(*own)
         self.place, self.place_adjoint = place_kernels(precision)
         constants = maker.constants
         self.constants = {
             "least": constants.least_diagonal,
-            "nearest": constants.nearest_weight,
+            "per_nearest": 1.0 / constants.nearest_weight,
             "spacing": constants.spacing,
         }
         self.layout = layout
-        self.around, self.kept = self.arrays("", **entries(precision)), self.arrays("", **self._sums())
+        self.around, self.flow = self.like_around(""), self.like_flow("")
         self._free, self._delta = layout.state((POSITIONS,)).positions, self.vectors()
         self.unpulled = self.like_pull("")
         """No tension: the pressure is not yet known."""
-
-    def _sums(self) -> dict[str, Any]:
-        """Names and types of what the shift is found from."""
-        return {"A": matrix_type(self.layout.precision), "crowd": self.layout.precision.vector}
 
     def arrays(self, suffix: str, **kinds: Any) -> dict[str, wp.array]:
         """Arrays (n,) of zeros by name and suffix, of Warp types."""
@@ -117,9 +115,9 @@ class Shift(Part):
         """Room for tangents or adjoints of what is around particles."""
         return self.arrays(suffix, **entries(self.layout.precision))
 
-    def like_sums(self, suffix: str) -> dict[str, wp.array]:
-        """Room for adjoints of what the shift is found from."""
-        return self.arrays(suffix, **self._sums())
+    def like_flow(self, suffix: str) -> dict[str, wp.array]:
+        """Room for A, its tangents or its adjoints."""
+        return self.arrays(suffix, A=matrix_type(self.layout.precision))
 
     def like_pull(self, suffix: str) -> dict[str, wp.array]:
         """Room for tangents or adjoints of k."""
@@ -131,8 +129,8 @@ class Shift(Part):
 
     def settle(self, step: StepContext) -> None:
         step.launch(self.surroundings.forward, self.around, self.constants)
-        flow = {"v_flow": step.fields["v"], "delta": self._delta}
-        step.launch(self.shift.forward, self.around, self.kept, self.constants, self.unpulled, flow)
+        step.launch(self.gradient.forward, self.flow, v_flow=step.fields["v"])
+        step.launch(self.shift.forward, self.around, self.flow, self.constants, self.unpulled, delta=self._delta)
 
     def target(self, moved: State) -> State:
         return State((POSITIONS, VELOCITIES), {"positions": self._free, "velocities": moved.velocities}, moved.batch)
@@ -153,13 +151,14 @@ class ShiftTangent(PartTangent):
     def __init__(self, shift: Shift):
         self._shift, self._delta_dot = shift, shift.vectors()
         self._around, self._unpulled = shift.like_around("_dot"), shift.like_pull("_dot")
+        self._flow = shift.like_flow("_dot")
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         shift = self._shift
         known = (*dot.named, self._around, shift.around, shift.constants, shift.unpulled, self._unpulled)
         step.launch(shift.surroundings.tangent, *known)
-        flow = {"v_flow": step.fields["v"], "v_flow_dot": dot.fields["v"], "delta_dot": self._delta_dot}
-        step.launch(shift.shift.tangent, *known, shift.kept, flow)
+        step.launch(shift.gradient.tangent, *known, self._flow, v_flow=step.fields["v"], v_flow_dot=dot.fields["v"])
+        step.launch(shift.shift.tangent, *known, shift.flow, self._flow, delta_dot=self._delta_dot)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         x_dot = state_dot.positions
@@ -171,7 +170,7 @@ class ShiftAdjoint(PartAdjoint):
 
     def __init__(self, shift: Shift):
         self._shift, self._delta_bar = shift, shift.vectors()
-        self._around, self._kept = shift.like_around("_bar"), shift.like_sums("_bar")
+        self._around, self._flow = shift.like_around("_bar"), shift.like_flow("_bar")
         self._unused = shift.like_pull("_bar")
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
@@ -180,12 +179,11 @@ class ShiftAdjoint(PartAdjoint):
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         shift = self._shift
-        for array in self._around.values():
+        for array in (*self._around.values(), *self._flow.values()):
             array.zero_()
         known = (*bar.named, self._around, shift.around, shift.constants, shift.unpulled, self._unused)
-        flow = {"v_flow": step.fields["v"], "v_flow_bar": bar.fields["v"], "delta_bar": self._delta_bar}
-        for kernel in shift.shift.adjoint:
-            step.launch(kernel, *known, self._kept, shift.kept, flow)
+        step.launch(shift.shift.adjoint, *known, self._flow, shift.flow, delta_bar=self._delta_bar)
+        step.launch(shift.gradient.adjoint, *known, self._flow, v_flow=step.fields["v"], v_flow_bar=bar.fields["v"])
         for kernel in shift.surroundings.adjoint:
             step.launch(kernel, *known)
         bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *known)

@@ -37,6 +37,7 @@ class ProjectionTangent(ParticleTangent):
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
         self._v_end_dot = self._v_new_dot if solver.following is None else solver.vectors()
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
+        self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
 
@@ -46,7 +47,7 @@ class ProjectionTangent(ParticleTangent):
         context = solver.context(parameters)
         self.sort(context, state_dot)
         known = (*self.dot.named, self._around, solver.around)
-        context.launch(kernels.surroundings.tangent, *known, solver.relaxed)
+        context.launch(kernels.surroundings.tangent, *known, solver.relaxed, solver.spaced)
         if self._bodies is not None:
             self._bodies.begin(context, self.dot, solver.around, self._around)
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
@@ -54,9 +55,9 @@ class ProjectionTangent(ParticleTangent):
         steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
         context.launch(kernels.pressure.start.tangent, *known, start, steps)
         self._project(context, known, counts[0])
-        flow = {"v_flow": solver.v_new, "v_flow_dot": self._v_new_dot, "delta_dot": self._delta_dot}
-        flow |= {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
-        context.launch(kernels.shift.tangent, *known, solver.kept, solver.shifted, flow)
+        flow = {"A": solver.last_gradient(counts[0]), "A_dot": self._A_dot}
+        pull = {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
+        context.launch(kernels.shift.tangent, *known, solver.spaced, flow, pull, delta_dot=self._delta_dot)
         moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "delta_dot": self._delta_dot}
         begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
         context.launch(kernels.moving.tangent, *known, moved, begun)
@@ -72,7 +73,7 @@ class ProjectionTangent(ParticleTangent):
         ends = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "x_now_dot": self._x_now_dot}
         if solver.following is not None:
             ends |= {"x_now": solver.repaired[counts[1]]["x_now"], "v_end_dot": self._v_end_dot}
-            context.launch(solver.following.tangent, *known, solver.kept, solver.shifted, ends)
+            context.launch(solver.following.tangent, *known, flow, ends)
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **{IMPULSE: self._k_dot})
 
     def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
@@ -90,12 +91,13 @@ class ProjectionTangent(ParticleTangent):
             at = solver.iterates[k]
             change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
             self._pull_along(context, known, at["y"], self._y_dot, u=at["u"], u_dot=self._u_dot)
-            new = {"k_out_dot": self._k_dot, "y_out_dot": self._y_dot, "beta": solver.momenta[k]}
+            new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
             drift = {}
             if self._bodies is not None:
                 drift_dot = self._around["drift_dot"]
                 drift = {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
-            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift)
+            beta = solver.momenta[k]
+            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift, beta=beta)
         k = solver.iterates[iterations]["k"]
         if self._bodies is not None:
             self._bodies.settle(context, self.dot, k, self._k_dot)
@@ -118,10 +120,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         super().__init__(solver, steps)
         self._solver: ProjectionSteps = solver
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
-        self._kept = named({name: wp.zeros_like(array) for name, array in solver.kept.items()}, "bar")
         self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
-        if solver.following is not None:
-            self._A_bar = wp.zeros_like(solver.kept["A"])
+        self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         pull = solver.new_arrays(T=solver.pull.dtype, S=solver.pull.dtype)
         self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
@@ -147,6 +147,10 @@ class ProjectionAdjoint(ParticleAdjoint):
         """That of the replayed step after all iterations."""
         return self._solver.iterates[counts[0]]["k"]
 
+    def _last_gradient(self, counts: Counts) -> wp.array:
+        """A of its last iteration."""
+        return self._solver.last_gradient(counts[0])
+
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
         """From the adjoint of the result to those of the last positions, velocities and k."""
         solver, context = self._solver, self._solver.context(parameters)
@@ -158,7 +162,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         }
         new = {"x": self._x_now_bar, "v": self._v_new_bar, "m": self._m_unused}
         context.launch(solver.integration.sort, scene, new)
-        for array in (*self.bar.fields.arrays(), *self._around.values(), self._x_moved_bar, self._c_bar, self._y_bar):
+        own = (self._x_moved_bar, self._c_bar, self._y_bar, self._A_bar)
+        for array in (*self.bar.fields.arrays(), *self._around.values(), *own):
             array.zero_()
         wp.copy(self._k_bar, self.carried_bar[IMPULSE])
         if self._bodies is not None:
@@ -170,20 +175,16 @@ class ProjectionAdjoint(ParticleAdjoint):
         """From there to the adjoint of the state."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
+        flow = {"A": self._last_gradient(counts), "A_bar": self._A_bar}
         if solver.following is not None:
             ends = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_now_bar": self._x_now_bar}
-            ends |= {"x_now": solver.repaired[counts[1]]["x_now"], "A_bar": self._A_bar}
-            context.launch(solver.following.adjoint, *known, solver.kept, ends)
+            ends |= {"x_now": solver.repaired[counts[1]]["x_now"]}
+            context.launch(solver.following.adjoint, *known, flow, ends)
         self._mend(context, known, counts[1])
         moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
         context.launch(kernels.moving.adjoint, *known, moved)
-        flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "delta_bar": self._x_moved_bar}
-        flow |= {"k": self._last_k(counts), "k_bar": self._k_bar}
-        own, sums = kernels.shift.adjoint
-        context.launch(own, *known, self._kept, solver.kept, solver.shifted, flow)
-        if solver.following is not None:
-            add(self._A_bar, self._kept["A_bar"])
-        context.launch(sums, *known, self._kept, solver.kept, solver.shifted, flow)
+        pull = {"k": self._last_k(counts), "k_bar": self._k_bar}
+        context.launch(kernels.shift.adjoint, *known, solver.spaced, flow, pull, delta_bar=self._x_moved_bar)
         self._project(context, known, counts[0])
         start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)
@@ -191,7 +192,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.finish(context, self.bar, solver.around, self._around)
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
-            context.launch(kernel, *known, solver.relaxed)
+            context.launch(kernel, *known, solver.relaxed, solver.spaced)
         self.bar.solids.add(context.launch, partial(beside_solid_kernel, solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
@@ -220,7 +221,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         self._from_velocities(context, known, solver.iterates[iterations]["k"])
         for k in reversed(range(iterations)):
-            self._back(context, known, solver.iterates[k], solver.momenta[k])
+            self._back(context, known, solver.iterates[k], solver.momenta[k], moves=k == iterations - 1)
 
     def _from_velocities(self, context: StepContext, known: tuple[Named, ...], k: wp.array) -> None:
         """Of the new velocities, to the adjoints of v* and of the last k."""
@@ -232,13 +233,20 @@ class ProjectionAdjoint(ParticleAdjoint):
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, k, self._k_bar)
 
-    def _back(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float) -> None:
-        """Of one iteration, from those of k' and y' to those of k and y, and of v*."""
-        solver, (clamp, divergence) = self._solver, self._solver.kernels.pressure.update.adjoint
+    def _back(
+        self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
+    ) -> None:
+        """Of one iteration, from those of k' and y' to those of k and y, and of v*. Its A ``moves`` particles, or only
+        has a divergence."""
+        solver, pressure = self._solver, self._solver.kernels.pressure
+        clamp, divergence, whole = pressure.update.adjoint
         steps = {"f": self._f, "T": self._pull, "S": self._push}
         steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
         context.launch(clamp, *known, at, solver.relaxed, steps, **drift, beta=beta)
+        if moves:
+            context.launch(pressure.whole_adjoint, *known, steps, A_bar=self._A_bar)
+            divergence, steps = whole, {**steps, "S": self._A_bar}
         context.launch(divergence, *known, at, steps, v_star=solver.v_star)
         context.launch(solver.kernels.velocity.velocity.adjoint, *known, at, steps)
         if self._bodies is not None:

@@ -31,6 +31,7 @@ from cortado.solvers.projection.pressure import pressure_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
+from cortado.solvers.projection.velocity_gradient import velocity_gradient_kernels
 from cortado.solvers.solver import Counts
 from cortado.sph.carried import Carried
 from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
@@ -59,7 +60,7 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, packed = neighbourhood_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
-    divergence, clamp = projection_sums(discretisation).divergence, pressure_functions(precision)
+    gradient, clamp = projection_sums(discretisation).velocity_gradient, pressure_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, "fixed_point")
     used = ("L", "gamma", "drift", "a", "weights")
@@ -83,13 +84,13 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def linearise(
-        s: neighbourhood,
+        particles: int,
         omega: real,
         time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
         n: wp.array(dtype=real),
         of: seen,
         u: wp.array(dtype=vector),
+        A: wp.array(dtype=matrix),
         y: wp.array(dtype=real),
         k_bar: wp.array(dtype=real),
         # out
@@ -99,13 +100,10 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         w: wp.array(dtype=real),
         r: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid() // LANES
-        total = divergence(i, x, u, of.L, s)
-        if lane() > 0:
-            return
+        i = wp.tid()
         a = of.a[i]
-        D = total + wp.dot(of.gamma[i], u[i]) - of.drift[i]
-        b = wanted(n[i], of.weights[i][1], time_step[i // s.particles])
+        D = wp.ddot(of.L[i], A[i]) + wp.dot(of.gamma[i], u[i]) - of.drift[i]
+        b = wanted(n[i], of.weights[i][1], time_step[i // particles])
         per = omega / a
         rise, fall = parts(y[i] + per * (D - b), y[i] + per * D)
         c = rise + fall * of.weights[i][0]
@@ -133,9 +131,10 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     ):
         """``u`` is -D^T y / m."""
         i = s.first + wp.tid() // LANES
-        total = divergence(i, x, u, of.L, s)
+        row_x, row_y, row_z = gradient(i, x, u, s)
         if lane() > 0:
             return
+        total = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z))
         found = rest[i] * p[i] - root[i] * (total + wp.dot(of.gamma[i], u[i]))
         product[i] = found / w[i]
         share[i] = p[i] * found
@@ -170,6 +169,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         super().__init__(solver, steps)
         layout, precision = solver.layout, solver.layout.precision
         self._own = fixed_point_kernels(solver.discretisation)
+        self._gradient = velocity_gradient_kernels(solver.discretisation, solver.system.walled.dimension)
         self._after = layout.state(solver.carried_fields)
         """k after the step that comes next, in the scene's order."""
         self._end = Carried(solver.carried_fields, layout)
@@ -191,6 +191,8 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._root.fill_(1.0)
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)
         wp.copy(at["k"], self._end[IMPULSE])
+        solver.settle(context, 0)
+        context.launch(self._gradient.forward, v_flow=solver.v_new, A=at["A"])
         solver.move(context, 0)
         for k in range(repairs):
             solver.mend(context, k, k, k + 1)
@@ -199,12 +201,17 @@ class FixedPointAdjoint(ProjectionAdjoint):
     def _last_k(self, counts: Counts) -> wp.array:
         return self._end[IMPULSE]
 
+    def _last_gradient(self, counts: Counts) -> wp.array:
+        return self._solver.iterates[0]["A"]
+
     def _pull_by(self, context: StepContext, p: wp.array, y: wp.array, T: wp.array) -> None:
         context.launch(self._own.pull, self._solver.around, p=p, root=self._root, y=y, T=T)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """Of the new velocities and of the fixed point, to the adjoint of v*."""
         solver, k = self._solver, self._end[IMPULSE]
+        flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "A_bar": self._A_bar}
+        context.launch(self._gradient.adjoint, *known, flow)
         self._from_velocities(context, known, k)
         at = {**solver.iterates[0], "u": solver.v_new, "k": k}
         system = {"root": self._root, "rest": self._rest, "w": self._w}
@@ -219,6 +226,6 @@ class FixedPointAdjoint(ProjectionAdjoint):
 
         self._solution.solve(context, multiply, self._w, self._r, self._q)
         context.launch(self._own.recover, *own, q=self._q, k_bar=self._k_bar, y_bar=self._y_bar)
-        self._back(context, known, at, 0.0)
+        self._back(context, known, at, 0.0, moves=False)
         self._k_bar.zero_()
         self._y_bar.zero_()

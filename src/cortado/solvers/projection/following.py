@@ -3,7 +3,7 @@ Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
-where x_K are the positions after the last repair, and A and M those of `cortado.solvers.projection.shifting`.
+where x_K are the positions after the last repair, and A is that of the last iteration of the pressure.
 """
 
 from functools import cache
@@ -13,11 +13,9 @@ import warp as wp
 
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
-from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.solvers.projection.effects import effect_functions
-from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import matrix_type
 
 
@@ -45,18 +43,15 @@ def change_functions(precision: Precision, dimension: int, module: Any) -> tuple
 
 @cache
 def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of v'; that of the adjoint leaves the adjoint of A to those of the shift."""
+    """The kernels of v'."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, crowding_tangent = neighbourhood_type(precision), projection_sums(discretisation).crowding_tangent
     topic = f"projection_following_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     change = change_functions(precision, dimension, module)[0]
     along = change_functions(precision, dimension, tangent_module)[1]
     back = change_functions(precision, dimension, adjoint_module)[1]
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=module)
     def follow(
@@ -76,8 +71,7 @@ def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def follow_tangent(
-        s: neighbourhood,
-        nearest: real,
+        particles: int,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -85,16 +79,13 @@ def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         A: wp.array(dtype=matrix),
         x_now: wp.array(dtype=vector),
         v_new: wp.array(dtype=vector),
-        dot: bundle(x=vector, x_now=vector, v_new=vector, M=matrix),
+        dot: bundle(x=vector, x_now=vector, v_new=vector, M=matrix, A=matrix),
         # out
         v_end_dot: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, _crowd_dot = crowding_tangent(i, x, dot.x, v_new, dot.v_new, nearest, s)
-        if lane() > 0:
-            return
-        member = i // s.particles
-        dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
+        i = wp.tid()
+        member = i // particles
+        dt = time_step[member]
         way = x_now[i] - x[i] - dt * v_new[i]
         way_dot = dot.x_now[i] - dot.x[i] - dt * dot.v_new[i] - time_step_dot[member] * v_new[i]
         total = dot.v_new[i]
@@ -103,7 +94,7 @@ def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels
             unit = vector()
             unit[k] = real(1.0)
             by_A, by_M, by_way = along(A[i], M[i], way, unit)
-            total += (wp.ddot(by_A, A_dot) + wp.ddot(by_M, dot.M[i]) + wp.dot(by_way, way_dot)) * unit
+            total += (wp.ddot(by_A, dot.A[i]) + wp.ddot(by_M, dot.M[i]) + wp.dot(by_way, way_dot)) * unit
         v_end_dot[i] = total
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
@@ -118,15 +109,13 @@ def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         # in and out: v_new_bar is at first the adjoint of v'
         v_new_bar: wp.array(dtype=vector),
         x_now_bar: wp.array(dtype=vector),
-        bar: bundle(x=vector, time_step=real, M=matrix),
-        # out
-        A_bar: wp.array(dtype=matrix),
+        bar: bundle(x=vector, time_step=real, M=matrix, A=matrix),
     ):
         i = wp.tid()
         dt, v_bar = time_step[i // particles], v_new_bar[i]
         way = x_now[i] - x[i] - dt * v_new[i]
         by_A, by_M, by_way = back(A[i], M[i], way, v_bar)
-        A_bar[i] = by_A
+        bar.A[i] = bar.A[i] + by_A
         v_new_bar[i] = v_bar - dt * by_way
         x_now_bar[i] = x_now_bar[i] + by_way
         bar.M[i] = bar.M[i] + by_M

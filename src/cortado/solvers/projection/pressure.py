@@ -2,7 +2,7 @@
 
 With k = dt p, the divergence D, in which walls that move have velocities v_b, and the transpose, which is the force,
 
-    (D v)_i = L_i : sum_j g_ij v_ij^T + gamma_i . v_i - sum_b gamma_ib . v_b,
+    (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
 an iteration from y, an extrapolation of k (Nesterov 1983), is
@@ -15,6 +15,7 @@ that of the step before. Tension is let through by sigma, where particles are su
 maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -29,7 +30,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
-from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
+from cortado.sph.moment_functions import matrix_type, symmetric
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,10 @@ class PressureKernels:
     start: Kernels
     """The first k of a step."""
     update: Kernels
-    """k' and y'; its adjoint are two kernels, that of the clamp and that of D."""
+    """k' and y'; its adjoint are three kernels, that of the clamp, and that of D without and with an adjoint of A from
+    elsewhere."""
+    whole_adjoint: wp.Kernel
+    """Adds to the adjoint of A what that of D gives it."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    packed, matrix, whole = symmetric(precision), matrix_type(precision), moment_functions(precision, dimension).change
-    six, pack, times = packed.kind, packed.pack, packed.times
-    divergence, divergence_tangent = sums.divergence, sums.divergence_tangent
-    divergence_back = sums.divergence_back
+    packed, matrix = symmetric(precision), matrix_type(precision)
+    six, pack = packed.kind, packed.pack
+    gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -99,7 +102,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "a", "weights")}
     seen = bundle(**own)
     bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
-    iterate = bundle(u=vector, d=real, y=real, k=real)
+    iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
     clamp, LANES = pressure_functions(precision), discretisation.lanes
     wanted, parts = clamp.wanted, clamp.parts
     lane = lane_functions(precision, LANES).lane
@@ -167,14 +170,14 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         T: wp.array(dtype=six),
         error: wp.array(dtype=pair_of),
     ):
-        """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). The
-        divergence is written to ``at``; T is y' L."""
+        """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). A and the
+        divergence are written to ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
-        total = divergence(i, x, at.u, of.L, s)
+        row_x, row_y, row_z = gradient(i, x, at.u, s)
         if lane() > 0:
             return
-        dt = time_step[i // s.particles]
-        D = total + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
+        dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
+        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
         b = wanted(n[i], of.weights[i][1], dt)
         per = omega / of.a[i]
         up = at.y[i] + per * (D - b)
@@ -189,6 +192,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
             left = of.weights[i][0] * D
         elif not (up <= real(0.0)):  # NaN, which must not be hidden
             new = up
+        at.A[i] = A
         at.d[i] = D
         later = new + beta * (new - at.k[i])  # before k, which may be the same array
         k_out[i] = new
@@ -211,16 +215,19 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         at: iterate,
         dot: bundle(u=vector, y=real, k=real, **own),
         # out
+        A_dot: wp.array(dtype=matrix),
         k_out_dot: wp.array(dtype=real),
         y_out_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        total = divergence_tangent(i, x, x_dot, at.u, dot.u, of.L, dot.L, s)
+        row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
         if lane() > 0:
             return
-        member = i // s.particles
+        member, change_of_A = i // s.particles, wp.matrix_from_rows(row_x, row_y, row_z)
         dt = time_step[member]
-        D_dot = total + wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i]) - dot.drift[i]
+        D_dot = wp.ddot(of.L[i], change_of_A) + wp.ddot(dot.L[i], at.A[i]) - dot.drift[i]
+        D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        A_dot[i] = change_of_A
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
         b_dot = -b * time_step_dot[member] / dt
@@ -281,35 +288,58 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         T[i] = at.y[i] * pack(of.L[i])
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def divergence_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        v_star: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
-        g: wp.array(dtype=vector),
-        of: seen,
+    def whole_adjoint(
+        L: wp.array(dtype=matrix),
         d_bar: wp.array(dtype=real),
-        S: wp.array(dtype=six),
         # in and out
-        bar: bars,
-        # out
-        f: wp.array(dtype=vector),
+        A_bar: wp.array(dtype=matrix),
     ):
-        """From that of D to f = -u_bar / m, and to that of v*, of which u = v* - ... is made."""
-        i = s.first + wp.tid() // LANES
-        u_part, x_part, diagonal, others = divergence_back(i, x, u, S, s)
-        if lane() > 0:
-            return
-        u_bar = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
-        bar.L[i] = bar.L[i] + d_bar[i] * whole(diagonal, others)
-        bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
-        bar.x[i] = bar.x[i] + x_part
-        bar.v[i] = bar.v[i] + u_bar
-        bar.m[i] = bar.m[i] + wp.dot(u_bar, v_star[i] - u[i]) / m[i]
-        f[i] = -u_bar / m[i]
+        i = wp.tid()
+        A_bar[i] = A_bar[i] + d_bar[i] * L[i]
 
+    def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
+        """From that of D, and of A where it is a whole matrix S, to f = -u_bar / m, and to that of v*, of which
+        u = v* - ... is made."""
+
+        def divergence_adjoint(
+            s: neighbourhood,
+            x: wp.array(dtype=vector),
+            m: wp.array(dtype=real),
+            v_star: wp.array(dtype=vector),
+            g: wp.array(dtype=vector),
+            of: seen,
+            u: wp.array(dtype=vector),
+            A: wp.array(dtype=matrix),
+            d_bar: wp.array(dtype=real),
+            S: wp.array(dtype=kind),
+            # in and out
+            bar: bars,
+            # out
+            f: wp.array(dtype=vector),
+        ):
+            i = s.first + wp.tid() // LANES
+            u_part, x_part = back(i, x, u, S, s)
+            if lane() > 0:
+                return
+            u_bar = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
+            bar.L[i] = bar.L[i] + (real(0.5) * d_bar[i]) * (A[i] + wp.transpose(A[i]))
+            bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
+            bar.x[i] = bar.x[i] + x_part
+            bar.v[i] = bar.v[i] + u_bar
+            bar.m[i] = bar.m[i] + wp.dot(u_bar, v_star[i] - u[i]) / m[i]
+            f[i] = -u_bar / m[i]
+
+        divergence_adjoint.__qualname__ = f"pressure_kernels.<locals>.{name}"
+        return wp.kernel(module=adjoint_module, enable_backward=False)(divergence_adjoint)
+
+    @wp.func
+    def whole_times(A: matrix, v: vector) -> vector:
+        return A * v
+
+    even = divergence_adjoint_of("divergence_adjoint", sums.divergence_back, six, packed.times)
+    uneven = divergence_adjoint_of("divergence_adjoint_whole", sums.velocity_gradient_back, matrix, whole_times)
     return PressureKernels(
         Kernels(start, start_tangent, start_adjoint),
-        Kernels(update, update_tangent, (clamp_adjoint, divergence_adjoint)),
+        Kernels(update, update_tangent, (clamp_adjoint, even, uneven)),
+        whole_adjoint,
     )

@@ -19,11 +19,9 @@ import warp as wp
 
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
-from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
 from cortado.solvers.projection.effects import effect_functions, weights_type
-from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type
 
@@ -48,7 +46,7 @@ class ShiftFunctions:
     """Warp functions of one particle."""
 
     shift: Any
-    """delta of A, the sum of g_ij in grad C, M, g, gamma, the weights, k = dt p, m, dt and s."""
+    """delta of A, the crowding, which is the sum in grad C, M, g, gamma, the weights, k = dt p, m, dt and s."""
     back: Any
     """For an adjoint of delta, those of all but s."""
 
@@ -128,114 +126,90 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
 
 @cache
 def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of delta; the adjoint are two, that of a particle's own and that of its sums."""
+    """The kernels of delta."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood = neighbourhood_type(precision)
-    sums = projection_sums(discretisation)
-    crowding, crowding_tangent, crowding_back = sums.crowding, sums.crowding_tangent, sums.crowding_back
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     shift_of = shift_functions(precision, dimension, module).shift
     along = shift_functions(precision, dimension, tangent_module).back
     back = shift_functions(precision, dimension, adjoint_module).back
-    own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "gamma", "weights")}
-    seen, bars = bundle(**own), bundle(time_step=real, k=real, m=real, **own)
-    kept = bundle(A=matrix, crowd=vector)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "crowd", "gamma", "weights")}
+    seen = bundle(**own)
 
     @wp.kernel(module=module)
     def shift(
-        s: neighbourhood,
-        nearest: real,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        k: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: seen,
-        # out
-        kept: kept,
-        delta: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, crowd = crowding(i, x, v_flow, nearest, s)
-        if lane() > 0:
-            return
-        dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
-        kept.A[i] = A
-        kept.crowd[i] = crowd
-        delta[i] = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i], k[i], m[i], dt, spacing)
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def shift_tangent(
-        s: neighbourhood,
-        nearest: real,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        k: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: seen,
-        kept: kept,
-        dot: bundle(x=vector, v_flow=vector, k=real, m=real, **own),
-        # out
-        delta_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, crowd_dot = crowding_tangent(i, x, dot.x, v_flow, dot.v_flow, nearest, s)
-        if lane() > 0:
-            return
-        member = i // s.particles
-        dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
-        total = vector()
-        count = int(3)  # not a number: Warp would write the gradient out for each
-        for axis in range(count):
-            unit = vector()
-            unit[axis] = real(1.0)
-            by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
-                kept.A[i],
-                kept.crowd[i],
-                of.M[i],
-                of.g[i],
-                of.gamma[i],
-                of.weights[i],
-                k[i],
-                m[i],
-                dt,
-                spacing,
-                unit,
-            )
-            entry = wp.ddot(by_A, A_dot) + wp.dot(by_crowd, crowd_dot) + wp.ddot(by_M, dot.M[i])
-            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + wp.dot(by_weights, dot.weights[i])
-            total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
-        delta_dot[i] = total
-
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def own_adjoint(
         particles: int,
         spacing: real,
         time_step: wp.array(dtype=real),
         k: wp.array(dtype=real),
         m: wp.array(dtype=real),
         of: seen,
-        kept: kept,
+        A: wp.array(dtype=matrix),
+        # out
+        delta: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        dt = time_step[i // particles]
+        delta[i] = shift_of(A[i], of.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i], k[i], m[i], dt, spacing)
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def shift_tangent(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        k: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        of: seen,
+        A: wp.array(dtype=matrix),
+        dot: bundle(k=real, m=real, A=matrix, **own),
+        # out
+        delta_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        member = i // particles
+        total = vector()
+        count = int(3)  # not a number: Warp would write the gradient out for each
+        for axis in range(count):
+            unit = vector()
+            unit[axis] = real(1.0)
+            by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
+                A[i],
+                of.crowd[i],
+                of.M[i],
+                of.g[i],
+                of.gamma[i],
+                of.weights[i],
+                k[i],
+                m[i],
+                time_step[member],
+                spacing,
+                unit,
+            )
+            entry = wp.ddot(by_A, dot.A[i]) + wp.dot(by_crowd, dot.crowd[i]) + wp.ddot(by_M, dot.M[i])
+            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + wp.dot(by_weights, dot.weights[i])
+            total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
+        delta_dot[i] = total
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def shift_adjoint(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        k: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        of: seen,
+        A: wp.array(dtype=matrix),
         delta_bar: wp.array(dtype=vector),
         # in and out
-        bar: bars,
-        # out
-        A_bar: wp.array(dtype=matrix),
-        crowd_bar: wp.array(dtype=vector),
+        bar: bundle(time_step=real, k=real, m=real, A=matrix, **own),
     ):
         i = wp.tid()
         by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = back(
-            kept.A[i],
-            kept.crowd[i],
+            A[i],
+            of.crowd[i],
             of.M[i],
             of.g[i],
             of.gamma[i],
@@ -246,8 +220,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
             spacing,
             delta_bar[i],
         )
-        A_bar[i] = by_A
-        crowd_bar[i] = by_crowd
+        bar.A[i] = bar.A[i] + by_A
+        bar.crowd[i] = bar.crowd[i] + by_crowd
         bar.M[i] = bar.M[i] + by_M
         bar.g[i] = bar.g[i] + by_g
         bar.gamma[i] = bar.gamma[i] + by_gamma
@@ -256,23 +230,4 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         bar.m[i] = bar.m[i] + by_m
         bar.time_step[i] = bar.time_step[i] + by_dt
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def sums_adjoint(
-        s: neighbourhood,
-        nearest: real,
-        x: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        A_bar: wp.array(dtype=matrix),
-        crowd_bar: wp.array(dtype=vector),
-        # in and out
-        v_flow_bar: wp.array(dtype=vector),
-        x_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        v_part, x_part = crowding_back(i, x, v_flow, A_bar, crowd_bar, nearest, s)
-        if lane() > 0:
-            return
-        v_flow_bar[i] = v_flow_bar[i] + v_part
-        x_bar[i] = x_bar[i] + x_part
-
-    return Kernels(shift, shift_tangent, (own_adjoint, sums_adjoint))
+    return Kernels(shift, shift_tangent, shift_adjoint)

@@ -33,6 +33,11 @@ from cortado.sph.parts import StepContext
 
 IMPULSE = "pressure_impulse"
 """The name of k = dt p in a state."""
+WARM = 5.0
+"""t of the first momentum. Nesterov's method begins with 1; here the first k is that of the step before, as if there
+had been iterations, and two with the momentum of later ones do as much as four from 1. From step to step errors shrink
+where iterations leave between -1/3 and 1 of them: here they leave -0.19 at least, whatever their number, up to 1.33
+times the stiffest wave of the lattice, and two of them up to 1.6 times."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +83,13 @@ class ProjectionSteps(ParticleSolver):
         self.around = self.new_arrays(**entries(system.layout.precision))
         """Of the neighbourhoods, see `cortado.solvers.projection.surroundings`."""
         precision = self.layout.precision
-        matrix, real, vector = matrix_type(precision), precision.real, precision.vector
+        real, vector = precision.real, precision.vector
         self.pull = self.new_arrays(T=symmetric(precision).kind)["T"]
         """y L of the present iteration."""
-        self.kept = self.new_arrays(A=matrix, crowd=vector)
-        """Sums of the shift."""
-        kinds = {"u": vector, "d": real, "y": real, "k": real}
+        kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real}
         self.iterates = [self.new_arrays(**self._iterate_kinds)]
-        """u = v* - D^T y / m, the divergence of u, y and k before each iteration; the last has y = k of all of them."""
+        """u = v* - D^T y / m, A and the divergence of u, y and k before each iteration; the last has y = k of all."""
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
         self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
@@ -119,14 +122,15 @@ class ProjectionSteps(ParticleSolver):
         return {"omega": self.constants.relaxation, "least": self.constants.least_diagonal}
 
     @cached_property
-    def shifted(self) -> dict[str, float]:
-        """Constants of the shift, as kernels call them."""
-        return {"nearest": self.constants.nearest_weight, "spacing": self.constants.spacing}
+    def spaced(self) -> dict[str, float]:
+        """Constants of the crowding and of the shift, as kernels call them."""
+        return {"per_nearest": 1.0 / self.constants.nearest_weight, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
         context = self.begin(state, parameters)
         projection, repair = self.loops
         projection.run(lambda k: self.iterate(context, k, 0, 0))
+        self.settle(context, 0)
         self.move(context, 0)
         repair.run(lambda k: self.mend(context, k, 0, 0))
         self._finish(context, 0, 0, new_state)
@@ -145,6 +149,7 @@ class ProjectionSteps(ParticleSolver):
         context = self.begin(state, parameters)
         for k in range(iterations):
             self.iterate(context, k, k, k + 1)
+        self.settle(context, iterations)
         self.move(context, iterations)
         for k in range(repairs):
             self.mend(context, k, k, k + 1)
@@ -167,7 +172,7 @@ class ProjectionSteps(ParticleSolver):
     def begin(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first one."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
-        context.launch(kernels.surroundings.forward, self.around, self.relaxed)
+        context.launch(kernels.surroundings.forward, self.around, self.relaxed, self.spaced)
         if self.bodies is not None:
             self.bodies.begin(context, self.around)
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
@@ -186,16 +191,24 @@ class ProjectionSteps(ParticleSolver):
             out["drift"] = self.bodies.drifted(context, self.around["drift"], at["y"])
         context.launch(kernels.pressure.update.forward, out, self.around, at, self.relaxed, beta=self.momenta[k])
 
-    def move(self, context: StepContext, last: int) -> None:
-        """The new velocities, by the k of a slot, and the positions that they and the shift lead to."""
-        kernels, at = self.kernels, {"y": self.iterates[last]["y"], "T": self.pull}
+    def settle(self, context: StepContext, last: int) -> None:
+        """The new velocities, by the k of a slot."""
+        at = {"y": self.iterates[last]["y"], "T": self.pull}
         if self.bodies is not None:
             self.bodies.settle(context, at["y"])
-        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
-        flow, first = {"v_flow": self.v_new, "k": self.iterates[last]["k"], "delta": self.delta}, self.repaired[0]
-        context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, flow)
+        context.launch(self.kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
+
+    def move(self, context: StepContext, last: int) -> None:
+        """The positions that the new velocities and the shift lead to, by the k of a slot."""
+        kernels, first = self.kernels, self.repaired[0]
+        flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
+        context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
         moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
+
+    def last_gradient(self, slot: int) -> wp.array:
+        """A of the last iteration, whose result is in a slot."""
+        return self.iterates[max(slot - 1, 0)]["A"]
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Repair k, from the positions of one slot to those of another."""
@@ -210,14 +223,14 @@ class ProjectionSteps(ParticleSolver):
         ends, x_now = {IMPULSE: self.iterates[iterations]["k"]}, self.repaired[repairs]["x_now"]
         if self.following is not None:
             moved = {"x_now": x_now, "v_new": self.v_new, "v_end": self.v_end}
-            context.launch(self.following.forward, self.around, self.kept, moved)
+            context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
         self.unsort(context, x_now, self.v_end, new_state, **ends)
 
 
 def momenta(iterations: int) -> list[float]:
-    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 1; 0 in the
+    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 5; 0 in the
     last, so that y is k at the end."""
-    found, t = [], 1.0
+    found, t = [], WARM
     for _ in range(iterations):
         later = 0.5 * (1.0 + (1.0 + 4.0 * t * t) ** 0.5)
         found.append((t - 1.0) / later)

@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.arithmetic import arithmetic
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum
@@ -29,8 +30,8 @@ class ProjectionSums:
     """Warp functions. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
 
     moments: Any
-    """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j and g = sum g_ij, with
-    h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2."""
+    """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij and the crowding sum (1 + R q / (1 + q / 4))
+    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``."""
     moments_tangent: Any
     moments_back: Any
     """What adjoints of the moments give to x and m."""
@@ -39,23 +40,18 @@ class ProjectionSums:
     force_tangent: Any
     force_back: Any
     """For adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and what x is given."""
-    divergence: Any
-    """L_i : sum_j v_ij g_ij^T"""
-    divergence_tangent: Any
+    velocity_gradient: Any
+    """The rows of A = sum v_ij g_ij^T, which lacks M^-1 to be the gradient."""
+    velocity_gradient_tangent: Any
+    velocity_gradient_back: Any
+    """For an adjoint of A, what v is given but for A_bar_i g_i, and what x is."""
     divergence_back: Any
-    """For an adjoint d of the divergence and S = d L: what v is given but for S_i g_i, what x is, and the symmetric
-    part of sum v_ij g_ij^T."""
+    """The same where that adjoint is symmetric, S = d L for an adjoint d of the divergence L : A."""
     push: Any
     """sum (c_i + c_j) g_ij"""
     push_tangent: Any
     push_back: Any
     """For adjoints f of the push: sum g_ij . f_ij, and what x is given."""
-    crowding: Any
-    """The rows of sum v_ij g_ij^T, and sum (1 + R q / (1 + q / 4)) g_ij with q = (W_ij / W(s))^4, for V W(s)
-    ``nearest``."""
-    crowding_tangent: Any
-    crowding_back: Any
-    """For adjoints A of the first, as matrices, and of the second: what v and x are given."""
 
 
 @cache
@@ -67,6 +63,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     packed, cross_terms = symmetric(discretisation.precision), cross_terms_function(discretisation.precision)
     six, times = packed.kind, packed.times
     crowded, unequal = wp.constant(real(CROWDED)), wp.constant(real(UNEQUAL))
+    reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
 
     @wp.func
@@ -77,37 +74,62 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     @wp.func
     def mobility(m_i: real, m_j: real) -> real:
         """h_ij / m_j"""
-        r = (m_i - m_j) / (m_i + m_j)
-        return (real(1.0) + unequal * r * r) / m_j
+        r = (m_i - m_j) * reciprocal(m_i + m_j)
+        return (real(1.0) + unequal * r * r) * reciprocal(m_j)
 
     @wp.func
     def slope_of_h(m_i: real, m_j: real) -> real:
         """The derivative of h_ij by m_i."""
-        both = m_i + m_j
-        return real(4.0) * unequal * (m_i - m_j) * m_j / (both * both * both)
+        per_both = reciprocal(m_i + m_j)
+        return real(4.0) * unequal * (m_i - m_j) * m_j * per_both * per_both * per_both
+
+    @wp.func
+    def closeness(near: real) -> real:
+        """1 + R q / (1 + q / 4) with q = near^4."""
+        q = near * near * near * near
+        return real(1.0) + crowded * q * reciprocal(real(1.0) + real(0.25) * q)
+
+    @wp.func
+    def closeness_derivative(near: real) -> real:
+        q = near * near * near * near
+        part = real(1.0) + real(0.25) * q
+        return real(4.0) * crowded * near * near * near * reciprocal(part * part)
 
     @fluid_sum(discretisation)
-    def moments(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> tuple[vector, vector, vector, vector, vector]:
+    def moments(
+        x_ij: vector, m_i: real, m_j: real, per_nearest: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         q = mobility(m_i, m_j) * g
-        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g
+        crowd = closeness(s.volume * weight(x_ij, s) * per_nearest) * g
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd
 
     @tangent_of(moments)
     @fluid_sum(discretisation, ahead=False)
     def moments_tangent(
-        x_ij: vector, x_dot_ij: vector, m_i: real, m_j: real, m_dot_i: real, m_dot_j: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector]:
+        x_ij: vector,
+        x_dot_ij: vector,
+        m_i: real,
+        m_j: real,
+        m_dot_i: real,
+        m_dot_j: real,
+        per_nearest: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
         per = mobility(m_i, m_j)
         h_dot = slope_of_h(m_i, m_j) * m_dot_i + slope_of_h(m_j, m_i) * m_dot_j
         q, q_dot = per * g, per * g_dot + ((h_dot - per * m_dot_j) / m_j) * g
+        near = s.volume * weight(x_ij, s) * per_nearest
+        more = closeness_derivative(near) * wp.dot(g, x_dot_ij) * per_nearest
         return (
             -wp.cw_mul(g_dot, x_ij) - wp.cw_mul(g, x_dot_ij),
             -cross_terms(g_dot, x_ij) - cross_terms(g, x_dot_ij),
             wp.cw_mul(q_dot, g) + wp.cw_mul(q, g_dot),
             cross_terms(q_dot, g) + cross_terms(q, g_dot),
             g_dot,
+            closeness(near) * g_dot + more * g,
         )
 
     @fluid_sum(discretisation)
@@ -120,6 +142,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         Q_bar_i: matrix,
         Q_bar_j: matrix,
         g_bar_ij: vector,
+        crowd_bar_ij: vector,
+        per_nearest: real,
         s: neighbourhood,
     ) -> tuple[vector, real]:
         """M_bar and Q_bar are symmetric."""
@@ -127,9 +151,12 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         stretch = (M_bar_i + M_bar_j) * x_ij
         from_i, from_j, per = Q_bar_i * g, Q_bar_j * g, mobility(m_j, m_i)
         both = mobility(m_i, m_j) * from_i + per * from_j
-        x_part = hessian_product(x_ij, real(2.0) * both + g_bar_ij - stretch, s) - slope(x_ij, s) * stretch
+        near = s.volume * weight(x_ij, s) * per_nearest
+        more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) * per_nearest
+        bent = real(2.0) * both + g_bar_ij + closeness(near) * crowd_bar_ij - stretch
+        x_part = s.volume * (hessian_product(x_ij, bent, s) - slope(x_ij, s) * stretch) + more * g
         h = slope_of_h(m_i, m_j)
-        return s.volume * x_part, wp.dot(g, from_i) * h / m_j + wp.dot(g, from_j) * (h - per) / m_i
+        return x_part, wp.dot(g, from_i) * h * reciprocal(m_j) + wp.dot(g, from_j) * (h - per) * reciprocal(m_i)
 
     @fluid_sum(discretisation)
     def force(x_ij: vector, T_j: six, s: neighbourhood) -> vector:
@@ -147,30 +174,33 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         return wp.cw_mul(f_ij, g), even_terms(f_ij, g), s.volume * hessian_product(x_ij, pulled, s)
 
     @fluid_sum(discretisation)
-    def divergence(x_ij: vector, v_ij: vector, L_i: matrix, s: neighbourhood) -> real:
-        return s.volume * wp.dot(v_ij, L_i * gradient(x_ij, s))
+    def velocity_gradient(x_ij: vector, v_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
 
-    @tangent_of(divergence)
+    @tangent_of(velocity_gradient)
     @fluid_sum(discretisation, ahead=False)
-    def divergence_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        L_i: matrix,
-        L_dot_i: matrix,
-        s: neighbourhood,
-    ) -> real:
-        g, g_dot = gradient(x_ij, s), hessian_product(x_ij, x_dot_ij, s)
-        return s.volume * (wp.dot(v_dot_ij, L_i * g) + wp.dot(v_ij, L_dot_i * g + L_i * g_dot))
+    def velocity_gradient_tangent(
+        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector]:
+        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        return (
+            v_dot_ij[0] * g + v_ij[0] * g_dot,
+            v_dot_ij[1] * g + v_ij[1] * g_dot,
+            v_dot_ij[2] * g + v_ij[2] * g_dot,
+        )
 
     @fluid_sum(discretisation)
-    def divergence_back(
-        x_ij: vector, v_ij: vector, S_i: six, S_j: six, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
-        g = s.volume * gradient(x_ij, s)
-        pushed, moved = times(S_i + S_j, v_ij), wp.cw_mul(v_ij, g)
-        return times(S_j, g), s.volume * hessian_product(x_ij, pushed, s), moved, even_terms(v_ij, g)
+    def velocity_gradient_back(
+        x_ij: vector, v_ij: vector, A_bar_i: matrix, A_bar_j: matrix, s: neighbourhood
+    ) -> tuple[vector, vector]:
+        pulled = wp.transpose(A_bar_i + A_bar_j) * v_ij
+        return A_bar_j * (s.volume * gradient(x_ij, s)), s.volume * hessian_product(x_ij, pulled, s)
+
+    @fluid_sum(discretisation)
+    def divergence_back(x_ij: vector, v_ij: vector, S_i: six, S_j: six, s: neighbourhood) -> tuple[vector, vector]:
+        pulled = times(S_i + S_j, v_ij)
+        return times(S_j, s.volume * gradient(x_ij, s)), s.volume * hessian_product(x_ij, pulled, s)
 
     @fluid_sum(discretisation)
     def push(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
@@ -191,59 +221,9 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
         )
 
-    @wp.func
-    def closeness(near: real) -> real:
-        """1 + R q / (1 + q / 4) with q = near^4."""
-        q = near * near * near * near
-        return real(1.0) + crowded * q / (real(1.0) + real(0.25) * q)
-
-    @wp.func
-    def closeness_derivative(near: real) -> real:
-        q = near * near * near * near
-        part = real(1.0) + real(0.25) * q
-        return real(4.0) * crowded * near * near * near / (part * part)
-
-    @fluid_sum(discretisation)
-    def crowding(x_ij: vector, v_ij: vector, nearest: real, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
-        g = s.volume * gradient(x_ij, s)
-        near = s.volume * weight(x_ij, s) / nearest
-        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, closeness(near) * g
-
-    @tangent_of(crowding)
-    @fluid_sum(discretisation, ahead=False)
-    def crowding_tangent(
-        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, nearest: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
-        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        near = s.volume * weight(x_ij, s) / nearest
-        more = closeness_derivative(near) * wp.dot(g, x_dot_ij) / nearest
-        return (
-            v_dot_ij[0] * g + v_ij[0] * g_dot,
-            v_dot_ij[1] * g + v_ij[1] * g_dot,
-            v_dot_ij[2] * g + v_ij[2] * g_dot,
-            closeness(near) * g_dot + more * g,
-        )
-
-    @fluid_sum(discretisation)
-    def crowding_back(
-        x_ij: vector,
-        v_ij: vector,
-        A_bar_i: matrix,
-        A_bar_j: matrix,
-        crowd_bar_ij: vector,
-        nearest: real,
-        s: neighbourhood,
-    ) -> tuple[vector, vector]:
-        g, both = s.volume * gradient(x_ij, s), A_bar_i + A_bar_j
-        near = s.volume * weight(x_ij, s) / nearest
-        more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) / nearest
-        pulled = wp.transpose(both) * v_ij + closeness(near) * crowd_bar_ij
-        return both * g, s.volume * hessian_product(x_ij, pulled, s) + more * g
-
     return ProjectionSums(
         *(moments, moments_tangent, moments_back),
         *(force, force_tangent, force_back),
-        *(divergence, divergence_tangent, divergence_back),
+        *(velocity_gradient, velocity_gradient_tangent, velocity_gradient_back, divergence_back),
         *(push, push_tangent, push_back),
-        *(crowding, crowding_tangent, crowding_back),
     )

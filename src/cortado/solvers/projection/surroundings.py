@@ -23,7 +23,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
-    return {**own, "L": matrix, "a": real, "weights": weights_type(precision)}
+    return {**own, "L": matrix, "a": real, "crowd": vector, "weights": weights_type(precision)}
 
 
 @cache
@@ -55,6 +55,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def surroundings(
         s: neighbourhood,
         least: real,
+        per_nearest: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -62,7 +63,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of: around,
     ):
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g = moments(i, x, m, s)
+        diagonal, others, square, mixed, g, crowd = moments(i, x, m, per_nearest, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
         if lane() > 0:
             return
@@ -82,6 +83,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.whole_drift[i] = whole_drift
         of.edge[i] = e
         of.L[i] = L
+        of.crowd[i] = crowd
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu)
 
@@ -89,6 +91,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def surroundings_tangent(
         s: neighbourhood,
         least: real,
+        per_nearest: real,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -101,7 +104,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
+        diagonal, others, square, mixed, g_i_dot, crowd_dot = moments_tangent(i, x, x_dot, m, m_dot, per_nearest, s)
         normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         if lane() > 0:
             return
@@ -142,6 +145,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.drift[i] = drift_i_dot
         dot.edge[i] = e_dot
         dot.L[i] = L_dot
+        dot.crowd[i] = crowd_dot
         dot.a[i] = a_dot
         dot.weights[i] = weights_dot
 
@@ -176,6 +180,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def sums_adjoint(
         s: neighbourhood,
+        per_nearest: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -185,7 +190,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, s)
+        x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, bar.crowd, per_nearest, s)
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
         if lane() > 0:
             return
