@@ -153,7 +153,7 @@ class Projection:
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
         c = between(H, 0.8, 0.95) / (1 + (nu / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
-        rate = rate + 60 * c**2 / (c + 0.01) ** 1.5
+        rate = rate + 60 * c**2 / (c + 0.004) ** 1.5
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4
         slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma

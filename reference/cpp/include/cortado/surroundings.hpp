@@ -154,7 +154,7 @@ struct Surroundings {
     }
 };
 
-// How fast a particle is shifted whose pressure p pulls, 60 c^2 / (c + 0.01)^1.5 with c = dt^2 max(-p, 0) / (rho s^2),
+// How fast a particle is shifted whose pressure p pulls, 60 c^2 / (c + 0.004)^1.5 with c = dt^2 max(-p, 0) / (rho s^2),
 // of `pull` = dt p by the weight of low densities in repairs; and its derivative by `pull`.
 template <class Scalar, int D>
 struct Pulled {
@@ -164,7 +164,7 @@ struct Pulled {
         using Real = typename RealOf<Scalar>::type;
         if (!(real_part(pull) < Real(0))) return;
         const Scalar per = -model.time_step / (model.rest_density * model.spacing * model.spacing);
-        const Scalar c = per * pull, weak = hundredths<Scalar>(1), above = c + weak;
+        const Scalar c = per * pull, weak = hundredths<Scalar>(2) / Scalar(5), above = c + weak;
         const Scalar below = above * square_root(above);
         rate = Scalar(60) * c * c / below;
         slope = Scalar(30) * c * (c + Scalar(4) * weak) / (below * above) * per;

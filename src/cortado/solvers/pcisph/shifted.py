@@ -23,7 +23,7 @@ from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity_gradient import velocity_gradient_kernels
 from cortado.solvers.solver import StepAdjoint
 from cortado.sph.integration import integration_module
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -172,6 +172,8 @@ class ShiftAdjoint(PartAdjoint):
         self._shift, self._delta_bar = shift, shift.vectors()
         self._around, self._flow = shift.like_around("_bar"), shift.like_flow("_bar")
         self._unused = shift.like_pull("_bar")
+        six = symmetric(shift.layout.precision).kind
+        self._moments = shift.arrays("_pull", M=six, Q=six)
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         step.launch(self._shift.place_adjoint, x_scene_bar=moved_bar.positions, delta_bar=self._delta_bar)
@@ -185,5 +187,5 @@ class ShiftAdjoint(PartAdjoint):
         step.launch(shift.shift.adjoint, *known, self._flow, shift.flow, delta_bar=self._delta_bar)
         step.launch(shift.gradient.adjoint, *known, self._flow, v_flow=step.fields["v"], v_flow_bar=bar.fields["v"])
         for kernel in shift.surroundings.adjoint:
-            step.launch(kernel, *known)
+            step.launch(kernel, *known, self._moments)
         bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *known)

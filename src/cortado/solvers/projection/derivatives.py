@@ -122,8 +122,10 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
         self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
-        pull = solver.new_arrays(T=solver.pull.dtype, S=solver.pull.dtype)
+        six = solver.pull.dtype
+        pull = solver.new_arrays(T=six, S=six)
         self._pull, self._push = pull["T"], pull["S"]
+        self._moments = solver.new_arrays(M_pull=six, Q_pull=six)
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
@@ -192,7 +194,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._bodies.finish(context, self.bar, solver.around, self._around)
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
-            context.launch(kernel, *known, solver.relaxed, solver.spaced)
+            context.launch(kernel, *known, self._moments, solver.relaxed, solver.spaced)
         self.bar.solids.add(context.launch, partial(beside_solid_kernel, solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)

@@ -2,7 +2,7 @@
 2013), at a rate that follows the velocity gradient and the tension, so that a fluid at rest is not stirred:
 
     delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
-    r = 20 dt |grad v| + 60 c^2 / (c + 0.01)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
+    r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
 with r softly at most 0.5, and |delta| softly at most 0.1 s. Where the pressure pulls, particles clump at the rate of
 sqrt(-p / rho) / s (the tensile instability, Monaghan 2000), and the shift is faster. P takes out the direction
@@ -37,7 +37,7 @@ LEAST = 1e-5
 """e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
 PULLED = 60.0
 """How fast particles are shifted where the pressure pulls."""
-WEAK = 0.01
+WEAK = 0.004
 """Of c, below which a pull counts with its square."""
 
 

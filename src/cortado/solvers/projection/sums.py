@@ -137,19 +137,18 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         x_ij: vector,
         m_i: real,
         m_j: real,
-        M_bar_i: matrix,
-        M_bar_j: matrix,
-        Q_bar_i: matrix,
-        Q_bar_j: matrix,
+        M_bar_i: six,
+        M_bar_j: six,
+        Q_bar_i: six,
+        Q_bar_j: six,
         g_bar_ij: vector,
         crowd_bar_ij: vector,
         per_nearest: real,
         s: neighbourhood,
     ) -> tuple[vector, real]:
-        """M_bar and Q_bar are symmetric."""
         g = s.volume * gradient(x_ij, s)
-        stretch = (M_bar_i + M_bar_j) * x_ij
-        from_i, from_j, per = Q_bar_i * g, Q_bar_j * g, mobility(m_j, m_i)
+        stretch = times(M_bar_i + M_bar_j, x_ij)
+        from_i, from_j, per = times(Q_bar_i, g), times(Q_bar_j, g), mobility(m_j, m_i)
         both = mobility(m_i, m_j) * from_i + per * from_j
         near = s.volume * weight(x_ij, s) * per_nearest
         more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) * per_nearest

@@ -15,7 +15,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.beside import beside_sums, edge_functions
 from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.solvers.projection.sums import projection_sums
-from cortado.sph.moment_functions import matrix_type, moment_functions
+from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
 
 def entries(precision: Precision) -> dict[str, Any]:
@@ -28,7 +28,8 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of the moments of neighbours, and of L, a and the weights that follow from them."""
+    """The kernels of the moments of neighbours, and of L, a and the weights that follow from them. Those of the adjoint
+    hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -38,8 +39,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
-    own = moment_functions(precision, dimension)
-    whole, change = own.whole, own.change
+    own, packed = moment_functions(precision, dimension), symmetric(precision)
+    whole, change, six, pack = own.whole, own.change, packed.kind, packed.pack
     here = effect_functions(precision, dimension, module)
     weights_of, correction_of, diagonal_of = here.weights, here.correction, here.diagonal
     along = effect_functions(precision, dimension, tangent_module).back
@@ -157,6 +158,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         # in and out
         m_bar: wp.array(dtype=real),
         bar: around,
+        # out
+        M_pull: wp.array(dtype=six),
+        Q_pull: wp.array(dtype=six),
     ):
         """Of what follows from the moments: adds to the adjoints of them."""
         i = wp.tid()
@@ -164,8 +168,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
             of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i], least, bar.L[i], bar.a[i], bar.weights[i]
         )
         m_bar[i] = m_bar[i] + m_i_bar
-        bar.M[i] = bar.M[i] + M_bar
-        bar.Q[i] = bar.Q[i] + Q_bar
+        M_pull[i] = pack(bar.M[i] + M_bar)
+        Q_pull[i] = pack(bar.Q[i] + Q_bar)
         bar.g[i] = bar.g[i] + g_bar
         bar.nu[i] = bar.nu[i] + nu_bar
         push_bar, drift_bar, e = bar.gamma[i] + gamma_bar, bar.drift[i], of.edge[i]
@@ -184,13 +188,15 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
+        M_pull: wp.array(dtype=six),
+        Q_pull: wp.array(dtype=six),
         bar: around,
         # in and out
         x_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, bar.crowd, per_nearest, s)
+        x_part, m_part = moments_back(i, x, m, M_pull, Q_pull, bar.g, bar.crowd, per_nearest, s)
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
         if lane() > 0:
             return
