@@ -51,8 +51,8 @@ def test_at_the_fixed_point_it_is_the_exact_gradient(case, bound):
 
 
 def test_after_few_iterations_it_points_the_same_way():
-    """Of fluid that random velocities scatter; with 4 iterations cosines are 0.948, 0.984 and 1.000."""
-    problem = problem_of("plane", 8)
+    """Of fluid that random velocities scatter; with 2 iterations cosines are 0.985, 0.933 and 1.000."""
+    problem = problem_of("plane", 16)
     at = point_of(problem.simulation)
     exact, found = (problem.value_and_gradient(at, one)[1] for one in (gradients.Exact(), ImplicitPressure()))
     for name in at:

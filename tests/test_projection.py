@@ -111,15 +111,15 @@ def test_fluid_that_moves_as_a_whole_resists_a_strain(precision):
     """All its pressures are 0 at first, where the formula of an iteration has a corner that its values have not."""
     jittered = {**plane().discretisation.model_dump(), "jitter": 0.1}
     free = plane(solver=SOLVER, discretisation=jittered, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]})
-    problem = problem_of(lambda: free, steps=6, precision=precision)
+    problem, double = (problem_of(lambda: free, steps=6, precision=name) for name in (precision, "float64"))
     x = problem.simulation.positions
     strain = (x - x.mean(axis=0)) * [1.0, -1.0]
     strain[:, 0] += 0.3 * strain[:, 0]  # and a little that the pressure takes out
     still = {"initial_velocities": np.tile([0.5, 0.25], (len(x), 1))}
-    step = 1e-4 if precision == "float64" else 1e-2
-    ends = [problem.value({"initial_velocities": still["initial_velocities"] + h * strain}) for h in (step, -step)]
+    step = 1e-4  # in float32 differences are rounded off where they are not bent
+    ends = [double.value({"initial_velocities": still["initial_velocities"] + h * strain}) for h in (step, -step)]
     slope = problem.tangent(still, {"initial_velocities": strain})
-    assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.02)
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.002)
     gradient = problem.value_and_gradient(still)[1]["initial_velocities"]
     assert np.sum(gradient * strain) == pytest.approx(slope, rel=1e-4 if precision == "float32" else 1e-11)
 

@@ -169,7 +169,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         )
         m_bar[i] = m_bar[i] + m_i_bar
         M_pull[i] = pack(bar.M[i] + M_bar)
-        Q_pull[i] = pack(bar.Q[i] + Q_bar)
+        Q_pull[i] = pack(Q_bar)
         bar.g[i] = bar.g[i] + g_bar
         bar.nu[i] = bar.nu[i] + nu_bar
         push_bar, drift_bar, e = bar.gamma[i] + gamma_bar, bar.drift[i], of.edge[i]
