@@ -156,6 +156,16 @@ def test_what_a_step_back_launches_is_compiled_ahead(launched):
     assert back and back <= ahead
 
 
+@pytest.mark.parametrize("kind", ["pcisph", "projection"])
+def test_kernels_of_a_module_have_names_of_their_own(kind):
+    """Of two of one name a captured graph on a CPU launches one for both."""
+    simulation = cortado.Simulation(plane(solver={"kind": kind, "time_step": 0.002}))
+    derivative = cortado.gradients.Exact().derivative(simulation.rollout(1))
+    kernels = {*kernels_of(simulation.solver), *kernels_of(derivative)}
+    names = [(kernel.module.name, kernel.key) for kernel in kernels]
+    assert len(names) == len(set(names)) > 15
+
+
 def test_what_is_compiled_meanwhile_is_waited_for_and_not_compiled_again(monkeypatch):
     """Not even where it has not ended when it is asked for."""
     solver, done, wanted = cortado.Simulation(plane()).solver, set(), Event()
