@@ -298,6 +298,7 @@ ELSEWHERE = {
     "implicit_kernels": "of what comes before and after a solve: whole steps in tests/test_implicit_viscosity.py",
     "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
     "velocity_kernels": "the same",
+    "velocity_gradient_kernels": "the same",
     "shift_kernels": "the same",
     "following_kernels": "the same",
     "moving_kernels": "the same",

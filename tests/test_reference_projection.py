@@ -54,8 +54,9 @@ def test_steps_are_those_of_the_twin(make, smoothing):
     twin = Projection(
         *(discrete.kernel, lattice.support, lattice.volume, made.discretisation.spacing),
         *(walls.positions, walls.weights, walls.feet, np.zeros(made.dimension)),
-        iterations=4,
-        repairs=2,
+        iterations=made.solver.iterations,
+        repairs=made.solver.repairs,
+        follow=False,
     )
     given = thrown(simulation)
     run = simulation.run(5, given)

@@ -215,9 +215,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         at: iterate,
         dot: bundle(u=vector, y=real, k=real, **own),
         # out
-        A_dot: wp.array(dtype=matrix),
-        k_out_dot: wp.array(dtype=real),
-        y_out_dot: wp.array(dtype=real),
+        out: bundle(A_dot=matrix, k_out_dot=real, y_out_dot=real),
     ):
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
@@ -227,7 +225,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         dt = time_step[member]
         D_dot = wp.ddot(of.L[i], change_of_A) + wp.ddot(dot.L[i], at.A[i]) - dot.drift[i]
         D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
-        A_dot[i] = change_of_A
+        out.A_dot[i] = change_of_A
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
         b_dot = -b * time_step_dot[member] / dt
@@ -238,10 +236,10 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         down = at.y[i] + per * D
         rise, fall = parts(at.y[i] + per * (D - b), down)
         change = dot.y[i] + per_dot * D + per * D_dot
-        new = rise * (change - per_dot * b - per * b_dot)
-        new += fall * (dot.weights[i][0] * down + of.weights[i][0] * change)
-        y_out_dot[i] = new + beta * (new - dot.k[i])  # before k, which may be the same array
-        k_out_dot[i] = new
+        found = rise * (change - per_dot * b - per * b_dot)
+        found += fall * (dot.weights[i][0] * down + of.weights[i][0] * change)
+        out.y_out_dot[i] = found + beta * (found - dot.k[i])  # before k, which may be the same array
+        out.k_out_dot[i] = found
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def clamp_adjoint(
