@@ -26,8 +26,8 @@ from cortado.device.bundles import bundle
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Parameters, State
+from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.derivatives import ProjectionAdjoint
-from cortado.solvers.projection.pressure import pressure_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
@@ -60,7 +60,7 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, packed = neighbourhood_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
-    gradient, clamp = projection_sums(discretisation).velocity_gradient, pressure_functions(precision)
+    gradient, clamp = projection_sums(discretisation).velocity_gradient, clamp_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, "fixed_point")
     used = ("L", "gamma", "drift", "a", "weights")

@@ -25,8 +25,8 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
@@ -46,46 +46,6 @@ class PressureKernels:
     """Adds to the adjoint of A what that of D gives it."""
 
 
-@dataclass(frozen=True)
-class PressureFunctions:
-    """Warp functions of one particle."""
-
-    wanted: Any
-    """b of n, f and dt."""
-    parts: Any
-    """The parts of two slopes that k' has."""
-
-
-@cache
-def pressure_functions(precision: Precision) -> PressureFunctions:
-    """In a precision."""
-    real = precision.real
-
-    @wp.func
-    def wanted(n: real, full: real, dt: real) -> real:
-        """b"""
-        return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
-
-    @wp.func
-    def parts(up: real, down: real):
-        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or at a corner the mean of both
-        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that
-        there is no corner but in this formula."""
-        rise, fall = real(0.0), real(0.0)
-        if up > real(0.0):
-            rise = real(1.0)
-        elif up == real(0.0):
-            rise = real(0.5)
-        if up <= real(0.0):
-            if down < real(0.0):
-                fall = real(1.0)
-            elif down == real(0.0):
-                fall = real(0.5)
-        return rise, fall
-
-    return PressureFunctions(wanted, parts)
-
-
 @cache
 def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
     """In 2 or 3 dimensions."""
@@ -103,7 +63,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     seen = bundle(**own)
     bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
     iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
-    clamp, LANES = pressure_functions(precision), discretisation.lanes
+    clamp, LANES = clamp_functions(precision), discretisation.lanes
     wanted, parts = clamp.wanted, clamp.parts
     lane = lane_functions(precision, LANES).lane
 
