@@ -81,7 +81,7 @@ def _at(point: np.ndarray, x: np.ndarray, values: np.ndarray, width: float) -> f
 
 
 def cases(device: str) -> dict[str, Callable[[], object]]:
-    """By name; only the cavity runs on the device."""
+    """By name; the cavity and the piston run on the device."""
     found: dict[str, Callable[[], object]] = {}
     for reynolds, across, duration in ((100, 50, 15.0), (400, 50, 50.0), (400, 100, 50.0)):
         for follow, name in ((False, ""), (True, ", velocities follow")):
@@ -107,7 +107,7 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="cases whose names begin so")
-    parser.add_argument("--device", default="cpu", help="of the cavity")
+    parser.add_argument("--device", default="cpu", help="of the cavity and the piston")
     given = parser.parse_args()
     warnings.simplefilter("ignore", CortadoWarning)
     for name, case in cases(given.device).items():
