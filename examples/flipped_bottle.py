@@ -7,8 +7,9 @@ import numpy as np
 
 import cortado
 
-STEPS, TIME_STEP = 200, 0.0025  # s
-WANTED = np.array([0.7, 0.22])  # m, where its middle shall be as it plunges
+# Judged as its foot is in the water: what water does to a slanted bottle after that makes a second minimum.
+STEPS, TIME_STEP = 180, 0.0025  # s
+WANTED = np.array([0.7, 0.24])  # m, where its middle shall be then
 
 outline = np.array([[-0.05, 0.0], [0.05, 0.0], [0.05, 0.14], [0.02, 0.19], [0.02, 0.25]])
 corners = np.concatenate([outline, outline[:1:-1] * [-1.0, 1.0]]) + [0.2, 0.3]
@@ -29,10 +30,10 @@ optimiser = cortado.optimisers.LineSearch(scale={"bottle.velocity": 0.3, "bottle
 found = cortado.optimise(problem, start, optimiser, 4)
 
 for name, throw in (("first throw", start), ("found", found.parameters)):
-    run = simulation.run(STEPS, throw, record_every=20).solids["bottle"]
+    run = simulation.run(STEPS, throw, record_every=36).solids["bottle"]
     place, turn = run.positions[-1], float(np.ravel(run.rotations[-1])[0])
     print(f"{name}: loss {problem.value(throw):.3g} m2, the bottle is at {place} m, turned by {turn:.2f} rad")
 assert found.loss < 0.05 * problem.value(start), "the bottle does not plunge upright where it should"
-run = simulation.run(STEPS, found.parameters, record_every=40)
+run = simulation.run(STEPS, found.parameters, record_every=36)
 pictures = [simulation.picture(run[k], width=400, height=360) for k in (0, 2, 4, 5)]
 cortado.pictures.write_picture("flipped_bottle.png", np.concatenate(pictures, axis=1))

@@ -43,7 +43,7 @@ so_far = np.cumsum(np.eye(BLOCKS)[np.arange(STEPS) * BLOCKS // STEPS], axis=0) *
 turn = Affine(steadily, -2.4 / BLOCKS * so_far)
 aside = Affine(np.zeros((STEPS, 2)), 0.02 * np.einsum("sb,d->sdb", so_far, [1.0, 0.0]))
 # Syrup that still falls is judged too, by which less of it ends beside the glass than by the end alone.
-loss = cortado.losses.Frames(dict.fromkeys(range(350, STEPS + 1, 50), Outside()))
+loss = cortado.losses.Frames(dict.fromkeys(range(400, STEPS + 1, 50), Outside()))
 problem = cortado.Problem(cortado.Simulation(scene), STEPS, loss)
 search = Transformed(problem, {"jug.turn": turn, "jug.displacement": aside})
 optimiser, gradient = cortado.optimisers.LineSearch(), cortado.gradients.AdjointViscosity()
