@@ -32,9 +32,9 @@ def with_kernel(name: str, support: float) -> dict[str, Any]:
     return dam(0.025, (12, 12), discretisation={"spacing": 0.025, "kernel": name, "support": support})
 
 
-def projected(tables: dict[str, Any]) -> dict[str, Any]:
+def projected(tables: dict[str, Any], **solver: Any) -> dict[str, Any]:
     """The same scene by the projection, whose own kernel it has where it names none."""
-    return {**tables, "solver": {"kind": "projection", "time_step": tables["solver"]["time_step"]}}
+    return {**tables, "solver": {"kind": "projection", "time_step": tables["solver"]["time_step"], **solver}}
 
 
 def two_fluids(spacing: float, counts: tuple[int, ...]) -> dict[str, Any]:
@@ -86,6 +86,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "plane-144-wendland-c2-2.6": with_kernel("wendland_c2", 2.6),
     "plane-144-projection-cubic-spline": projected(with_kernel("cubic_spline", 2.0)),
     "plane-paddle-projection": projected(paddled()),
+    "plane-paddle-projection-4-iterations": projected(paddled(), iterations=4),
     "plane-576-projection": projected(dam(0.0125, (24, 24))),
     "space-1000-projection": projected(dam(0.05, (10, 10, 10))),
     "space-8000-projection": projected(dam(0.025, (20, 20, 20))),
