@@ -30,10 +30,10 @@ optimiser = cortado.optimisers.LineSearch(scale={"bottle.velocity": 0.3, "bottle
 found = cortado.optimise(problem, start, optimiser, 4)
 
 for name, throw in (("first throw", start), ("found", found.parameters)):
-    run = simulation.run(STEPS, throw, record_every=36).solids["bottle"]
-    place, turn = run.positions[-1], float(np.ravel(run.rotations[-1])[0])
+    run = simulation.run(STEPS, throw, record_every=36)
+    bottle = run.solids["bottle"]
+    place, turn = bottle.positions[-1], float(np.ravel(bottle.rotations[-1])[0])
     print(f"{name}: loss {problem.value(throw):.3g} m2, the bottle is at {place} m, turned by {turn:.2f} rad")
 assert found.loss < 0.05 * problem.value(start), "the bottle does not plunge upright where it should"
-run = simulation.run(STEPS, found.parameters, record_every=36)
 pictures = [simulation.picture(run[k], width=400, height=360) for k in (0, 2, 4, 5)]
 cortado.pictures.write_picture("flipped_bottle.png", np.concatenate(pictures, axis=1))

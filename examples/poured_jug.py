@@ -42,7 +42,7 @@ steadily = -2.4 / STEPS * np.arange(1, STEPS + 1)  # clockwise
 so_far = np.cumsum(np.eye(BLOCKS)[np.arange(STEPS) * BLOCKS // STEPS], axis=0) * BLOCKS / STEPS
 turn = Affine(steadily, -2.4 / BLOCKS * so_far)
 aside = Affine(np.zeros((STEPS, 2)), 0.02 * np.einsum("sb,d->sdb", so_far, [1.0, 0.0]))
-# Syrup that still falls is judged too, by which less of it ends beside the glass than by the end alone.
+# Syrup that still falls is judged too, but not before a jug can have emptied itself: that would pay for haste.
 loss = cortado.losses.Frames(dict.fromkeys(range(400, STEPS + 1, 50), Outside()))
 problem = cortado.Problem(cortado.Simulation(scene), STEPS, loss)
 search = Transformed(problem, {"jug.turn": turn, "jug.displacement": aside})
