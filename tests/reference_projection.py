@@ -94,7 +94,8 @@ class Projection:
         return W, g, g.sum(1), gamma, nu, M, H, 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
 
     def step(self, x, v_star, before, m, dt):
-        """Positions, velocities and k after the step, from predicted velocities and the k of the step before."""
+        """Positions, velocities, and k with what it adds to velocities, after the step, from predicted velocities and
+        those two of the step before."""
         (n, d), density = x.shape, self.density(x)
         _, g, total, gamma, nu, M, H, inverse = self.around(x)
         B = 1 / (1 + (nu / 0.05) ** 4)
@@ -125,16 +126,17 @@ class Projection:
             return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
 
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
-        k = y = full * before
+        k = y = full * before[0]
+        v = v_star + full[:, None] * before[1]
         t = 5.0
-        for _ in range(self.iterations):
-            u = v_star - force(y) / m[:, None]
-            D = divergence(u)
+        for left in reversed(range(self.iterations)):
+            u, D = v, divergence(v)
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
-            y, k, t = new + (t - 1) / later * (new - k), new, later  # y of the last one is not used
-        v = v_star - force(k) / m[:, None]
+            y, k, t = new + (t - 1) / later * (new - k) * (left > 0), new, later
+            kick = -force(y) / m[:, None]
+            v = v_star + kick
         moved = x + dt * v + self.shift(x, u, dt, dt * k / m)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
@@ -145,7 +147,7 @@ class Projection:
         if self.follow:
             slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
-        return now, v, k
+        return now, v, (k, kick)
 
     def shift(self, x, v, dt, pull=0.0):
         """By velocities, and dt^2 p / rho of every particle."""

@@ -31,12 +31,15 @@ def test_a_step_is_that_of_the_twin(case):
     gravity, dt = np.array(made.forces.gravity), 0.002
     m = simulation.state()["reference_density"]
     run = simulation.run(3, given)
-    x, v, k = given["initial_positions"], given["initial_velocities"], np.zeros(len(m))
+    x, v = given["initial_positions"], given["initial_velocities"]
+    ends = np.zeros(len(m)), np.zeros_like(x)
     for step in range(1, 4):
-        x, v, k = twin.step(x, v + dt * gravity, k, m, dt)
+        x, v, ends = twin.step(x, v + dt * gravity, ends, m, dt)
+        k, kick = ends
         for found, wanted in ((run.positions[step], x), (run.velocities[step], v)):
             np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-11)
         np.testing.assert_allclose(run.others["pressure_impulse"][step], k, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(run.others["pressure_kick"][step], kick, rtol=1e-10, atol=1e-11)
     assert (k > 0.0).any() and (k < 0.0).any()
 
 

@@ -26,6 +26,7 @@ struct State {
     Vectors<Scalar, D> x;  // [m]
     Vectors<Scalar, D> v;  // [m / s]
     Values<Scalar> k;      // dt p of the projection [Pa s]
+    Vectors<Scalar, D> kick;  // -D^T k / m of its step [m / s]
 };
 
 // Every particle writes its own values only: the same bits for any number of threads.

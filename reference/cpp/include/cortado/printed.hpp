@@ -24,7 +24,7 @@ State<Real, D> printed_tangent(const Model<Real, D>& model, Step<Real, D>& step,
     const Values<Real> dn = density_tangent(model, step, state.x, dot.x);
     const Real gamma = reading.printed_gamma ? 2 * (D + 2 * viscosity) : model.kappa * viscosity;
     const Vectors<Real, D> da = acceleration_tangent(model, step, state, dot, dn, gravity_dot, gamma, Real(0));
-    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count), {}};
+    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count), {}, {}};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {
         predict_tangent(i, model.time_step, dot, da, push_dot, new_dot);
     };

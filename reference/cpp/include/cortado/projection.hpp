@@ -29,7 +29,8 @@ struct Projection {
     std::vector<Effects<Scalar, D>> effects;
     std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
-    std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
+    std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity before iteration i; the last is the result
+    Vectors<Scalar, D> kick;                  // what the last k adds to velocities
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of the last but one
     Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
     Vectors<Scalar, D> x_moved;               // x'
@@ -38,7 +39,7 @@ struct Projection {
     std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
     double error = 0;                         // average compression as the last repair found it
 
-    State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back()}; }
+    State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back(), kick}; }
 
     // omega / a
     Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
@@ -72,12 +73,15 @@ struct Projection {
         sized(c, repairs + 1);
         sized(excess, repairs);
         find(model, fluid, walls, count);
-        for (std::size_t i = 0; i < count; ++i) k[0][i] = y[0][i] = effects[i].full * state.k[i];
-        for (std::size_t at = 0; at < iterations; ++at) {
-            pull(model, fluid, y[at], v_star, u[at]);
-            iterate(model, fluid, n, at);
+        kick.resize(count);
+        for (std::size_t i = 0; i < count; ++i) {
+            k[0][i] = y[0][i] = effects[i].full * state.k[i];
+            u[0][i] = v_star[i] + effects[i].full * state.kick[i];
         }
-        pull(model, fluid, y[iterations], v_star, u[iterations]);
+        for (std::size_t at = 0; at < iterations; ++at) {
+            iterate(model, fluid, n, at);
+            pull(model, fluid, y[at + 1], v_star, u[at + 1]);
+        }
         move(model, fluid, state.x, u[iterations]);
         for (std::size_t at = 0; at < repairs; ++at) repair(model, fluid, walls, at);
     }
@@ -110,7 +114,7 @@ private:
 
     // The velocity v* - D^T y / m that pressures leave.
     void pull(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
-              const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) const {
+              const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) {
         each_particle(y.size(), model.threads, [&](std::size_t i) {
             Vector<Scalar, D> total = y[i] * moments[i].gamma;
             const Matrix<Scalar, D> T = y[i] * effects[i].L;
@@ -118,7 +122,8 @@ private:
                 const int j = pair->other;
                 total += model.volume * ((T + y[j] * effects[j].L) * pair->gradient());
             }
-            left[i] = v_star[i] - total / model.rest_density;
+            kick[i] = -total / model.rest_density;
+            left[i] = v_star[i] + kick[i];
         });
     }
 

@@ -28,11 +28,13 @@ public:
         const Vectors<Real, D> moved_bar = repairs(bar.x);
         shift(moved_bar, bar.v, bar.k);
         Values<Real> y_bar(count_, Real(0));
-        project(bar.k, y_bar, bar.v, n_bar);
+        project(bar, y_bar, n_bar);
         each([&](std::size_t i) {
-            const Real first_bar = bar.k[i] + y_bar[i];
-            bar.k[i] = at_.effects[i].full * first_bar;
-            effects_bar_[i].full += state_.k[i] * first_bar;
+            const Real first_bar = bar.k[i] + y_bar[i], full = at_.effects[i].full;
+            bar.k[i] = full * first_bar;
+            bar.kick[i] = full * bar.v[i];
+            effects_bar_[i].full += state_.k[i] * first_bar + state_.kick[i].dot(bar.v[i]);
+            v_star_bar_[i] += bar.v[i];
         });
         surroundings();
         bar.x = x_bar_;
@@ -115,11 +117,12 @@ private:
         });
     }
 
-    // Of the velocity that y leaves, from its adjoint, to that of y.
-    void pull(const Values<Real>& y, const Vectors<Real, D>& u_bar, Values<Real>& y_bar) {
+    // Of the velocity that y leaves, from its adjoint and that of the kick, which is 0 then, to that of y.
+    void pull(const Values<Real>& y, const Vectors<Real, D>& u_bar, Vectors<Real, D>& kick_bar, Values<Real>& y_bar) {
         each([&](std::size_t i) {
             v_star_bar_[i] += u_bar[i];
-            f_[i] = -u_bar[i] / model_.rest_density;
+            f_[i] = -(u_bar[i] + kick_bar[i]) / model_.rest_density;
+            kick_bar[i] = Vector<Real, D>::Zero();
         });
         each([&](std::size_t i) {
             const Matrix<Real, D>& L = at_.effects[i].L;
@@ -136,15 +139,16 @@ private:
         });
     }
 
-    // From the adjoints of the last k and of the new velocities to those of the first k and y.
-    void project(Values<Real>& k_bar, Values<Real>& y_bar, const Vectors<Real, D>& v_bar, Values<Real>& n_bar) {
+    // From the adjoints of the last k, of the new velocities and of the kick to those of the first k, y and u.
+    void project(State<Real, D>& bar, Values<Real>& y_bar, Values<Real>& n_bar) {
         const Real dt = model_.time_step;
+        Values<Real>& k_bar = bar.k;
+        Vectors<Real, D>& u_bar = bar.v;
         Values<Real> d_bar(count_);
-        Vectors<Real, D> u_bar(count_);
-        pull(at_.y.back(), v_bar, y_bar);
         const int last = int(at_.divergences.size()) - 1;
         for (int k = last; k >= 0; --k) {
             const Real beta = model_.momenta[k];
+            pull(at_.y[k + 1], u_bar, bar.kick, y_bar);
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];
                 Effects<Real, D>& of_bar = effects_bar_[i];
@@ -179,7 +183,6 @@ private:
                 effects_bar_[i].L += d_bar[i] * even<Real, D>(L_bar);
                 moments_bar_[i].gamma += d_bar[i] * u[i];
             });
-            pull(at_.y[k], u_bar, y_bar);
         }
     }
 

@@ -39,13 +39,13 @@ ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Rea
     return change;
 }
 
-// Of the velocity that pressures y leave.
+// Of what pressures y add to velocities.
 template <class Real, int D>
-Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
+Vectors<Real, D> kick_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
                               const ManyMoments<Real, D>& moments_dot, const ManyEffects<Real, D>& effects_dot,
-                              const Values<Real>& y, const Values<Real>& dy, const Vectors<Real, D>& dv_star) {
+                              const Values<Real>& y, const Values<Real>& dy) {
     const Projection<Real, D>& at = step.projection;
-    Vectors<Real, D> du(y.size());
+    Vectors<Real, D> dkick(y.size());
     each_particle(y.size(), model.threads, [&](std::size_t i) {
         const auto pull = [&](std::size_t j) { return Matrix<Real, D>(y[j] * at.effects[j].L); };
         const auto change = [&](std::size_t j) {
@@ -59,9 +59,9 @@ Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& 
             const Vector<Real, D> dg = pair->hessian_product(dx_ij);
             total += model.volume * ((dT + change(j)) * pair->gradient() + (T + pull(j)) * dg);
         }
-        du[i] = dv_star[i] - total / model.rest_density;
+        dkick[i] = -total / model.rest_density;
     });
-    return du;
+    return dkick;
 }
 
 // From the tangents of a state, of its densities and of predicted velocities to that of the step's result.
@@ -74,14 +74,16 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     const ManyMoments<Real, D> moments_dot = moments_tangent(model, step, dot.x);
     ManyEffects<Real, D> effects_dot(count);
     Values<Real> dk(count), dy(count);
+    Vectors<Real, D> dv(count), du(count), dkick;  // du: before the last iteration
     each_particle(count, model.threads, [&](std::size_t i) {
         effects_dot[i] = SurroundingsSlope<Real, D>(model, at.moments[i]).tangent(moments_dot[i]);
-        dk[i] = dy[i] = effects_dot[i].full * state.k[i] + at.effects[i].full * dot.k[i];
+        const Real full = at.effects[i].full, dfull = effects_dot[i].full;
+        dk[i] = dy[i] = dfull * state.k[i] + full * dot.k[i];
+        dv[i] = dv_star[i] + dfull * state.kick[i] + full * dot.kick[i];
     });
-    Vectors<Real, D> du;
     for (std::size_t k = 0; k < at.divergences.size(); ++k) {
         const Vectors<Real, D>& u = at.u[k];
-        du = pull_tangent(model, step, dot.x, moments_dot, effects_dot, at.y[k], dy, dv_star);
+        du = dv;
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
             Real dD = at.moments[i].gamma.dot(du[i]) + moments_dot[i].gamma.dot(u[i]);
@@ -102,9 +104,9 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             dy[i] = dk_new + model.momenta[k] * (dk_new - dk[i]);
             dk[i] = dk_new;
         });
+        dkick = kick_tangent(model, step, dot.x, moments_dot, effects_dot, at.y[k + 1], dy);
+        for (std::size_t i = 0; i < count; ++i) dv[i] = dv_star[i] + dkick[i];
     }
-    const Vectors<Real, D> dv =
-        pull_tangent(model, step, dot.x, moments_dot, effects_dot, at.y.back(), dy, dv_star);
     const Vectors<Real, D>& u = at.flow();
     Vectors<Real, D> dx_moved(count);
     each_particle(count, model.threads, [&](std::size_t i) {
@@ -143,7 +145,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             dx_now[i] = dx_moved[i] - total / m;
         });
     }
-    return {dx_now, dv, dk};
+    return {dx_now, dv, dk, dkick};
 }
 
 }  // namespace cortado

@@ -70,8 +70,9 @@ public:
         append(x, states.back().x);
         append(v, states.back().v);
         const auto [x_bar, v_bar] = loss(x, v);
-        State<Real, D> bar{joined_vectors<Real, D>(x_bar), joined_vectors<Real, D>(v_bar), states.back().k};
-        bar.k.assign(bar.k.size(), Real(0));
+        State<Real, D> bar{joined_vectors<Real, D>(x_bar), joined_vectors<Real, D>(v_bar),
+                           Values<Real>(states.back().k.size(), Real(0)),
+                           zero_vectors<Real, D>(states.back().kick.size())};
         Vectors<Real, D> gravity_bar = zero_vectors<Real, D>(steps);
         Real viscosity_bar = 0;
         history.position_norms.assign(steps + 1, norm(bar.x));
@@ -102,7 +103,8 @@ private:
 
     static Run<Real> begin(const Parameters& at, int steps) {
         Run<Real> run{{joined_vectors<Real, D>(at.positions), joined_vectors<Real, D>(at.velocities),
-                       Values<Real>(at.positions.size() / D, Real(0))},
+                       Values<Real>(at.positions.size() / D, Real(0)),
+                       zero_vectors<Real, D>(at.positions.size() / D)},
                       joined_vectors<Real, D>(at.gravity),
                       joined<Real>(at.viscosity, 0)};
         if (int(run.gravity.size()) != steps) throw std::invalid_argument("gravity must have a vector for each step");
@@ -184,7 +186,8 @@ private:
             return both;
         };
         const Run<Scalar> both{{joined(run.first.x, dot.first.x), joined(run.first.v, dot.first.v),
-                                Values<Scalar>(run.first.k.size(), Scalar(0))},
+                                Values<Scalar>(run.first.k.size(), Scalar(0)),
+                                zero_vectors<Scalar, D>(run.first.kick.size())},
                                joined(run.gravity, dot.gravity),
                                Scalar(run.viscosity, size * dot.viscosity)};
         const auto part = [&](const Vectors<Scalar, D>& from, bool second) {
@@ -196,8 +199,8 @@ private:
         };
         forward<Scalar>(Model<Scalar, D>(scene_, threads_), both, history, observe,
                         [&](int step, const State<Scalar, D>& state) {
-                            keep(step, State<Real, D>{part(state.x, false), part(state.v, false), {}},
-                                 State<Real, D>{part(state.x, true), part(state.v, true), {}});
+                            keep(step, State<Real, D>{part(state.x, false), part(state.v, false), {}, {}},
+                                 State<Real, D>{part(state.x, true), part(state.v, true), {}, {}});
                         });
     }
 

@@ -27,7 +27,7 @@ struct Step {
 
     int iterations() const { return iterations_; }
     State<Scalar, D> result() const {
-        return projected_ ? projection.result() : State<Scalar, D>{x_star[iterations_], v_star, {}};
+        return projected_ ? projection.result() : State<Scalar, D>{x_star[iterations_], v_star, {}, {}};
     }
     Scalar delta(const Model<Scalar, D>& model, std::size_t i) const {
         return y[i] * model.stiffness / (model.time_step * model.time_step);

@@ -100,7 +100,7 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
             change += model.wall_weights[pair->other] * pair->hessian_product(dot.x[i]);
         dy[i] = -2 * step.y[i] * step.y[i] * step.wall_gradient[i].dot(change) / model.response;
     });
-    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count), {}};
+    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count), {}, {}};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {
         predict_tangent(i, model.time_step, dot, da, push_dot, new_dot);
     };

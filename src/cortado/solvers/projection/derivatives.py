@@ -13,7 +13,7 @@ from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangen
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
-from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
+from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
 from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
@@ -33,9 +33,9 @@ class ProjectionTangent(ParticleTangent):
         self._solver: ProjectionSteps = solver
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "dot")
         self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
-        self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
+        self._x_star_dot, self._v_star_dot, self._kick_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
-        self._v_end_dot = self._v_new_dot if solver.following is None else solver.vectors()
+        self._v_end_dot = self._u_dot if solver.following is None else solver.vectors()
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
         self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
@@ -51,16 +51,18 @@ class ProjectionTangent(ParticleTangent):
         if self._bodies is not None:
             self._bodies.begin(context, self.dot, solver.around, self._around)
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
-        start = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
-        steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
-        context.launch(kernels.pressure.start.tangent, *known, start, steps)
         self._project(context, known, counts[0])
+        v_new = {"v_new": solver.iterates[counts[0]]["u"], "v_new_dot": self._u_dot}
         flow = {"A": solver.last_gradient(counts[0]), "A_dot": self._A_dot}
         pull = {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
         context.launch(kernels.shift.tangent, *known, solver.spaced, flow, pull, delta_dot=self._delta_dot)
-        moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "delta_dot": self._delta_dot}
-        begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
-        context.launch(kernels.moving.tangent, *known, moved, begun)
+        begun = {
+            "delta_dot": self._delta_dot,
+            "x_moved_dot": self._x_moved_dot,
+            "x_now_dot": self._x_now_dot,
+            "c_dot": self._c_dot,
+        }
+        context.launch(kernels.moving.tangent, *known, v_new, begun)
         omegas = solver.repair_relaxations
         for k in range(counts[1]):
             at, new = solver.repaired[k], solver.repaired[k + 1]
@@ -70,11 +72,11 @@ class ProjectionTangent(ParticleTangent):
             there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"]}
             change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
             context.launch(kernels.repair.move.tangent, *known, there, change)
-        ends = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "x_now_dot": self._x_now_dot}
         if solver.following is not None:
-            ends |= {"x_now": solver.repaired[counts[1]]["x_now"], "v_end_dot": self._v_end_dot}
-            context.launch(solver.following.tangent, *known, flow, ends)
-        self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **{IMPULSE: self._k_dot})
+            ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_dot": self._x_now_dot}
+            context.launch(solver.following.tangent, *known, flow, v_new, ends, v_end_dot=self._v_end_dot)
+        carried = {IMPULSE: self._k_dot, KICK: self._kick_dot}
+        self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
     def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
         """As that of `PressureTangent`."""
@@ -85,12 +87,14 @@ class ProjectionTangent(ParticleTangent):
         return list(k_dot / dt - k * dt_dot / dt**2)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """The iterations, and the new velocities."""
+        """The first k and the iterations."""
         solver, kernels = self._solver, self._solver.kernels.pressure
+        before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
+        before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
+        change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
+        context.launch(kernels.start.tangent, *known, before, change, v_star_dot=self._v_star_dot)
         for k in range(iterations):
             at = solver.iterates[k]
-            change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
-            self._pull_along(context, known, at["y"], self._y_dot, u=at["u"], u_dot=self._u_dot)
             new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
             drift = {}
             if self._bodies is not None:
@@ -98,19 +102,18 @@ class ProjectionTangent(ParticleTangent):
                 drift = {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
             beta = solver.momenta[k]
             context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift, beta=beta)
-        k = solver.iterates[iterations]["k"]
+            self._press(context, known, solver.iterates[k + 1])
         if self._bodies is not None:
-            self._bodies.settle(context, self.dot, k, self._k_dot)
-        self._pull_along(context, known, k, self._k_dot, u=solver.v_new, u_dot=self._v_new_dot)
+            self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
 
-    def _pull_along(
-        self, context: StepContext, known: tuple[Named, ...], y: wp.array, y_dot: wp.array, **velocity: wp.array
-    ) -> None:
-        """Of the velocity that is left by y."""
-        kernels, pull = self._solver.kernels.velocity, {**self._pull, "y": y, "y_dot": y_dot}
+    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
+        """Of the velocities that y leaves."""
+        solver, kernels = self._solver, self._solver.kernels.velocity
+        pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
         context.launch(kernels.pull_tangent, *known, pull)
-        predicted = {"v_star": self._solver.v_star, "v_star_dot": self._v_star_dot}
-        context.launch(kernels.velocity.tangent, *known, pull, predicted, **velocity)
+        predicted = {"v_star": solver.v_star, "v_star_dot": self._v_star_dot}
+        found = {"u": at["u"], "u_dot": self._u_dot, "kick_dot": self._kick_dot}
+        context.launch(kernels.velocity.tangent, *known, pull, predicted, found)
 
 
 class ProjectionAdjoint(ParticleAdjoint):
@@ -120,7 +123,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         super().__init__(solver, steps)
         self._solver: ProjectionSteps = solver
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
-        self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
+        self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
+        self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         six = solver.pull.dtype
         pull = solver.new_arrays(T=six, S=six)
@@ -141,13 +145,13 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
-        own = {"k": self._last_k(counts), "p_bar": within.p, "k_bar": self._k_bar}
+        own = {"k": self._last(counts)["k"], "p_bar": within.p, "k_bar": self._k_bar}
         solver.context(parameters).launch(pressed_adjoint_kernel(solver.layout.precision), *self.bar.named, own)
         self._finish(counts, state_bar, parameters, within)
 
-    def _last_k(self, counts: Counts) -> wp.array:
-        """That of the replayed step after all iterations."""
-        return self._solver.iterates[counts[0]]["k"]
+    def _last(self, counts: Counts) -> dict[str, wp.array]:
+        """The iterate of the replayed step after all iterations."""
+        return self._solver.iterates[counts[0]]
 
     def _last_gradient(self, counts: Counts) -> wp.array:
         """A of its last iteration."""
@@ -162,12 +166,13 @@ class ProjectionAdjoint(ParticleAdjoint):
             "v_scene": free_bar.velocities,
             "m_scene": state_bar["reference_density"],
         }
-        new = {"x": self._x_now_bar, "v": self._v_new_bar, "m": self._m_unused}
+        new = {"x": self._x_now_bar, "v": self._u_bar, "m": self._m_unused}
         context.launch(solver.integration.sort, scene, new)
         own = (self._x_moved_bar, self._c_bar, self._y_bar, self._A_bar)
         for array in (*self.bar.fields.arrays(), *self._around.values(), *own):
             array.zero_()
         wp.copy(self._k_bar, self.carried_bar[IMPULSE])
+        wp.copy(self._kick_bar, self.carried_bar[KICK])
         if self._bodies is not None:
             self._bodies.begin()
 
@@ -178,18 +183,19 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
         flow = {"A": self._last_gradient(counts), "A_bar": self._A_bar}
+        v_new = {"v_new": self._last(counts)["u"], "v_new_bar": self._u_bar}
         if solver.following is not None:
-            ends = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_now_bar": self._x_now_bar}
-            ends |= {"x_now": solver.repaired[counts[1]]["x_now"]}
-            context.launch(solver.following.adjoint, *known, flow, ends)
+            ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_bar": self._x_now_bar}
+            context.launch(solver.following.adjoint, *known, flow, v_new, ends)
         self._mend(context, known, counts[1])
-        moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
-        context.launch(kernels.moving.adjoint, *known, moved)
-        pull = {"k": self._last_k(counts), "k_bar": self._k_bar}
+        context.launch(kernels.moving.adjoint, *known, v_new, x_moved_bar=self._x_moved_bar)
+        pull = {"k": self._last(counts)["k"], "k_bar": self._k_bar}
         context.launch(kernels.shift.adjoint, *known, solver.spaced, flow, pull, delta_bar=self._x_moved_bar)
         self._project(context, known, counts[0])
-        start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
-        context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)
+        before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
+        before |= {"kick_before": solver.carried[KICK], "kick_before_bar": self._kick_before_bar}
+        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar}
+        context.launch(kernels.pressure.start.adjoint, *known, before, steps)
         if self._bodies is not None:
             self._bodies.finish(context, self.bar, solver.around, self._around)
         own, sums = kernels.surroundings.adjoint
@@ -199,7 +205,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
         self.mix(context, state_bar)
-        self.sort(context, state_bar, **{IMPULSE: self._k_before_bar})
+        self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
 
     def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
         """Of the repairs, to the adjoint of the positions before them."""
@@ -219,37 +225,35 @@ class ProjectionAdjoint(ParticleAdjoint):
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Of the new velocities and of the iterations, to the adjoints of v* and of the first k."""
+        """Of the iterations, to the adjoints of v* and of the first k and u."""
         solver = self._solver
-        self._from_velocities(context, known, solver.iterates[iterations]["k"])
+        if self._bodies is not None:
+            self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
         for k in reversed(range(iterations)):
+            self._press(context, known, solver.iterates[k + 1], self._y_bar)
             self._back(context, known, solver.iterates[k], solver.momenta[k], moves=k == iterations - 1)
 
-    def _from_velocities(self, context: StepContext, known: tuple[Named, ...], k: wp.array) -> None:
-        """Of the new velocities, to the adjoints of v* and of the last k."""
+    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], y_bar: wp.array) -> None:
+        """Of the velocities that y leaves, to the adjoints of v* and of y."""
         solver, velocity = self._solver, self._solver.kernels.velocity
-        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star}
-        steps = {"f": self._f, "T": self._pull}
-        context.launch(velocity.end_adjoint, *known, last, steps, y=k)
-        context.launch(velocity.velocity.adjoint, *known, steps, y=k, y_bar=self._k_bar)
-        if self._bodies is not None:
-            self._bodies.settle(context, self.bar, k, self._k_bar)
+        found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
+        steps = {"f": self._f, "T": self._pull, "y": at["y"]}
+        context.launch(velocity.own_adjoint, *known, found, steps)
+        context.launch(velocity.velocity.adjoint, *known, steps, y_bar=y_bar)
 
     def _back(
         self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
     ) -> None:
-        """Of one iteration, from those of k' and y' to those of k and y, and of v*. Its A ``moves`` particles, or only
+        """Of one iteration, from the adjoints of k' and y' to those of k, y and u. Its A ``moves`` particles, or only
         has a divergence."""
         solver, pressure = self._solver, self._solver.kernels.pressure
         clamp, divergence, whole = pressure.update.adjoint
-        steps = {"f": self._f, "T": self._pull, "S": self._push}
-        steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
+        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
         context.launch(clamp, *known, at, solver.relaxed, steps, **drift, beta=beta)
         if moves:
             context.launch(pressure.whole_adjoint, *known, steps, A_bar=self._A_bar)
             divergence, steps = whole, {**steps, "S": self._A_bar}
-        context.launch(divergence, *known, at, steps, v_star=solver.v_star)
-        context.launch(solver.kernels.velocity.velocity.adjoint, *known, at, steps)
+        context.launch(divergence, *known, at, steps, u_bar=self._u_bar)
         if self._bodies is not None:
             self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)

@@ -191,15 +191,15 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._root.fill_(1.0)
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)
         wp.copy(at["k"], self._end[IMPULSE])
-        solver.settle(context, 0)
-        context.launch(self._gradient.forward, v_flow=solver.v_new, A=at["A"])
+        solver.press(context, 0)
+        context.launch(self._gradient.forward, v_flow=at["u"], A=at["A"])
         solver.move(context, 0)
         for k in range(repairs):
             solver.mend(context, k, k, k + 1)
         self.arrive(state)
 
-    def _last_k(self, counts: Counts) -> wp.array:
-        return self._end[IMPULSE]
+    def _last(self, counts: Counts) -> dict[str, wp.array]:
+        return self._solver.iterates[0]
 
     def _last_gradient(self, counts: Counts) -> wp.array:
         return self._solver.iterates[0]["A"]
@@ -209,23 +209,23 @@ class FixedPointAdjoint(ProjectionAdjoint):
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """Of the new velocities and of the fixed point, to the adjoint of v*."""
-        solver, k = self._solver, self._end[IMPULSE]
-        flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "A_bar": self._A_bar}
+        solver, at = self._solver, self._solver.iterates[0]
+        flow = {"v_flow": at["u"], "v_flow_bar": self._u_bar, "A_bar": self._A_bar}
         context.launch(self._gradient.adjoint, *known, flow)
-        self._from_velocities(context, known, k)
-        at = {**solver.iterates[0], "u": solver.v_new, "k": k}
+        self._press(context, known, at, self._k_bar)
         system = {"root": self._root, "rest": self._rest, "w": self._w}
         own = (solver.around, solver.relaxed, system)
         context.launch(self._own.linearise, *own, at, k_bar=self._k_bar, r=self._r)
 
         def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
-            by = {"y": self._y, "T": self._pull}
-            self._pull_by(context, p, **by)
-            context.launch(solver.kernels.velocity.velocity.forward, solver.around, by, v_star=self._still, u=self._u)
+            by = {"y": self._y, "T": self._pull, "u": self._u, "kick": self._u}
+            self._pull_by(context, p, y=self._y, T=self._pull)
+            context.launch(solver.kernels.velocity.velocity.forward, solver.around, by, v_star=self._still)
             context.launch(self._own.multiply, *own, found, u=self._u, p=p)
 
         self._solution.solve(context, multiply, self._w, self._r, self._q)
         context.launch(self._own.recover, *own, q=self._q, k_bar=self._k_bar, y_bar=self._y_bar)
         self._back(context, known, at, 0.0, moves=False)
-        self._k_bar.zero_()
-        self._y_bar.zero_()
+        self._press(context, known, at, self._y_bar)
+        for bar in (self._k_bar, self._y_bar, self._u_bar):
+            bar.zero_()

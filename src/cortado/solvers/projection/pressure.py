@@ -61,7 +61,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     weights4 = weights_type(precision)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "a", "weights")}
     seen = bundle(**own)
-    bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
+    bars = bundle(x=vector, n=real, time_step=real, **own)
     iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
     clamp, LANES = clamp_functions(precision), discretisation.lanes
     wanted, parts = clamp.wanted, clamp.parts
@@ -70,49 +70,61 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     @wp.kernel(module=module)
     def start(
         k_before: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
-        L: wp.array(dtype=matrix),
+        v_star: wp.array(dtype=vector),
         # out
         k: wp.array(dtype=real),
         y: wp.array(dtype=real),
-        T: wp.array(dtype=six),
+        u: wp.array(dtype=vector),
     ):
         i = wp.tid()
         first = weights[i][1] * k_before[i]
-        T[i] = first * pack(L[i])
         k[i] = first
         y[i] = first
+        u[i] = v_star[i] + weights[i][1] * kick_before[i]
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def start_tangent(
         k_before: wp.array(dtype=real),
-        k_before_dot: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
-        weights_dot: wp.array(dtype=weights4),
+        dot: bundle(k_before=real, kick_before=vector, weights=weights4, v_star=vector),
         # out
         k_dot: wp.array(dtype=real),
         y_dot: wp.array(dtype=real),
+        u_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        first = weights_dot[i][1] * k_before[i] + weights[i][1] * k_before_dot[i]
+        full, full_dot = weights[i][1], dot.weights[i][1]
+        first = full_dot * k_before[i] + full * dot.k_before[i]
         k_dot[i] = first
         y_dot[i] = first
+        u_dot[i] = dot.v_star[i] + full_dot * kick_before[i] + full * dot.kick_before[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def start_adjoint(
         k_before: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
         k_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
+        u_bar: wp.array(dtype=vector),
         # in and out
         weights_bar: wp.array(dtype=weights4),
+        v_bar: wp.array(dtype=vector),
         # out
         k_before_bar: wp.array(dtype=real),
+        kick_before_bar: wp.array(dtype=vector),
     ):
+        """``v_bar`` is the adjoint of v*."""
         i = wp.tid()
         bar, no = k_bar[i] + y_bar[i], real(0.0)
         k_before_bar[i] = weights[i][1] * bar
-        weights_bar[i] = weights_bar[i] + weights4(no, k_before[i] * bar, no, no)
+        kick_before_bar[i] = weights[i][1] * u_bar[i]
+        full_bar = k_before[i] * bar + wp.dot(kick_before[i], u_bar[i])
+        weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
+        v_bar[i] = v_bar[i] + u_bar[i]
 
     @wp.kernel(module=module)
     def update(
@@ -217,9 +229,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         # out
         d_bar: wp.array(dtype=real),
         S: wp.array(dtype=six),
-        T: wp.array(dtype=six),
     ):
-        """S is d_bar L, and T is y L."""
+        """S is d_bar L."""
         i = wp.tid()
         dt = time_step[i // particles]
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
@@ -243,7 +254,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         bar.drift[i] = bar.drift[i] - per * z_bar
         d_bar[i] = per * z_bar
         S[i] = (per * z_bar) * pack(of.L[i])
-        T[i] = at.y[i] * pack(of.L[i])
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def whole_adjoint(
@@ -256,14 +266,11 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         A_bar[i] = A_bar[i] + d_bar[i] * L[i]
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
-        """From that of D, and of A where it is a whole matrix S, to f = -u_bar / m, and to that of v*, of which
-        u = v* - ... is made."""
+        """From that of D, and of A where it is a whole matrix S, to that of u."""
 
         def divergence_adjoint(
             s: neighbourhood,
             x: wp.array(dtype=vector),
-            m: wp.array(dtype=real),
-            v_star: wp.array(dtype=vector),
             g: wp.array(dtype=vector),
             of: seen,
             u: wp.array(dtype=vector),
@@ -273,19 +280,16 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
             # in and out
             bar: bars,
             # out
-            f: wp.array(dtype=vector),
+            u_bar: wp.array(dtype=vector),
         ):
             i = s.first + wp.tid() // LANES
             u_part, x_part = back(i, x, u, S, s)
             if lane() > 0:
                 return
-            u_bar = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
             bar.L[i] = bar.L[i] + (real(0.5) * d_bar[i]) * (A[i] + wp.transpose(A[i]))
             bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
             bar.x[i] = bar.x[i] + x_part
-            bar.v[i] = bar.v[i] + u_bar
-            bar.m[i] = bar.m[i] + wp.dot(u_bar, v_star[i] - u[i]) / m[i]
-            f[i] = -u_bar / m[i]
+            u_bar[i] = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
 
         divergence_adjoint.__qualname__ = f"pressure_kernels.<locals>.{name}"
         return wp.kernel(module=adjoint_module, enable_backward=False)(divergence_adjoint)

@@ -33,6 +33,8 @@ from cortado.sph.parts import StepContext
 
 IMPULSE = "pressure_impulse"
 """The name of k = dt p in a state."""
+KICK = "pressure_kick"
+"""The name of -D^T k / m, which a step's pressures added to velocities, in a state."""
 WARM = 5.0
 """t of the first momentum. Nesterov's method begins with 1; here the first k is that of the step before, as if there
 had been iterations, and two with the momentum of later ones do as much as four from 1. From step to step errors shrink
@@ -70,7 +72,7 @@ class ProjectionSteps(ParticleSolver):
 
     topic = "projection"
     density_power = 0
-    carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER),)
+    carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER), StateField(KICK, "m/s", Entry.VECTOR))
 
     def __init__(
         self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int, follow: bool
@@ -89,13 +91,13 @@ class ProjectionSteps(ParticleSolver):
         kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real}
         self.iterates = [self.new_arrays(**self._iterate_kinds)]
-        """u = v* - D^T y / m, A and the divergence of u, y and k before each iteration; the last has y = k of all."""
+        """u, A and the divergence of u, y and k before each iteration; the last has u and y = k of all."""
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
-        self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
         """Those of velocities that follow the shift and the repairs; None where they do not."""
-        self.v_end = self.vectors() if follow else self.v_new
+        self._followed = self.vectors()
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
@@ -133,8 +135,8 @@ class ProjectionSteps(ParticleSolver):
         self.settle(context, 0)
         self.move(context, 0)
         repair.run(lambda k: self.mend(context, k, 0, 0))
-        self._finish(context, 0, 0, new_state)
-        self.end_step(self.repaired[0]["x_now"], self.v_end, new_state, log)
+        v_end = self._finish(context, 0, 0, new_state)
+        self.end_step(self.repaired[0]["x_now"], v_end, new_state, log)
 
     def reserve(self, counts: Counts) -> None:
         iterations, repairs = counts
@@ -177,33 +179,36 @@ class ProjectionSteps(ParticleSolver):
             self.bodies.begin(context, self.around)
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
-        started = {"k": first["k"], "y": first["y"], "T": self.pull, "k_before": self.carried[IMPULSE]}
-        context.launch(kernels.pressure.start.forward, self.around, started)
+        before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
+        context.launch(kernels.pressure.start.forward, self.around, before, first)
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Iteration k, from the iterates of one slot to those of another."""
         kernels, at, new = self.kernels, self.iterates[before], self.iterates[after]
-        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, T=self.pull)
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
         out["drift"] = self.around["drift"]
         if self.bodies is not None:
             out["drift"] = self.bodies.drifted(context, self.around["drift"], at["y"])
         context.launch(kernels.pressure.update.forward, out, self.around, at, self.relaxed, beta=self.momenta[k])
+        self.press(context, after)
+
+    def press(self, context: StepContext, slot: int) -> None:
+        """The velocities that the y of a slot leaves, with its pull."""
+        at = {"y": self.iterates[slot]["y"], "u": self.iterates[slot]["u"], "T": self.pull, "kick": self.kick}
+        context.launch(self.kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star)
 
     def settle(self, context: StepContext, last: int) -> None:
-        """The new velocities, by the k of a slot."""
-        at = {"y": self.iterates[last]["y"], "T": self.pull}
+        """The new velocities of bodies, by the k of a slot."""
         if self.bodies is not None:
-            self.bodies.settle(context, at["y"])
-        context.launch(self.kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
+            self.bodies.settle(context, self.iterates[last]["y"])
 
     def move(self, context: StepContext, last: int) -> None:
         """The positions that the new velocities and the shift lead to, by the k of a slot."""
         kernels, first = self.kernels, self.repaired[0]
         flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
         context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
-        moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
+        moved = {"v_new": self.iterates[last]["u"], "delta": self.delta, "x_moved": self.x_moved}
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
 
     def last_gradient(self, slot: int) -> wp.array:
@@ -219,12 +224,15 @@ class ProjectionSteps(ParticleSolver):
         moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"]}
         context.launch(kernels.move.forward, self.around, moved)
 
-    def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> None:
-        ends, x_now = {IMPULSE: self.iterates[iterations]["k"]}, self.repaired[repairs]["x_now"]
+    def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> wp.array:
+        """Write the new state, and return its velocities, sorted."""
+        end, x_now = self.iterates[iterations], self.repaired[repairs]["x_now"]
+        v_end = end["u"]
         if self.following is not None:
-            moved = {"x_now": x_now, "v_new": self.v_new, "v_end": self.v_end}
+            moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self._followed}, self._followed
             context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
-        self.unsort(context, x_now, self.v_end, new_state, **ends)
+        self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
+        return v_end
 
 
 def momenta(iterations: int) -> list[float]:

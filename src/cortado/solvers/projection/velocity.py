@@ -19,11 +19,11 @@ class VelocityKernels:
     """Of the velocity."""
 
     velocity: Kernels
-    """Its adjoint goes on from f = -u_bar / m of all particles."""
+    """Its adjoint goes on from the f of all particles."""
     pull_tangent: wp.Kernel
     """Comes before the tangent of the velocity."""
-    end_adjoint: wp.Kernel
-    """From the adjoint of the last velocity of a step to that of v* and to f."""
+    own_adjoint: wp.Kernel
+    """Comes before the adjoint of the velocity: from the adjoints of u and of the kick to that of v* and to f."""
     time_adjoint: wp.Kernel
     """What v* = v + dt a gives to the adjoint of dt."""
 
@@ -57,14 +57,17 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         gamma: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
         # out
+        kick: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
     ):
-        """T is y L."""
+        """T is y L, and ``kick`` -D^T y / m."""
         i = s.first + wp.tid() // LANES
         total = force(i, x, T, s)
         if lane() > 0:
             return
-        u[i] = v_star[i] - (total + times(T[i], g[i]) + y[i] * gamma[i]) / m[i]
+        change = -(total + times(T[i], g[i]) + y[i] * gamma[i]) / m[i]
+        kick[i] = change
+        u[i] = v_star[i] + change
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def pull_tangent(
@@ -94,6 +97,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         v_star_dot: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
         # out
+        kick_dot: wp.array(dtype=vector),
         u_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
@@ -102,7 +106,9 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
             return
         change = total + times(dot.T[i], of.g[i]) + times(of.T[i], dot.g[i])
         change += dot.y[i] * of.gamma[i] + of.y[i] * dot.gamma[i]
-        u_dot[i] = v_star_dot[i] - (change + m_dot[i] * (u[i] - v_star[i])) / m[i]
+        change = -(change + m_dot[i] * (u[i] - v_star[i])) / m[i]
+        kick_dot[i] = change
+        u_dot[i] = v_star_dot[i] + change
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def velocity_adjoint(
@@ -116,7 +122,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         y_bar: wp.array(dtype=real),
         bar: bars,
     ):
-        """From f = -u_bar / m of all particles; T is y L."""
+        """From f of all particles; T is y L."""
         i = s.first + wp.tid() // LANES
         diagonal, others, x_part = force_back(i, x, T, f, s)
         if lane() > 0:
@@ -128,26 +134,29 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         bar.x[i] = bar.x[i] + x_part
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def end_adjoint(
+    def own_adjoint(
         m: wp.array(dtype=real),
         v_star: wp.array(dtype=vector),
         y: wp.array(dtype=real),
         L: wp.array(dtype=matrix),
         u: wp.array(dtype=vector),
         u_bar: wp.array(dtype=vector),
-        # in and out
+        # in and out: the adjoint of the kick is 0 afterwards
+        kick_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
         # out
         T: wp.array(dtype=six),
         f: wp.array(dtype=vector),
     ):
+        """f = -(u_bar + kick_bar) / m, and T is y L."""
         i = wp.tid()
-        bar = u_bar[i]
-        v_bar[i] = v_bar[i] + bar
+        bar = u_bar[i] + kick_bar[i]
+        v_bar[i] = v_bar[i] + u_bar[i]
         m_bar[i] = m_bar[i] + wp.dot(bar, v_star[i] - u[i]) / m[i]
         T[i] = y[i] * pack(L[i])
         f[i] = -bar / m[i]
+        kick_bar[i] = vector()
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def time_adjoint(
@@ -160,5 +169,5 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         time_step_bar[i] = time_step_bar[i] + wp.dot(v_bar[i], acceleration[i])
 
     return VelocityKernels(
-        Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, end_adjoint, time_adjoint
+        Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, own_adjoint, time_adjoint
     )
