@@ -183,9 +183,10 @@ class ShiftAdjoint(PartAdjoint):
         shift = self._shift
         for array in (*self._around.values(), *self._flow.values()):
             array.zero_()
-        known = (*bar.named, self._around, shift.around, shift.constants, shift.unpulled, self._unused)
+        around = (*bar.named, self._around, shift.around)
+        known = (*around, shift.constants, shift.unpulled, self._unused)
         step.launch(shift.shift.adjoint, *known, self._flow, shift.flow, delta_bar=self._delta_bar)
         step.launch(shift.gradient.adjoint, *known, self._flow, v_flow=step.fields["v"], v_flow_bar=bar.fields["v"])
         for kernel in shift.surroundings.adjoint:
             step.launch(kernel, *known, self._moments)
-        bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *known)
+        bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *around)
