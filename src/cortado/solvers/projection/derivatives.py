@@ -56,13 +56,8 @@ class ProjectionTangent(ParticleTangent):
         flow = {"A": solver.last_gradient(counts[0]), "A_dot": self._A_dot}
         pull = {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
         context.launch(kernels.shift.tangent, *known, solver.spaced, flow, pull, delta_dot=self._delta_dot)
-        begun = {
-            "delta_dot": self._delta_dot,
-            "x_moved_dot": self._x_moved_dot,
-            "x_now_dot": self._x_now_dot,
-            "c_dot": self._c_dot,
-        }
-        context.launch(kernels.moving.tangent, *known, v_new, begun)
+        begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
+        context.launch(kernels.moving.tangent, *known, v_new, begun, delta_dot=self._delta_dot)
         omegas = solver.repair_relaxations
         for k in range(counts[1]):
             at, new = solver.repaired[k], solver.repaired[k + 1]

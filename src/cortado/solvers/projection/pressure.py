@@ -10,9 +10,10 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists; the first k is f times
-that of the step before. Tension is let through by sigma, where particles are surrounded. Slopes of the clamp and of the
-maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
+b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k is f times
+that of the step before, and the first v is v* + f w, with the kick w = -D^T k / m of the step before. Tension is let
+through by sigma, where particles are surrounded. Slopes of the clamp and of the maximum have corners, at which one of
+the two derivatives is taken. The result is v* - D^T k / m.
 """
 
 from collections.abc import Callable
