@@ -48,7 +48,7 @@ problem = cortado.Problem(cortado.Simulation(scene), STEPS, loss)
 search = Transformed(problem, {"jug.turn": turn, "jug.displacement": aside})
 optimiser, gradient = cortado.optimisers.LineSearch(), cortado.gradients.AdjointViscosity()
 start, bounds = (dict.fromkeys(search.coordinates, one) for one in (np.zeros(BLOCKS), (-1.0, 1.0)))
-found = cortado.optimise(search, start, optimiser, 5, bounds, gradient=gradient)
+found = cortado.optimise(search, start, optimiser, 10, bounds, gradient=gradient)
 
 for name, u in (("turned steadily", start), ("found", found.parameters)):
     syrup = problem.end(search.parameters(u)).positions

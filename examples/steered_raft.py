@@ -8,7 +8,7 @@ import numpy as np
 import cortado
 from cortado.optimisation.transforms import Affine, Transformed
 
-STEPS, TIME_STEP, MODES = 320, 0.003, 10
+STEPS, TIME_STEP, MODES = 320, 0.003, 16
 WANTED = np.array([0.55, 0.2])  # m, where the middle of the raft shall be
 
 paddle = {"name": "paddle", "shape": "box", "lower": [0.06, -0.1], "upper": [0.16, 0.4]}
@@ -32,7 +32,8 @@ path = Affine(np.zeros((STEPS, 2)), np.einsum("sk,d->sdk", waves, [1.0, 0.0]))
 problem = cortado.Problem(cortado.Simulation(scene), STEPS, cortado.losses.SolidPose("raft", WANTED, 0.0, length=0.1))
 search = Transformed(problem, {"paddle.displacement": path})
 start, bounds = {"paddle.displacement": np.zeros(MODES)}, {"paddle.displacement": (-1.0, 1.0)}
-found = cortado.optimise(search, start, cortado.optimisers.LineSearch(), 8, bounds)
+optimiser, gradient = cortado.optimisers.LineSearch(), cortado.gradients.AdjointViscosity()
+found = cortado.optimise(search, start, optimiser, 16, bounds, gradient=gradient)
 
 for name, u in (("no waves", start), ("found", found.parameters)):
     body = problem.simulation.run(STEPS, search.parameters(u), record_every=STEPS).solids["raft"]

@@ -6,6 +6,7 @@ launched a kernel, and calls the command line there; `by_console` starts the rea
 
 import faulthandler
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -170,7 +171,8 @@ def _watched(
     child: int, arguments: tuple[str, ...], files: tuple[Path, Path, Path], limits: Limits, kill: Kill | None
 ) -> Outcome:
     """Wait for the end of a process, and bring it about where it takes too much."""
-    started = time.monotonic()
+    started, resident = time.monotonic(), 0
+    inherited = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # with which the peak of a child begins
     hung = swollen = sent = False
     try:
         while True:
@@ -182,7 +184,8 @@ def _watched(
                 sent = _signal_group(child, kill.number)
             elif not (hung or swollen):
                 hung = _is_hung(child, seconds, limits.seconds)
-                swollen = _resident(child) > limits.memory
+                resident = max(resident, _resident(child))
+                swollen = resident > limits.memory
                 if hung or swollen:
                     _end(child)
             time.sleep(POLL)
@@ -190,7 +193,8 @@ def _watched(
         _signal_group(child, signal.SIGKILL)  # and whatever it has left behind
     out, err, stack = (_read(path) for path in files)
     code = os.waitstatus_to_exitcode(status)
-    computed, memory = usage.ru_utime + usage.ru_stime, 1024 * usage.ru_maxrss
+    computed = usage.ru_utime + usage.ru_stime
+    memory = 1024 * usage.ru_maxrss if usage.ru_maxrss > inherited else resident
     return Outcome(arguments, code, out, err, seconds, computed, memory, hung, swollen, stack if hung else "")
 
 

@@ -41,6 +41,26 @@ def exact_mode(ohnesorge: float, dimension: int = 2, mode: int = 2) -> tuple[flo
     return float(root[1]), float(-root[0])
 
 
+def disc_of_lattice(spacing, discretisation, dimension):
+    """Points of a lattice of that spacing in a disc or ball of radius 1."""
+    across = round(2.0 / spacing)
+    line = spacing * (np.arange(-across, across) + 0.5)
+    x = np.stack(np.meshgrid(*[line] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
+    return x[(x**2).sum(axis=1) < 1.0]
+
+
+def packed_disc(spacing, discretisation, dimension):
+    """The particles of the fluid that a scene has in a disc or ball of radius 1."""
+    water = {"name": "water", "rest_density": 1.0, "viscosity": 0.0}
+    ball = {"shape": "sphere", "centre": [0.0] * dimension, "radius": 1.0, "phase": "water"}
+    made = {
+        "dimension": dimension,
+        "discretisation": {"spacing": spacing, **discretisation},
+        "solver": {"time_step": 0.001},
+    }
+    return Simulation(Scene(**made, phase=[water], fluid=[ball]), precision="float64").positions
+
+
 def swing(t, a, b, frequency, damping, offset):
     return np.exp(-damping * t) * (a * np.cos(frequency * t) + b * np.sin(frequency * t)) + offset
 
@@ -63,17 +83,16 @@ class Drop:
         step=0.2,
         slope=False,
         precision="float64",
+        particles=disc_of_lattice,
         **forces,
     ):
-        """``turned``: its lattice by an angle [degrees]; ``periods`` of its oscillation; with its ``slope``, the
+        """``turned``: its ``particles`` by an angle [degrees]; ``periods`` of its oscillation; with its ``slope``, the
         tangent with respect to the surface tension is computed too."""
         spacing, d = 2.0 / across, dimension
-        line = spacing * (np.arange(-across, across) + 0.5)
-        x = np.stack(np.meshgrid(*[line] * d, indexing="ij"), axis=-1).reshape(-1, d)
+        x = particles(spacing, discretisation, d)
         turn, angle = np.eye(d), radians(turned)
         turn[:2, :2] = [[cos(angle), -sin(angle)], [sin(angle), cos(angle)]]
         x = x @ turn.T
-        x = x[(x**2).sum(axis=1) < 1.0]
         x = x + jitter * spacing * np.random.default_rng(1).uniform(-1.0, 1.0, x.shape)
         x -= x.mean(axis=0)
         self.radius = (len(x) * spacing**d / (pi if d == 2 else 4.0 * pi / 3.0)) ** (1.0 / d)

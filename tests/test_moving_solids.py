@@ -38,6 +38,10 @@ PADDLE = {
 }
 
 
+CONVERGED = {"kind": "projection", "time_step": 0.001, "iterations": 8}
+"""Two iterations are not at the fixed point: there the cosine of gravity's gradient is 0.998, with 8 it is 0.99996."""
+
+
 def plane(*solids, **tables):
     fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "water"}
     return Scene(
@@ -172,7 +176,7 @@ def test_a_belt_moves_fluid_and_stays():
     ("made", "estimator"),
     [
         (lambda: plane(ROTOR), None),
-        (lambda: plane(ROTOR), ImplicitPressure()),
+        (lambda: plane(ROTOR, solver=CONVERGED), ImplicitPressure()),
         (lambda: plane(ROTOR, solver={"kind": "pcisph", "time_step": 0.001}), None),
         (lambda: plane(ROTOR, forces={"viscous_solve": "implicit"}), None),
         (lambda: plane(ROTOR, forces={"viscosity": "laminar"}, solver={"time_step": 0.001}), None),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cortado.sph.curvature_constants import CurvatureConstants
-from oscillating_drops import C2, C4, Drop, exact_mode
+from oscillating_drops import C2, C4, Drop, exact_mode, packed_disc
 
 pytestmark = pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 
@@ -32,6 +32,12 @@ def test_a_drop_oscillates_as_it_must(turned, name):
     frequency, damping, rest = made.fit()
     assert abs(frequency - 1.0) < 0.04 and 0.82 < damping < 1.1 and rest < 0.05
     assert abs(made.frequency_slope() - 1.0) < 0.1
+
+
+def test_a_drop_as_scenes_have_it_is_damped_as_it_must_be():
+    """Particles of round bodies are packed, and no lattice has to come to rest."""
+    frequency, damping, rest = Drop(24, discretisation=C4, particles=packed_disc).fit()
+    assert abs(frequency - 1.0) < 0.02 and abs(damping - 1.0) < 0.1 and rest < 0.01
 
 
 @pytest.mark.parametrize("turned", [0.0, 45.0])

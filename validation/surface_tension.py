@@ -11,14 +11,16 @@ import argparse
 import sys
 import time
 import warnings
+from itertools import product
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado.errors import CortadoWarning
-from oscillating_drops import C2, C4, CUBIC, PCISPH, Drop
+from oscillating_drops import C2, C4, CUBIC, PCISPH, Drop, disc_of_lattice, packed_disc
 
 KERNELS = {"C4, 3": C4, "C2, 2.6": C2}
 TURNS = (0.0, 45.0)
+PARTICLES = {"of a lattice": disc_of_lattice, "packed": packed_disc}
 
 
 def row(name: str, slope: bool = False, **options) -> None:
@@ -39,11 +41,12 @@ def main() -> None:
     across = parser.parse_args().across
     warnings.simplefilter("ignore", CortadoWarning)  # of forms and kernels that are compared
     print("| drop | frequency | damping | d omega / d sigma | pressure | rest | drift | time |\n|" + 8 * "---|")
-    for number in across:
-        for kernel, discretisation in KERNELS.items():
-            for turned in TURNS:
-                name = f"{number} across, {kernel}, turned by {turned:g}"
-                row(name, slope=True, across=number, turned=turned, discretisation=discretisation)
+    for number, (kernel, discretisation), (kind, particles), turned in product(
+        across, KERNELS.items(), PARTICLES.items(), TURNS
+    ):
+        name = f"{number} across, {kernel}, {kind}, turned by {turned:g}"
+        options = {"discretisation": discretisation, "particles": particles, "turned": turned}
+        row(name, slope=True, across=number, **options)
     row("24 across, C4, stirred", across=24, turned=20.0, jitter=0.1, discretisation=C4)
     for support in (2.0, 2.6):
         row(f"24 across, cubic, {support:g}", across=24, discretisation={**CUBIC, "support": support})
