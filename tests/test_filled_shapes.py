@@ -100,8 +100,8 @@ def test_a_box_turned_by_a_right_angle_is_on_its_lattice_still():
 def test_a_polygon_fills_a_tank_of_its_shape_and_stays():
     """All of the fluid begins at the rest density between walls that lean; it gains no energy and stays inside.
 
-    From one 50 steps to the next, repairs of the density of the 82 particles lift it now and then: by up to 5e-4 with two
-    iterations, 1e-4 with four, 0.5e-4 in steps of half the length (PCISPH 7e-4).
+    From one 50 steps to the next, repairs of the density of the 82 particles lift it now and then: by up to 5e-4 with
+    two iterations, 1e-4 with four, 0.5e-4 in steps of half the length (PCISPH 7e-4).
     """
     tank = {"name": "tank", "side": "inside", **TRIANGLE}
     container = {"shape": "box", "lower": [-0.1, -0.1], "upper": [0.7, 0.8]}
