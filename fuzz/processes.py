@@ -6,7 +6,6 @@ launched a kernel, and calls the command line there; `by_console` starts the rea
 
 import faulthandler
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -32,7 +31,7 @@ class Limits:
     seconds: float = 20.0
     """Of computing, or of waiting for something that does not come."""
     memory: int = 2_000_000_000
-    """Bytes that it holds at once."""
+    """Bytes that it holds at once, beyond those that it was forked with."""
 
 
 LIMITS = Limits()
@@ -93,10 +92,10 @@ def call(
     out, err, stack = (_file(folder, name) for name in ("out", "err", "stack"))
     sys.stdout.flush()
     sys.stderr.flush()
-    child = os.fork()
+    shared, child = _resident(os.getpid()), os.fork()
     if child == 0:
         _be_program(function, folder, out, err, stack)
-    return _watched(child, arguments, (out, err, stack), limits, kill)
+    return _watched(child, arguments, (out, err, stack), limits, kill, shared)
 
 
 def by_console(
@@ -168,11 +167,16 @@ def _exit_code(function: Callable[[], None]) -> int:
 
 
 def _watched(
-    child: int, arguments: tuple[str, ...], files: tuple[Path, Path, Path], limits: Limits, kill: Kill | None
+    child: int,
+    arguments: tuple[str, ...],
+    files: tuple[Path, Path, Path],
+    limits: Limits,
+    kill: Kill | None,
+    shared: int = 0,
 ) -> Outcome:
-    """Wait for the end of a process, and bring it about where it takes too much."""
-    started, resident = time.monotonic(), 0
-    inherited = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # with which the peak of a child begins
+    """Wait for the end of a process, and bring it about where it takes too much; ``shared``: bytes that it was forked
+    with, which do not count."""
+    started = time.monotonic()
     hung = swollen = sent = False
     try:
         while True:
@@ -184,8 +188,7 @@ def _watched(
                 sent = _signal_group(child, kill.number)
             elif not (hung or swollen):
                 hung = _is_hung(child, seconds, limits.seconds)
-                resident = max(resident, _resident(child))
-                swollen = resident > limits.memory
+                swollen = _resident(child) - shared > limits.memory
                 if hung or swollen:
                     _end(child)
             time.sleep(POLL)
@@ -193,8 +196,7 @@ def _watched(
         _signal_group(child, signal.SIGKILL)  # and whatever it has left behind
     out, err, stack = (_read(path) for path in files)
     code = os.waitstatus_to_exitcode(status)
-    computed = usage.ru_utime + usage.ru_stime
-    memory = 1024 * usage.ru_maxrss if usage.ru_maxrss > inherited else resident
+    computed, memory = usage.ru_utime + usage.ru_stime, max(1024 * usage.ru_maxrss - shared, 0)
     return Outcome(arguments, code, out, err, seconds, computed, memory, hung, swollen, stack if hung else "")
 
 

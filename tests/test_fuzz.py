@@ -94,6 +94,11 @@ def test_much_memory_is_found(tmp_path):
     assert len(found) == 1 and "held" in found[0]
 
 
+def test_memory_that_this_process_held_is_not_its_childs(tmp_path):
+    held = np.ones(1_000_000_000, dtype=np.uint8)
+    assert call(lambda: None, ("test",), tmp_path).memory < 300_000_000 < len(held)
+
+
 def test_a_kill_is_a_kill(tmp_path):
     outcome = call(wait_long, ("test",), tmp_path, kill=Kill(0.05, signal.SIGTERM))
     assert outcome.code == -signal.SIGTERM and outcome.seconds < 5.0
