@@ -92,7 +92,7 @@ def call(
     out, err, stack = (_file(folder, name) for name in ("out", "err", "stack"))
     sys.stdout.flush()
     sys.stderr.flush()
-    shared, child = _resident(os.getpid()), os.fork()
+    shared, child = _anonymous(os.getpid()), os.fork()
     if child == 0:
         _be_program(function, folder, out, err, stack)
     return _watched(child, arguments, (out, err, stack), limits, kill, shared)
@@ -225,11 +225,24 @@ def _queued_seconds(child: int) -> float:
     return 0.0
 
 
-def _resident(child: int) -> int:
+def _resident(process: int) -> int:
     """Bytes that a process holds."""
+    return _pages(process)[0]
+
+
+def _anonymous(process: int) -> int:
+    """Those that are of no file, with which a fork begins."""
+    resident, of_files = _pages(process)
+    return resident - of_files
+
+
+def _pages(process: int) -> tuple[int, int]:
+    """Bytes that a process holds, and those of them that are of files."""
     with suppress(OSError):
-        return int(Path(f"/proc/{child}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return 0
+        fields = Path(f"/proc/{process}/statm").read_text().split()
+        size = os.sysconf("SC_PAGE_SIZE")
+        return int(fields[1]) * size, int(fields[2]) * size
+    return 0, 0
 
 
 def _end(child: int) -> None:
