@@ -97,7 +97,6 @@ class ProjectionSteps(ParticleSolver):
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
         """Those of velocities that follow the shift and the repairs; None where they do not."""
-        self._followed = self.vectors()
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
@@ -229,7 +228,7 @@ class ProjectionSteps(ParticleSolver):
         end, x_now = self.iterates[iterations], self.repaired[repairs]["x_now"]
         v_end = end["u"]
         if self.following is not None:
-            moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self._followed}, self._followed
+            moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self.delta}, self.delta  # which is moved by now
             context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
         self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
         return v_end
