@@ -18,6 +18,7 @@ from cortado.device.kernels import Kernels
 from cortado.gradients import Tape
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.rollout.rollout import BackwardStep, Rollout
+from cortado.solvers.density import Density
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class OneKernelTape(Tape):
         step = super().derivative(rollout)
         loops = one_kernel_loops(step.solver.discretisation)
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
-        step.solver.density = wrong.pop("density", step.solver.density)
+        if "density" in wrong:
+            step.solver.density = Density(step.solver.discretisation, "one_kernel_loops", wrong.pop("density"))
         step.solver.kernels = replace(step.solver.kernels, **wrong)
         return step
 

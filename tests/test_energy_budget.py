@@ -82,7 +82,7 @@ class Step:
         """(n,) changes of number densities by the displacements [-], from the solver's kernel."""
         solver, n_dot = self.solver, wp.zeros_like(self.solver.fields["n"])
         x_dot = to_device(self.u, solver.discretisation.precision, solver.search.device)
-        solver.launch(solver.density.tangent, s=neighbourhood, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
+        solver.launch(solver.density.kernels.tangent, s=neighbourhood, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
         return n_dot.numpy().astype(np.float64)
 
     def gap(self, forces, compressions):

@@ -70,7 +70,7 @@ def test_a_sum_over_neighbours_has_a_thread_for_each_particle():
     solver = Simulation(plane()).solver
     context = solver.context(solver.new_parameters(1))
     with pytest.raises(TypeError, match="sums over neighbours, and has one thread for each particle"):
-        context.launch(solver.density.forward, threads=1)
+        context.launch(solver.density.kernels.forward, threads=1)
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import launch, launch_together
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 FURTHEST = 2.0**24
@@ -133,8 +134,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
-    module = wp.get_module(f"cortado_cells_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"cells_{precision.name}")
 
     @wp.func
     def is_astray(x: vector, grid: grid_type) -> bool:

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BRANCHES = 32
@@ -117,8 +118,7 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
 
 def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
     """A kernel of that name in a module of its own: what compiles for a GPU alone is in no module for a CPU."""
-    module = wp.get_module(f"cortado_{module_name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(module_name)
     function.__qualname__ = name
     return wp.kernel(function, module=module, enable_backward=False, **options)
 
@@ -126,8 +126,7 @@ def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
 @cache
 def add_kernel(dtype: Any) -> Any:
     """total += value, element by element."""
-    module = wp.get_module(f"cortado_add_{type_name(dtype)}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"add_{type_name(dtype)}")
 
     @wp.kernel(module=module, enable_backward=False)
     def accumulate(value: wp.array(dtype=dtype), total: wp.array(dtype=dtype)):

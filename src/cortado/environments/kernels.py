@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 FAR = wp.constant(1.0e30)
@@ -33,8 +34,7 @@ class EnvironmentKernels:
 def environment_kernels(precision: Precision) -> EnvironmentKernels:
     """In one precision; values to be added up are in float64."""
     real, vector = precision.real, precision.vector
-    module = wp.get_module(f"cortado_environments_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"environments_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def sample(

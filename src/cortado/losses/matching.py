@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 
@@ -22,8 +23,7 @@ def matching_kernels(precision: Precision) -> MatchingKernels:
     """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets, which
     are the same for every scene of a batch."""
     real, vector = precision.real, precision.vector
-    module = wp.get_module(f"cortado_matching_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"matching_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def squared_distance(

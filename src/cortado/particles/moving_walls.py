@@ -18,6 +18,7 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.cells import CellSort, Grid, cell_grid_type
 from cortado.device.launching import launch
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
@@ -82,8 +83,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     """Those that place wall particles, that write them in the order of their cells, that say where cells begin, and
     that write tangents."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    module = wp.get_module(f"cortado_moving_walls_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
     own_vectors = dict.fromkeys(("own", "own_feet", "own_slides"), vector)
     own_of: Any = bundle(**own_vectors, own_weights=real, own_grips=real, own_solids=wp.int32)

@@ -9,6 +9,7 @@ import warp as wp
 from cortado.device.arithmetic import arithmetic
 from cortado.device.kernels import kind_of
 from cortado.device.lanes import set_lanes
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
@@ -53,8 +54,7 @@ class Discretisation:
         images = "_periodic" * self.periodic + "_moving" * self.moving
         lanes = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
         beside = f"{images}{lanes}_beside_taped" if self.taped and not enable_backward else f"{images}{lanes}"
-        module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
-        module.options["enable_backward"] = enable_backward
+        module = kernel_module(f"{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}", enable_backward)
         set_lanes(module, self.lanes)
         return module
 

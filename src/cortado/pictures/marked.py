@@ -3,9 +3,10 @@
 import warp as wp
 
 from cortado.device.bands import BandLauncher
+from cortado.device.modules import kernel_module
 
 
-@wp.kernel(module=wp.get_module("cortado_marked"), enable_backward=False)
+@wp.kernel(module=kernel_module("marked"), enable_backward=False)
 def list_marked(
     first: wp.int32,
     marks: wp.array(dtype=wp.int32),

@@ -7,11 +7,12 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
+from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.words import counted
 
-MODULE = wp.get_module("cortado_liquid")
+MODULE = kernel_module("liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
 Look = wp.types.vector(5, wp.float32)
 """Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""

@@ -8,13 +8,14 @@ import warp as wp
 
 from cortado.device.bands import BandLauncher
 from cortado.device.launching import launch as launch_once
+from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
 from cortado.pictures.particles import Look, Particles
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage
 
-MODULE = wp.get_module("cortado_shadow")
+MODULE = kernel_module("shadow")
 NODES = 320
 """Along either side of the floor that may lie in shadow."""
 ABOVE = 1e-3

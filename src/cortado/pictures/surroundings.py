@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.pictures.lit_surface import LitSurface
 
 OPAQUE, CLEAR = wp.constant(0), wp.constant(1)
@@ -17,7 +18,7 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 def shading_module(has_opaque: bool, has_clear: bool) -> Any:
     """The Warp module of kernels for scenes with opaque or transparent solids, or with none."""
-    return wp.get_module("cortado_shading" + "_opaque" * has_opaque + "_clear" * has_clear)
+    return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
 
 
 @wp.struct

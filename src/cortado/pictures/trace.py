@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.pictures.glass import glass_functions
 from cortado.pictures.lit_surface import LitSurface, SurfaceHit, medium_at
 from cortado.pictures.solid_hit import meet_solid, reach_solid, shaded_solid
@@ -218,7 +219,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     return trace
 
 
-@wp.kernel(module=wp.get_module("cortado_contrast"), enable_backward=False)
+@wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(
     first: wp.int32,
     columns: wp.int32,

@@ -16,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.interpolation import interpolation_functions
@@ -90,8 +91,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     shining = brightness_functions(precision)
     brightness, brightness_derivative = shining.brightness, shining.brightness_derivative
     place = node_functions(precision).place
-    module = wp.get_module(f"cortado_absorption_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"absorption_{precision.name}")
 
     @wp.func
     def diagonal(nodes: nodes_struct) -> vector:

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 
@@ -29,8 +30,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernel
     """Kernels ``forward`` and ``tangent`` (which sort positions besides), and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
-    module = wp.get_module(f"cortado_phase_colour_{phases}_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"phase_colour_{phases}_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def phase_colour(

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import launch
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError
 from cortado.particles.arrays import components
@@ -99,8 +100,7 @@ def _numbers(array: wp.array) -> wp.array:
 def _kernels(precision: Precision) -> tuple[Any, Any]:
     """What writes rows to all scenes and steps, and the transpose."""
     real = precision.real
-    module = wp.get_module(f"cortado_device_rows_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"device_rows_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(

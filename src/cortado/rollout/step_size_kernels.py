@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 
@@ -23,8 +24,7 @@ class StepSizeKernels:
 def step_size_kernels(precision: Precision) -> StepSizeKernels:
     """The kernels for a precision."""
     real, pair, vector = precision.real, precision.pair, precision.vector
-    module = wp.get_module(f"cortado_step_sizes_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"step_sizes_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def speeds(v: wp.array(dtype=vector), squares: wp.array(dtype=pair)):

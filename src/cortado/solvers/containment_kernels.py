@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
 
@@ -72,8 +73,7 @@ def lost_kernel(precision: Precision) -> Any:
     """The kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
     bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), matrix_of(precision)
-    module = wp.get_module(f"cortado_containment_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"containment_{precision.name}")
 
     @wp.func
     def between(x: vector, lower: vector, upper: vector) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.solvers.containment_kernels import NO_PARTICLE
 
@@ -31,8 +32,7 @@ class ConvergenceKernels:
 def convergence_kernels(precision: Precision) -> ConvergenceKernels:
     """The kernels for a precision."""
     real, pair = precision.real, precision.pair
-    module = wp.get_module(f"cortado_convergence_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"convergence_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def decide(

@@ -1,6 +1,5 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
-from functools import partial
 from weakref import finalize
 
 import warp as wp
@@ -13,7 +12,6 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried
-from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
 
 
@@ -26,6 +24,7 @@ class ParticleTangent:
         self.dot = Tangents(fields, parameters_dot)
         """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
+        self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         self._parts = [part.new_tangent() for part in solver.parts]
         finalize(self, solver.launch.forget)
@@ -45,7 +44,7 @@ class ParticleTangent:
         self.carried_dot.sort(context, state_dot)
         for part in self._parts:
             part.begin(context, self.dot, state_dot)
-        context.launch(solver.density.tangent, *self.dot.named)
+        self.density.measure(context, self.dot)
         for part in self._parts:
             part.sort(context, self.dot, state_dot)
 
@@ -92,7 +91,7 @@ class ParticleAdjoint:
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Of what the step carries on, once `unsort` has been called."""
-        self._acceleration_bar = solver.vectors()
+        self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
         self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
         finalize(self, solver.launch.forget)
 
@@ -142,12 +141,9 @@ class ParticleAdjoint:
             acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """Of the parts, and of the particles' masses, in `ParticleSolver.sort`."""
+        """Of the parts in `ParticleSolver.sort`."""
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
-        with context.aside():
-            m_scene_bar = state_bar["reference_density"]
-            context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
 
     def begin_parts(self, context: StepContext, state_bar: State) -> None:
         """Of how the parts begin."""
@@ -157,9 +153,10 @@ class ParticleAdjoint:
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
         """Of the rest of `ParticleSolver.sort`."""
         solver, b = self._solver, self.bar.fields
-        context.launch(solver.density.adjoint, *self.bar.named)
-        densities = partial(density_solid_kernel, solver.discretisation, solver.topic)
-        self.bar.solids.add(context.launch, densities, *self.bar.named, bar=b["n"])
+        self.density.measure(context, self.bar)
+        with context.aside():
+            m_scene_bar = state_bar["reference_density"]
+            context.launch(solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
         self.begin_parts(context, state_bar)
         scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
         context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)

@@ -25,10 +25,10 @@ from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
+from cortado.solvers.density import Density
 from cortado.solvers.loop import IterationLog, Loop
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
-from cortado.sph.density import density_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, StepContext
@@ -96,10 +96,7 @@ class ParticleSolver:
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.density, self.integration = (
-            density_kernels(discretisation, self.topic),
-            integration_kernels(precision, requires_grad),
-        )
+        self.density, self.integration = self.new_density(), integration_kernels(precision, requires_grad)
         self.parts = (
             *(maker.part(layout, requires_grad) for maker in system.parts),
             *(force for force in self.forces if isinstance(force, Part)),
@@ -125,6 +122,10 @@ class ParticleSolver:
         self.generation = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
         self.resize(search.capacity)
+
+    def new_density(self) -> Density:
+        """What measures the number density in `sort`."""
+        return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
         """What a particle's pressure pushes walls along: with V^2 p_i / n_i^2, or what `density_power` says."""
@@ -212,7 +213,7 @@ class ParticleSolver:
         for part in self.parts:
             part.sort(context, state)
         self.search.fill(self._neighbourhood, self.fields["x"], self.containment.bad_step)
-        context.launch(self.density.forward)
+        self.density.measure(context)
         context.join()
         for part in self.parts:
             part.settle(context)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 import warp as wp
 
 from cortado.device.kernels import kind_of
+from cortado.device.modules import kernel_module
 from cortado.device.reduction import type_name
 from cortado.particles.fields import StateField
 from cortado.particles.state import Layout, State
@@ -48,6 +49,5 @@ class Carried:
 
 
 def _kernels(a: wp.array) -> OrderKernels:
-    module = wp.get_module(f"cortado_order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}")
-    module.options["enable_backward"] = a.requires_grad
+    module = kernel_module(f"order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}", a.requires_grad)
     return order_kernels(a.dtype, module)

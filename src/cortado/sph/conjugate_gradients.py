@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32, Precision
 from cortado.device.reduction import type_name
 from cortado.particles.state import Layout
@@ -37,8 +38,7 @@ class SolveKernels:
 def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
     """Of a precision, for numbers or vectors of it; ``going`` (members,) is 1 for a scene that goes on."""
     real = precision.real
-    module = wp.get_module(f"cortado_conjugate_gradients_{type_name(kind)}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
     square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
 
     @wp.kernel(module=module, enable_backward=False)

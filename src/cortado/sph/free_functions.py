@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bundles import bundle
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
 from cortado.sph.rotations import rotations
@@ -41,8 +42,7 @@ class FreeFunctions:
 
 def free_module(precision: Precision) -> Any:
     """The Warp module of kernels of free bodies that need no smoothing kernel."""
-    module = wp.get_module(f"cortado_free_bodies_derivative_{precision.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"free_bodies_derivative_{precision.name}")
     return module
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import kind_of
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
     """The Warp module of kernels that need no smoothing kernel; ``taped`` forward kernels get Warp's own adjoint."""
-    module = wp.get_module(f"cortado_integration_{kind_of(forward, taped)}_{precision.name}")
-    module.options["enable_backward"] = forward and taped
+    module = kernel_module(f"integration_{kind_of(forward, taped)}_{precision.name}", forward and taped)
     return module
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels, kind_of
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.sph.order import OrderKernels, order_kernels
 
@@ -21,8 +22,7 @@ from cortado.sph.order import OrderKernels, order_kernels
 def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:
     """The Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels get
     Warp's own adjoint."""
-    module = wp.get_module(f"cortado_mixture_{kind_of(forward, taped)}_{phases}_{precision.name}")
-    module.options["enable_backward"] = forward and taped
+    module = kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
     return module
 
 

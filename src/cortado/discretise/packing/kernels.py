@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT64
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
@@ -103,8 +104,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
     """The kernels for a smoothing kernel."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
-    module = wp.get_module(f"cortado_packing_{smoothing.name}")
-    module.options["enable_backward"] = False
+    module = kernel_module(f"packing_{smoothing.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def look_around(

@@ -6,14 +6,15 @@ which the first has triangles ``starts[0]`` to ``starts[1]``.
 
 import warp as wp
 
+from cortado.device.modules import kernel_module
+
 DEPTH = 32
 """Nodes that may wait on the way down, more than a tree has levels."""
 real, vector = wp.float64, wp.vec3d
 box = wp.types.vector(length=6, dtype=wp.float64)
 """Lower and upper corner."""
 waiting_nodes, waiting_squares = wp.types.vector(length=DEPTH, dtype=wp.int32), wp.types.vector(DEPTH, wp.float64)
-_module = wp.get_module("cortado_triangle_tree")
-_module.options["enable_backward"] = False
+_module = kernel_module("triangle_tree")
 
 
 @wp.func

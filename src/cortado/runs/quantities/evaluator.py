@@ -181,6 +181,7 @@ class QuantityEvaluator:
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)
+        adjoint.density.begin()
         adjoint.bar.fields.assign(fields)
         adjoint.mix(context, state_bar)
         adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self._solver.carried_fields})

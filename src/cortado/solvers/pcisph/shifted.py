@@ -4,7 +4,7 @@ step: it is found from the state that the step begins from, x' = x* + delta(x, v
 """
 
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, Self
 
 import warp as wp
@@ -16,14 +16,13 @@ from cortado.particles.state import Layout, Parameters, State
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.solver import Pcisph
-from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.measured import Surroundings
 from cortado.solvers.projection.shifting import shift_kernels
-from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity_gradient import velocity_gradient_kernels
 from cortado.solvers.solver import StepAdjoint
 from cortado.sph.integration import integration_module
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import matrix_type
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -85,52 +84,43 @@ def place_kernels(precision: Precision) -> tuple[Any, Any]:
     return place, place_adjoint
 
 
+class SurroundingsApart(Surroundings):
+    """Those of a solver that measures the density itself: their own one, to the last places the same, stands apart."""
+
+    def like_density(self, suffix: str) -> dict[str, wp.array]:
+        return self.arrays(suffix, n=self.layout.precision.real)
+
+
 class Shift(Part):
     """The shift of the particles of one solver."""
 
     def __init__(self, maker: ShiftMaker, layout: Layout):
-        precision, own = layout.precision, (maker.discretisation, maker.dimension)
-        self.discretisation = maker.discretisation
-        self.surroundings, self.gradient = surrounding_kernels(*own), velocity_gradient_kernels(*own)
-        self.shift = shift_kernels(*own)
-        self.place, self.place_adjoint = place_kernels(precision)
-        constants = maker.constants
-        self.constants = {
-            "least": constants.least_diagonal,
-            "per_nearest": 1.0 / constants.nearest_weight,
-            "spacing": constants.spacing,
-        }
-        self.layout = layout
-        self.around, self.flow = self.like_around(""), self.like_flow("")
+        own = maker.discretisation, maker.dimension
+        self.surroundings = SurroundingsApart(maker.discretisation, layout, "", maker.dimension, maker.constants)
+        self.gradient, self.shift = velocity_gradient_kernels(*own), shift_kernels(*own)
+        self.place, self.place_adjoint = place_kernels(layout.precision)
+        self.constants = {**self.surroundings.constants, "spacing": maker.constants.spacing}
+        self.flow, self.unpulled = self.like_flow(""), self.like_pull("")
+        """A; and no tension, as the pressure is not yet known."""
         self._free, self._delta = layout.state((POSITIONS,)).positions, self.vectors()
-        self.unpulled = self.like_pull("")
-        """No tension: the pressure is not yet known."""
-
-    def arrays(self, suffix: str, **kinds: Any) -> dict[str, wp.array]:
-        """Arrays (n,) of zeros by name and suffix, of Warp types."""
-        size, device = self.layout.all_particles, self.layout.device
-        return {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
-
-    def like_around(self, suffix: str) -> dict[str, wp.array]:
-        """Room for tangents or adjoints of what is around particles."""
-        return self.arrays(suffix, **entries(self.layout.precision))
 
     def like_flow(self, suffix: str) -> dict[str, wp.array]:
         """Room for A, its tangents or its adjoints."""
-        return self.arrays(suffix, A=matrix_type(self.layout.precision))
+        return self.surroundings.arrays(suffix, A=matrix_type(self.surroundings.layout.precision))
 
     def like_pull(self, suffix: str) -> dict[str, wp.array]:
         """Room for tangents or adjoints of k."""
-        return self.arrays(suffix, k=self.layout.precision.real)
+        return self.surroundings.arrays(suffix, k=self.surroundings.layout.precision.real)
 
     def vectors(self) -> wp.array:
         """(n,) vectors, all 0."""
-        return self.arrays("", one=self.layout.precision.vector)["one"]
+        return self.surroundings.arrays("", one=self.surroundings.layout.precision.vector)["one"]
 
     def settle(self, step: StepContext) -> None:
-        step.launch(self.surroundings.forward, self.around, self.constants)
+        self.surroundings.measure(step)
+        known = self.surroundings.around, self.flow
         step.launch(self.gradient.forward, self.flow, v_flow=step.fields["v"])
-        step.launch(self.shift.forward, self.around, self.flow, self.constants, self.unpulled, delta=self._delta)
+        step.launch(self.shift.forward, *known, self.constants, self.unpulled, delta=self._delta)
 
     def target(self, moved: State) -> State:
         return State((POSITIONS, VELOCITIES), {"positions": self._free, "velocities": moved.velocities}, moved.batch)
@@ -150,13 +140,13 @@ class ShiftTangent(PartTangent):
 
     def __init__(self, shift: Shift):
         self._shift, self._delta_dot = shift, shift.vectors()
-        self._around, self._unpulled = shift.like_around("_dot"), shift.like_pull("_dot")
+        self._surroundings, self._unpulled = shift.surroundings.new_tangent(), shift.like_pull("_dot")
         self._flow = shift.like_flow("_dot")
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        shift = self._shift
-        known = (*dot.named, self._around, shift.around, shift.constants, shift.unpulled, self._unpulled)
-        step.launch(shift.surroundings.tangent, *known)
+        shift, own = self._shift, self._surroundings
+        own.measure(step, dot)
+        known = (*dot.named, own.around, shift.surroundings.around, shift.constants, shift.unpulled, self._unpulled)
         step.launch(shift.gradient.tangent, *known, self._flow, v_flow=step.fields["v"], v_flow_dot=dot.fields["v"])
         step.launch(shift.shift.tangent, *known, shift.flow, self._flow, delta_dot=self._delta_dot)
 
@@ -170,23 +160,19 @@ class ShiftAdjoint(PartAdjoint):
 
     def __init__(self, shift: Shift):
         self._shift, self._delta_bar = shift, shift.vectors()
-        self._around, self._flow = shift.like_around("_bar"), shift.like_flow("_bar")
+        self._surroundings, self._flow = shift.surroundings.new_adjoint(), shift.like_flow("_bar")
         self._unused = shift.like_pull("_bar")
-        six = symmetric(shift.layout.precision).kind
-        self._moments = shift.arrays("_pull", M=six, Q=six)
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         step.launch(self._shift.place_adjoint, x_scene_bar=moved_bar.positions, delta_bar=self._delta_bar)
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        shift = self._shift
-        for array in (*self._around.values(), *self._flow.values()):
+        shift, own = self._shift, self._surroundings
+        own.begin()
+        for array in self._flow.values():
             array.zero_()
-        around = (*bar.named, self._around, shift.around)
-        known = (*around, shift.constants, shift.unpulled, self._unused)
+        known = (*bar.named, own.around, shift.surroundings.around, shift.constants, shift.unpulled, self._unused)
         step.launch(shift.shift.adjoint, *known, self._flow, shift.flow, delta_bar=self._delta_bar)
         step.launch(shift.gradient.adjoint, *known, self._flow, v_flow=step.fields["v"], v_flow_bar=bar.fields["v"])
-        for kernel in shift.surroundings.adjoint:
-            step.launch(kernel, *known, self._moments)
-        bar.solids.add(step.launch, partial(beside_solid_kernel, shift.discretisation), *around)
+        own.measure(step, bar)

@@ -10,8 +10,8 @@ from cortado.device.binding import Named
 from cortado.device.launching import add
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
-from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
+from cortado.solvers.projection.measured import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
 from cortado.solvers.solver import Counts, WithinBar
@@ -20,18 +20,15 @@ from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
 
 
-def named(arrays: dict[str, wp.array], suffix: str) -> dict[str, wp.array]:
-    """Tangents or adjoints by the names that kernels have for them."""
-    return {f"{name}_{suffix}": array for name, array in arrays.items()}
-
-
 class ProjectionTangent(ParticleTangent):
     """Forward mode, one step at a time, of a run along tangents of its parameters."""
+
+    density: SurroundingsTangent
 
     def __init__(self, solver: ProjectionSteps, parameters_dot: Parameters):
         super().__init__(solver, parameters_dot)
         self._solver: ProjectionSteps = solver
-        self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "dot")
+        self._around = self.density.around
         self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
         self._x_star_dot, self._v_star_dot, self._kick_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
@@ -47,7 +44,6 @@ class ProjectionTangent(ParticleTangent):
         context = solver.context(parameters)
         self.sort(context, state_dot)
         known = (*self.dot.named, self._around, solver.around)
-        context.launch(kernels.surroundings.tangent, *known, solver.relaxed, solver.spaced)
         if self._bodies is not None:
             self._bodies.begin(context, self.dot, solver.around, self._around)
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
@@ -114,17 +110,18 @@ class ProjectionTangent(ParticleTangent):
 class ProjectionAdjoint(ParticleAdjoint):
     """Reverse mode, one step at a time, of a run with some parameters."""
 
+    density: SurroundingsAdjoint
+
     def __init__(self, solver: ProjectionSteps, steps: int):
         super().__init__(solver, steps)
         self._solver: ProjectionSteps = solver
-        self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
+        self._around = self.density.around
         self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
         self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         six = solver.pull.dtype
         pull = solver.new_arrays(T=six, S=six)
         self._pull, self._push = pull["T"], pull["S"]
-        self._moments = solver.new_arrays(M_pull=six, Q_pull=six)
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
@@ -164,8 +161,9 @@ class ProjectionAdjoint(ParticleAdjoint):
         new = {"x": self._x_now_bar, "v": self._u_bar, "m": self._m_unused}
         context.launch(solver.integration.sort, scene, new)
         own = (self._x_moved_bar, self._c_bar, self._y_bar, self._A_bar)
-        for array in (*self.bar.fields.arrays(), *self._around.values(), *own):
+        for array in (*self.bar.fields.arrays(), *own):
             array.zero_()
+        self.density.begin()
         wp.copy(self._k_bar, self.carried_bar[IMPULSE])
         wp.copy(self._kick_bar, self.carried_bar[KICK])
         if self._bodies is not None:
@@ -193,10 +191,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         context.launch(kernels.pressure.start.adjoint, *known, before, steps)
         if self._bodies is not None:
             self._bodies.finish(context, self.bar, solver.around, self._around)
-        own, sums = kernels.surroundings.adjoint
-        for kernel in (own, sums):
-            context.launch(kernel, *known, self._moments, solver.relaxed, solver.spaced)
-        self.bar.solids.add(context.launch, partial(beside_solid_kernel, solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
         self.mix(context, state_bar)

@@ -19,11 +19,11 @@ from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.following import following_kernels
+from cortado.solvers.projection.measured import Surroundings
 from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.shifting import shift_kernels
-from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.wall_push import ProjectionPush
 from cortado.solvers.solver import Counts
@@ -46,7 +46,6 @@ times the stiffest wave of the lattice, and two of them up to 1.6 times."""
 class ProjectionKernels:
     """The kernels that only the projection needs."""
 
-    surroundings: Any
     velocity: VelocityKernels
     pressure: PressureKernels
     shift: Any
@@ -58,7 +57,6 @@ class ProjectionKernels:
         """In 2 or 3 dimensions."""
         own = discretisation, dimension
         return cls(
-            surrounding_kernels(*own),
             velocity_kernels(*own),
             pressure_kernels(*own),
             shift_kernels(*own),
@@ -71,6 +69,7 @@ class ProjectionSteps(ParticleSolver):
     """The steps of one set of particles, forward."""
 
     topic = "projection"
+    density: Surroundings
     density_power = 0
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER), StateField(KICK, "m/s", Entry.VECTOR))
 
@@ -79,11 +78,9 @@ class ProjectionSteps(ParticleSolver):
     ):
         """Of so many iterations of the pressure and of the repair of density in every step; velocities ``follow`` the
         shift and the repairs, or stay as they are."""
-        super().__init__(system)
         self.constants = constants
+        super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
-        self.around = self.new_arrays(**entries(system.layout.precision))
-        """Of the neighbourhoods, see `cortado.solvers.projection.surroundings`."""
         precision = self.layout.precision
         real, vector = precision.real, precision.vector
         self.pull = self.new_arrays(T=symmetric(precision).kind)["T"]
@@ -109,6 +106,15 @@ class ProjectionSteps(ParticleSolver):
             Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, names, strict=True)
         )
 
+    def new_density(self) -> Surroundings:
+        own = self.discretisation, self.layout, self.topic, self.system.walled.dimension
+        return Surroundings(*own, self.constants)
+
+    @property
+    def around(self) -> dict[str, wp.array]:
+        """What surrounds particles, see `cortado.solvers.projection.surroundings`."""
+        return self.density.around
+
     def wall_push(self) -> ProjectionPush:
         return ProjectionPush(self.discretisation, self.layout, self.constants, self.lattice.volume)
 
@@ -120,12 +126,12 @@ class ProjectionSteps(ParticleSolver):
     @cached_property
     def relaxed(self) -> dict[str, float]:
         """Constants of the iterations, as kernels call them."""
-        return {"omega": self.constants.relaxation, "least": self.constants.least_diagonal}
+        return {"omega": self.constants.relaxation}
 
     @cached_property
     def spaced(self) -> dict[str, float]:
-        """Constants of the crowding and of the shift, as kernels call them."""
-        return {"per_nearest": 1.0 / self.constants.nearest_weight, "spacing": self.constants.spacing}
+        """Constants of the shift, as kernels call them."""
+        return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
         context = self.begin(state, parameters)
@@ -173,7 +179,6 @@ class ProjectionSteps(ParticleSolver):
     def begin(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first one."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
-        context.launch(kernels.surroundings.forward, self.around, self.relaxed, self.spaced)
         if self.bodies is not None:
             self.bodies.begin(context, self.around)
         predicted = {"x_star": self.x_star, "v_star": self.v_star}

@@ -30,11 +30,12 @@ class ProjectionSums:
     """Warp functions. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
 
     moments: Any
-    """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij and the crowding sum (1 + R q / (1 + q / 4))
-    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``."""
+    """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
+    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``, and
+    sum V W_ij, to which what fills lists up adds."""
     moments_tangent: Any
     moments_back: Any
-    """What adjoints of the moments give to x and m."""
+    """What adjoints of the moments, and ``n_bar`` of the last one, give to x and m."""
     force: Any
     """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
     force_tangent: Any
@@ -98,11 +99,12 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     @fluid_sum(discretisation)
     def moments(
         x_ij: vector, m_i: real, m_j: real, per_nearest: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, vector]:
+    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
         g = s.volume * gradient(x_ij, s)
         q = mobility(m_i, m_j) * g
-        crowd = closeness(s.volume * weight(x_ij, s) * per_nearest) * g
-        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd
+        near = s.volume * weight(x_ij, s)
+        crowd = closeness(near * per_nearest) * g
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd, near
 
     @tangent_of(moments)
     @fluid_sum(discretisation, ahead=False)
@@ -115,14 +117,15 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         m_dot_j: real,
         per_nearest: real,
         s: neighbourhood,
-    ) -> tuple[vector, vector, vector, vector, vector, vector]:
+    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
         g = s.volume * gradient(x_ij, s)
         g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
         per = mobility(m_i, m_j)
         h_dot = slope_of_h(m_i, m_j) * m_dot_i + slope_of_h(m_j, m_i) * m_dot_j
         q, q_dot = per * g, per * g_dot + ((h_dot - per * m_dot_j) / m_j) * g
         near = s.volume * weight(x_ij, s) * per_nearest
-        more = closeness_derivative(near) * wp.dot(g, x_dot_ij) * per_nearest
+        near_dot = wp.dot(g, x_dot_ij)
+        more = closeness_derivative(near) * near_dot * per_nearest
         return (
             -wp.cw_mul(g_dot, x_ij) - wp.cw_mul(g, x_dot_ij),
             -cross_terms(g_dot, x_ij) - cross_terms(g, x_dot_ij),
@@ -130,6 +133,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             cross_terms(q_dot, g) + cross_terms(q, g_dot),
             g_dot,
             closeness(near) * g_dot + more * g,
+            near_dot,
         )
 
     @fluid_sum(discretisation)
@@ -143,6 +147,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         Q_bar_j: six,
         g_bar_ij: vector,
         crowd_bar_ij: vector,
+        n_bar_i: real,
+        n_bar_j: real,
         per_nearest: real,
         s: neighbourhood,
     ) -> tuple[vector, real]:
@@ -151,7 +157,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         from_i, from_j, per = times(Q_bar_i, g), times(Q_bar_j, g), mobility(m_j, m_i)
         both = mobility(m_i, m_j) * from_i + per * from_j
         near = s.volume * weight(x_ij, s) * per_nearest
-        more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) * per_nearest
+        more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) * per_nearest + n_bar_i + n_bar_j
         bent = real(2.0) * both + g_bar_ij + closeness(near) * crowd_bar_ij - stretch
         x_part = s.volume * (hessian_product(x_ij, bent, s) - slope(x_ij, s) * stretch) + more * g
         h = slope_of_h(m_i, m_j)

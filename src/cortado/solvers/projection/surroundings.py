@@ -1,5 +1,5 @@
-"""The kernels of what surrounds particles: the moments of neighbours, what is beside walls, and what follows from them
-(`cortado.solvers.projection.effects`).
+"""The kernels of what surrounds particles: their number density (`cortado.sph.density`) and the moments of neighbours,
+what is beside walls, and what follows from them (`cortado.solvers.projection.effects`).
 """
 
 from functools import cache
@@ -28,8 +28,8 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of the moments of neighbours, and of L, a and the weights that follow from them. Those of the adjoint
-    hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
+    """The kernels of n and the moments of neighbours, and of L, a and the weights that follow from them. Those of the
+    adjoint hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -61,10 +61,11 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         # out
+        n: wp.array(dtype=real),
         of: around,
     ):
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g, crowd = moments(i, x, m, per_nearest, s)
+        diagonal, others, square, mixed, g, crowd, near = moments(i, x, m, per_nearest, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
         if lane() > 0:
             return
@@ -72,6 +73,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         gamma = normal + e * (entire - normal)
         M, Q = whole(diagonal, others), change(square, mixed)
         L = correction_of(M, gamma, nu, least)
+        n[i] = s.volume * real(1 - s.filling[i]) * s.self_weight + near + nu
         of.M[i] = M
         of.Q[i] = Q
         of.g[i] = g
@@ -101,11 +103,14 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         m_dot: wp.array(dtype=real),
         of: around,
         # out
+        n_dot: wp.array(dtype=real),
         dot: around,
     ):
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g_i_dot, crowd_dot = moments_tangent(i, x, x_dot, m, m_dot, per_nearest, s)
+        diagonal, others, square, mixed, g_i_dot, crowd_dot, near_dot = moments_tangent(
+            i, x, x_dot, m, m_dot, per_nearest, s
+        )
         normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         if lane() > 0:
             return
@@ -138,6 +143,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
                 weights_dot[k - 9] = entry
             else:
                 a_dot = entry
+        n_dot[i] = near_dot + nu_i_dot
         dot.M[i] = M_i_dot
         dot.Q[i] = Q_i_dot
         dot.g[i] = g_i_dot
@@ -154,6 +160,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def own_adjoint(
         least: real,
         m: wp.array(dtype=real),
+        n_bar: wp.array(dtype=real),
         of: around,
         # in and out
         m_bar: wp.array(dtype=real),
@@ -171,7 +178,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         M_pull[i] = pack(bar.M[i] + M_bar)
         Q_pull[i] = pack(Q_bar)
         bar.g[i] = bar.g[i] + g_bar
-        bar.nu[i] = bar.nu[i] + nu_bar
+        bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i]
         push_bar, drift_bar, e = bar.gamma[i] + gamma_bar, bar.drift[i], of.edge[i]
         e_bar = bar.edge[i] + wp.dot(push_bar, of.whole[i] - of.normal[i])
         e_bar += drift_bar * (of.whole_drift[i] - of.normal_drift[i])
@@ -188,6 +195,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
+        n_bar: wp.array(dtype=real),
         M_pull: wp.array(dtype=six),
         Q_pull: wp.array(dtype=six),
         bar: around,
@@ -196,7 +204,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_part, m_part = moments_back(i, x, m, M_pull, Q_pull, bar.g, bar.crowd, per_nearest, s)
+        x_part, m_part = moments_back(i, x, m, M_pull, Q_pull, bar.g, bar.crowd, n_bar, per_nearest, s)
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
         if lane() > 0:
             return

@@ -1,0 +1,86 @@
+"""What the projection measures of a particle's neighbours, n among it, with its derivatives: see
+`cortado.solvers.projection.surroundings`."""
+
+from functools import partial
+from typing import Any
+
+import warp as wp
+
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.state import Layout
+from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
+from cortado.solvers.projection.beside import beside_solid_kernel
+from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.surroundings import entries, surrounding_kernels
+from cortado.sph.moment_functions import symmetric
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+
+class Surroundings(Density):
+    """Writes n and all of ``around``."""
+
+    def __init__(
+        self, discretisation: Discretisation, layout: Layout, topic: str, dimension: int, constants: ProjectionConstants
+    ):
+        super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
+        self.layout = layout
+        self.around, self.density = self.like_around(""), self.like_density("")
+        self.constants = {"least": constants.least_diagonal, "per_nearest": 1.0 / constants.nearest_weight}
+        """As kernels call them."""
+
+    def arrays(self, suffix: str, **kinds: Any) -> dict[str, wp.array]:
+        """Arrays (n,) of zeros by name and suffix, of Warp types."""
+        size, device = self.layout.all_particles, self.layout.device
+        return {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
+
+    def like_around(self, suffix: str) -> dict[str, wp.array]:
+        """Room for what is around particles, its tangents or its adjoints."""
+        return self.arrays(suffix, **entries(self.layout.precision))
+
+    def like_density(self, suffix: str) -> dict[str, wp.array]:
+        """Room for n, its tangents or its adjoints, if they are not those of the step's fields."""
+        return {}
+
+    def measure(self, context: StepContext) -> None:
+        context.launch(self.kernels.forward, self.around, self.constants, **self.density)
+
+    def new_tangent(self) -> "SurroundingsTangent":
+        return SurroundingsTangent(self)
+
+    def new_adjoint(self) -> "SurroundingsAdjoint":
+        return SurroundingsAdjoint(self)
+
+
+class SurroundingsTangent(DensityTangent):
+    """Forward mode."""
+
+    def __init__(self, surroundings: Surroundings):
+        super().__init__(surroundings)
+        self._surroundings = surroundings
+        self.around, self._n = surroundings.like_around("_dot"), surroundings.like_density("_dot")
+
+    def measure(self, context: StepContext, dot: Tangents) -> None:
+        own = self._surroundings
+        context.launch(own.kernels.tangent, *dot.named, self.around, own.around, own.constants, **self._n)
+
+
+class SurroundingsAdjoint(DensityAdjoint):
+    """Reverse mode."""
+
+    def __init__(self, surroundings: Surroundings):
+        super().__init__(surroundings)
+        self._surroundings = surroundings
+        self.around, self._n = surroundings.like_around("_bar"), surroundings.like_density("_bar")
+        six = symmetric(surroundings.layout.precision).kind
+        self._moments = surroundings.arrays("_pull", M=six, Q=six)
+
+    def begin(self) -> None:
+        for array in self.around.values():
+            array.zero_()
+
+    def measure(self, context: StepContext, bar: Adjoints) -> None:
+        """From the adjoints of n and of all around to those of positions, masses and solids."""
+        own, known = self._surroundings, (*bar.named, self.around, self._surroundings.around)
+        for kernel in own.kernels.adjoint:
+            context.launch(kernel, *known, self._moments, own.constants, **self._n)
+        bar.solids.add(context.launch, partial(beside_solid_kernel, own.discretisation), *known)
