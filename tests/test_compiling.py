@@ -14,6 +14,7 @@ from compiling_notice import COMPILING, UNOPTIMISED
 from cortado.device import compiling
 from cortado.device.compiling import kernels_of
 from cortado.device.kernels import is_derivative
+from cortado.device.modules import DEEP, SHALLOW, kernel_module
 from scenes import plane, pour
 
 FIRST = {
@@ -184,3 +185,31 @@ def test_what_is_compiled_meanwhile_is_waited_for_and_not_compiled_again(monkeyp
     Timer(0.1, wanted.set).start()
     compiling.compile_ahead(solver, wp.get_device("cpu"))
     assert len(compiled) == len(set(compiled)) == len(done) > 1
+
+
+@pytest.mark.parametrize(
+    "given, wanted",
+    [
+        (f"-march=native -mllvm={SHALLOW}", f"-march=native -mllvm={DEEP}"),
+        ("-march=native -O1", "-march=native -O1"),
+        ("", ""),
+        (None, None),
+    ],
+)
+def test_kernels_for_a_cpu_are_vectorised_deeper_unless_flags_are_given(monkeypatch, given, wanted):
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", given)
+    assert kernel_module("of_a_test").options["cpu_compiler_flags"] == wanted
+
+
+def test_warps_own_flags_are_those_that_were_measured():
+    program = "import warp; print(warp.config.cpu_compiler_flags)"  # in the tests they are others
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert SHALLOW in found.stdout
+
+
+def test_all_modules_are_compiled_with_the_same_flags():
+    from warp._src.context import user_modules
+
+    cortado.Simulation(plane()).run(1)
+    ours = [module for name, module in user_modules.items() if name.startswith("cortado_") and "of_a_test" not in name]
+    assert ours and all(module.options["cpu_compiler_flags"] is not None for module in ours)

@@ -11,7 +11,7 @@ from cortado.particles.state import Layout
 from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
-from cortado.solvers.projection.surroundings import entries, surrounding_kernels
+from cortado.solvers.projection.surroundings import adjoint_entries, entries, surrounding_kernels
 from cortado.sph.moment_functions import symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -24,7 +24,7 @@ class Surroundings(Density):
     ):
         super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
         self.layout = layout
-        self.around, self.density = self.like_around(""), self.like_density("")
+        self.around, self.density = self.arrays("", **entries(layout.precision)), self.like_density("")
         self.constants = {"least": constants.least_diagonal, "per_nearest": 1.0 / constants.nearest_weight}
         """As kernels call them."""
 
@@ -32,10 +32,6 @@ class Surroundings(Density):
         """Arrays (n,) of zeros by name and suffix, of Warp types."""
         size, device = self.layout.all_particles, self.layout.device
         return {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
-
-    def like_around(self, suffix: str) -> dict[str, wp.array]:
-        """Room for what is around particles, its tangents or its adjoints."""
-        return self.arrays(suffix, **entries(self.layout.precision))
 
     def like_density(self, suffix: str) -> dict[str, wp.array]:
         """Room for n, its tangents or its adjoints, if they are not those of the step's fields."""
@@ -57,7 +53,8 @@ class SurroundingsTangent(DensityTangent):
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
         self._surroundings = surroundings
-        self.around, self._n = surroundings.like_around("_dot"), surroundings.like_density("_dot")
+        self.around = surroundings.arrays("_dot", **entries(surroundings.layout.precision))
+        self._n = surroundings.like_density("_dot")
 
     def measure(self, context: StepContext, dot: Tangents) -> None:
         own = self._surroundings
@@ -69,9 +66,11 @@ class SurroundingsAdjoint(DensityAdjoint):
 
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
+        precision = surroundings.layout.precision
         self._surroundings = surroundings
-        self.around, self._n = surroundings.like_around("_bar"), surroundings.like_density("_bar")
-        six = symmetric(surroundings.layout.precision).kind
+        self.around = surroundings.arrays("_bar", **adjoint_entries(precision))
+        self._n = surroundings.like_density("_bar")
+        six = symmetric(precision).kind
         self._moments = surroundings.arrays("_pull", M=six, Q=six)
 
     def begin(self) -> None:

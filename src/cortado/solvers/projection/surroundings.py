@@ -26,6 +26,11 @@ def entries(precision: Precision) -> dict[str, Any]:
     return {**own, "L": matrix, "a": real, "crowd": vector, "weights": weights_type(precision)}
 
 
+def adjoint_entries(precision: Precision) -> dict[str, Any]:
+    """Of what adjoints are added up of: all but Q, which nothing but a depends on."""
+    return {name: kind for name, kind in entries(precision).items() if name != "Q"}
+
+
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """The kernels of n and the moments of neighbours, and of L, a and the weights that follow from them. Those of the
@@ -48,7 +53,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     edge = edge_functions(precision, dimension, module).edge
     edge_along = edge_functions(precision, dimension, tangent_module).back
     edge_back = edge_functions(precision, dimension, adjoint_module).back
-    around = bundle(**entries(precision))
+    around, bars = bundle(**entries(precision)), bundle(**adjoint_entries(precision))
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
@@ -164,7 +169,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of: around,
         # in and out
         m_bar: wp.array(dtype=real),
-        bar: around,
+        bar: bars,
         # out
         M_pull: wp.array(dtype=six),
         Q_pull: wp.array(dtype=six),
@@ -198,7 +203,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         n_bar: wp.array(dtype=real),
         M_pull: wp.array(dtype=six),
         Q_pull: wp.array(dtype=six),
-        bar: around,
+        bar: bars,
         # in and out
         x_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
