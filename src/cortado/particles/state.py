@@ -196,6 +196,10 @@ class Layout:
         """Sums over the particles of each scene of numbers, vectors or matrices of a Warp type."""
         return sum_of(dtype, self.particles, self.device, self.members)
 
+    def arrays(self, suffix: str = "", **kinds: Any) -> dict[str, wp.array]:
+        """Arrays (n,) over all particles, all 0, of Warp types by name, to which a ``suffix`` is added."""
+        return zeros({f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}, self.device)
+
     def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
         """A state of these fields, all 0."""
         precision = self.precision

@@ -42,8 +42,7 @@ class FreeFunctions:
 
 def free_module(precision: Precision) -> Any:
     """The Warp module of kernels of free bodies that need no smoothing kernel."""
-    module = kernel_module(f"free_bodies_derivative_{precision.name}")
-    return module
+    return kernel_module(f"free_bodies_derivative_{precision.name}")
 
 
 @cache

@@ -13,8 +13,7 @@ from cortado.device.precision import Precision
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
     """The Warp module of kernels that need no smoothing kernel; ``taped`` forward kernels get Warp's own adjoint."""
-    module = kernel_module(f"integration_{kind_of(forward, taped)}_{precision.name}", forward and taped)
-    return module
+    return kernel_module(f"integration_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
 @cache

@@ -22,8 +22,7 @@ from cortado.sph.order import OrderKernels, order_kernels
 def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:
     """The Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels get
     Warp's own adjoint."""
-    module = kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
-    return module
+    return kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
 
 
 @dataclass(frozen=True)

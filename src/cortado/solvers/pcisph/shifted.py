@@ -88,14 +88,14 @@ class SurroundingsApart(Surroundings):
     """Those of a solver that measures the density itself: their own one, to the last places the same, stands apart."""
 
     def like_density(self, suffix: str) -> dict[str, wp.array]:
-        return self.arrays(suffix, n=self.layout.precision.real)
+        return self.layout.arrays(suffix, n=self.layout.precision.real)
 
 
 class Shift(Part):
     """The shift of the particles of one solver."""
 
     def __init__(self, maker: ShiftMaker, layout: Layout):
-        own = maker.discretisation, maker.dimension
+        self.layout, own = layout, (maker.discretisation, maker.dimension)
         self.surroundings = SurroundingsApart(maker.discretisation, layout, "", maker.dimension, maker.constants)
         self.gradient, self.shift = velocity_gradient_kernels(*own), shift_kernels(*own)
         self.place, self.place_adjoint = place_kernels(layout.precision)
@@ -106,15 +106,15 @@ class Shift(Part):
 
     def like_flow(self, suffix: str) -> dict[str, wp.array]:
         """Room for A, its tangents or its adjoints."""
-        return self.surroundings.arrays(suffix, A=matrix_type(self.surroundings.layout.precision))
+        return self.layout.arrays(suffix, A=matrix_type(self.layout.precision))
 
     def like_pull(self, suffix: str) -> dict[str, wp.array]:
         """Room for tangents or adjoints of k."""
-        return self.surroundings.arrays(suffix, k=self.surroundings.layout.precision.real)
+        return self.layout.arrays(suffix, k=self.layout.precision.real)
 
     def vectors(self) -> wp.array:
         """(n,) vectors, all 0."""
-        return self.surroundings.arrays("", one=self.surroundings.layout.precision.vector)["one"]
+        return self.layout.arrays(one=self.layout.precision.vector)["one"]
 
     def settle(self, step: StepContext) -> None:
         self.surroundings.measure(step)

@@ -22,17 +22,12 @@ class Held:
 
     def __init__(self, body: FreeBody, layout: Layout, suffix: str = ""):
         self.body, self._layout = body, layout
-        precision, device, size = layout.precision, layout.device, layout.all_particles
-        kinds = {"gamma_of": precision.vector, "arm": precision.vector, "sizes": precision.pair}
-        self.known = {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
-        self.shares = {
-            f"{name}{suffix}": wp.zeros(size, dtype=precision.vector, device=device) for name in ("pulled", "twisted")
-        }
-        self.moved = {
-            f"{name}{suffix}": wp.zeros(layout.members, dtype=precision.vector, device=device) for name in "VWL"
-        }
+        precision, vector, device = layout.precision, layout.precision.vector, layout.device
+        self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
+        self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
+        self.moved = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in "VWL"}
         """V, W and L of an iteration."""
-        self._sums = [layout.sum_of(precision.vector) for _ in range(2)]
+        self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
         """The sums of the sizes."""

@@ -29,7 +29,7 @@ class ProjectionTangent(ParticleTangent):
         super().__init__(solver, parameters_dot)
         self._solver: ProjectionSteps = solver
         self._around = self.density.around
-        self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
+        self._pull = solver.layout.arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
         self._x_star_dot, self._v_star_dot, self._kick_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
         self._v_end_dot = self._u_dot if solver.following is None else solver.vectors()
@@ -120,7 +120,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         six = solver.pull.dtype
-        pull = solver.new_arrays(T=six, S=six)
+        pull = solver.layout.arrays(T=six, S=six)
         self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))

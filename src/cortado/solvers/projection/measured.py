@@ -2,7 +2,6 @@
 `cortado.solvers.projection.surroundings`."""
 
 from functools import partial
-from typing import Any
 
 import warp as wp
 
@@ -24,21 +23,16 @@ class Surroundings(Density):
     ):
         super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
         self.layout = layout
-        self.around, self.density = self.arrays("", **entries(layout.precision)), self.like_density("")
+        self.around, self._n = layout.arrays(**entries(layout.precision)), self.like_density("")
         self.constants = {"least": constants.least_diagonal, "per_nearest": 1.0 / constants.nearest_weight}
         """As kernels call them."""
-
-    def arrays(self, suffix: str, **kinds: Any) -> dict[str, wp.array]:
-        """Arrays (n,) of zeros by name and suffix, of Warp types."""
-        size, device = self.layout.all_particles, self.layout.device
-        return {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
 
     def like_density(self, suffix: str) -> dict[str, wp.array]:
         """Room for n, its tangents or its adjoints, if they are not those of the step's fields."""
         return {}
 
     def measure(self, context: StepContext) -> None:
-        context.launch(self.kernels.forward, self.around, self.constants, **self.density)
+        context.launch(self.kernels.forward, self.around, self.constants, **self._n)
 
     def new_tangent(self) -> "SurroundingsTangent":
         return SurroundingsTangent(self)
@@ -50,28 +44,30 @@ class Surroundings(Density):
 class SurroundingsTangent(DensityTangent):
     """Forward mode."""
 
+    _density: Surroundings
+
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
-        self._surroundings = surroundings
-        self.around = surroundings.arrays("_dot", **entries(surroundings.layout.precision))
+        self.around = surroundings.layout.arrays("_dot", **entries(surroundings.layout.precision))
         self._n = surroundings.like_density("_dot")
 
     def measure(self, context: StepContext, dot: Tangents) -> None:
-        own = self._surroundings
+        own = self._density
         context.launch(own.kernels.tangent, *dot.named, self.around, own.around, own.constants, **self._n)
 
 
 class SurroundingsAdjoint(DensityAdjoint):
     """Reverse mode."""
 
+    _density: Surroundings
+
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
         precision = surroundings.layout.precision
-        self._surroundings = surroundings
-        self.around = surroundings.arrays("_bar", **adjoint_entries(precision))
+        self.around = surroundings.layout.arrays("_bar", **adjoint_entries(precision))
         self._n = surroundings.like_density("_bar")
         six = symmetric(precision).kind
-        self._moments = surroundings.arrays("_pull", M=six, Q=six)
+        self._moments = surroundings.layout.arrays("_pull", M=six, Q=six)
 
     def begin(self) -> None:
         for array in self.around.values():
@@ -79,7 +75,7 @@ class SurroundingsAdjoint(DensityAdjoint):
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
         """From the adjoints of n and of all around to those of positions, masses and solids."""
-        own, known = self._surroundings, (*bar.named, self.around, self._surroundings.around)
+        own, known = self._density, (*bar.named, self.around, self._density.around)
         for kernel in own.kernels.adjoint:
             context.launch(kernel, *known, self._moments, own.constants, **self._n)
         bar.solids.add(context.launch, partial(beside_solid_kernel, own.discretisation), *known)

@@ -83,13 +83,13 @@ class ProjectionSteps(ParticleSolver):
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
         precision = self.layout.precision
         real, vector = precision.real, precision.vector
-        self.pull = self.new_arrays(T=symmetric(precision).kind)["T"]
+        self.pull = self.layout.arrays(T=symmetric(precision).kind)["T"]
         """y L of the present iteration."""
         kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real}
-        self.iterates = [self.new_arrays(**self._iterate_kinds)]
+        self.iterates = [self.layout.arrays(**self._iterate_kinds)]
         """u, A and the divergence of u, y and k before each iteration; the last has u and y = k of all."""
-        self.repaired = [self.new_arrays(**self._repair_kinds)]
+        self.repaired = [self.layout.arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
@@ -118,11 +118,6 @@ class ProjectionSteps(ParticleSolver):
     def wall_push(self) -> ProjectionPush:
         return ProjectionPush(self.discretisation, self.layout, self.constants, self.lattice.volume)
 
-    def new_arrays(self, **kinds: Any) -> dict[str, wp.array]:
-        """Arrays (n,) of zeros by name, of Warp types."""
-        size, device = self.layout.all_particles, self.device
-        return {name: wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
-
     @cached_property
     def relaxed(self) -> dict[str, float]:
         """Constants of the iterations, as kernels call them."""
@@ -146,9 +141,9 @@ class ProjectionSteps(ParticleSolver):
     def reserve(self, counts: Counts) -> None:
         iterations, repairs = counts
         while len(self.iterates) <= iterations:
-            self.iterates.append(self.new_arrays(**self._iterate_kinds))
+            self.iterates.append(self.layout.arrays(**self._iterate_kinds))
         while len(self.repaired) <= repairs:
-            self.repaired.append(self.new_arrays(**self._repair_kinds))
+            self.repaired.append(self.layout.arrays(**self._repair_kinds))
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)

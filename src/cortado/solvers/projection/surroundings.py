@@ -27,7 +27,7 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def adjoint_entries(precision: Precision) -> dict[str, Any]:
-    """Of what adjoints are added up of: all but Q, which nothing but a depends on."""
+    """The same for adjoints, which add up for all but Q: nothing but a depends on it."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
