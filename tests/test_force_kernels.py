@@ -309,6 +309,7 @@ ELSEWHERE = {
     "place_kernels": "of PCISPH with shifting: whole steps in tests/test_shifting.py",
     "repair_kernels": "the same",
     "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
+    "mean_stress_kernels": "of a quantity: tests/test_mean_stress.py",
     "stress_wall_kernels": "of loads, which are quantities: tests/test_solid_loads.py",
     "environment_kernels": "of rewards: tests/test_environments.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",

@@ -197,6 +197,40 @@ def test_estimators_of_the_projection_are_those_of_the_cpu(name, lanes, estimato
         assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
 
 
+@pytest.mark.parametrize("name", ["plane", "projection", "solids in the plane", "solids in space"])
+def test_pressures_and_loads_are_those_of_the_cpu(name):
+    """With their gradients, and the same bits twice."""
+    made = SCENES[name]
+    names = ["pressure", "wall_force", *(f"{solid.name}.load" for solid in made.solid)]
+    wanted, found, again = (read(made, device, names) for device in ("cpu", "cuda:0", "cuda:0"))
+    for one, other, third in zip(wanted, found, again, strict=True):
+        assert np.linalg.norm(other - one) <= 1e-8 * np.linalg.norm(one)
+        assert other.tobytes() == third.tobytes()
+
+
+def read(made, device, names):
+    """The sum of the squares of quantities of the last state, each over its first size, with its gradient by gravity
+    and first velocities."""
+    simulation = Simulation(made, device, "float64")
+    point = {**thrown(simulation), "gravity": GRAVITY[: simulation.dimension]}
+
+    class Squares:
+        def __init__(self, scales):
+            self.scales = scales
+
+        def value(self, end):
+            return sum(float((end[name] ** 2).sum()) / size for name, size in self.scales.items())
+
+        def adjoint(self, end):
+            return {name: 2.0 * end[name] / size for name, size in self.scales.items()}
+
+    end = Problem(simulation, 20, losses.FinalPositions(simulation.positions)).end(point)
+    values = [end[name] for name in names]
+    sizes = {name: float((value**2).sum()) or 1.0 for name, value in zip(names, values, strict=True)}
+    loss, gradient = Problem(simulation, 20, Squares(sizes)).value_and_gradient(point)
+    return [*values, np.array(loss), *gradient.values()]
+
+
 @pytest.mark.parametrize("name", ["fixed", "two fluids"])
 def test_the_tape_follows_kernels_of_one_lane(name):
     simulation = Simulation(SCENES[name], "cuda:0", "float64")

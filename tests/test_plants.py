@@ -79,6 +79,7 @@ ELSEWHERE = {
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
     "solvers.projection.pressed": "of a quantity too: tests/test_quantities.py",
+    "solvers.projection.mean_stress": "of a quantity too: tests/test_mean_stress.py",
     "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
     "sph.stress_wall_kernels": "of loads too",
     "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",

@@ -59,14 +59,14 @@ def jet() -> dict[str, Any]:
     }
 
 
-def paddled() -> dict[str, Any]:
-    """A pool in the plane of 24 by 12 spacings, in whose middle a paddle is moved, a third of it deep."""
-    spacing = 0.025
+def paddled(spacing: float) -> dict[str, Any]:
+    """A pool in the plane, 0.6 m wide and 0.3 m deep, in whose middle a paddle is moved, a third of it deep."""
+    counts = round(0.6 / spacing), round(0.3 / spacing)
     paddle = {"name": "paddle", "shape": "box", "lower": [0.25, 0.1], "upper": [0.35, 0.5], "motion": "path"}
     paddle["velocity"] = [0.0, 0.0]
-    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [24 * spacing, 12 * spacing], "phase": "water"}
-    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [24 * spacing, 40 * spacing]}
-    return dam(spacing, (24, 12), fluid=[pool], container=container, solid=[paddle])
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.3], "phase": "water"}
+    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 1.0]}
+    return dam(spacing, counts, fluid=[pool], container=container, solid=[paddle])
 
 
 SCENES: dict[str, dict[str, Any]] = {
@@ -75,7 +75,8 @@ SCENES: dict[str, dict[str, Any]] = {
     "plane-144-wendland-c4": with_kernel("wendland_c4", 2.4),
     "plane-144-two-fluids": two_fluids(0.025, (12, 12)),
     "plane-jet": jet(),
-    "plane-paddle": paddled(),
+    "plane-paddle": paddled(0.025),
+    "plane-paddle-1024": paddled(0.0125),
     "plane-576": dam(0.0125, (24, 24)),
     "plane-2304": dam(0.00625, (48, 48)),
     "plane-9216": dam(0.003125, (96, 96)),
@@ -85,8 +86,9 @@ SCENES: dict[str, dict[str, Any]] = {
     "plane-144-projection": projected(dam(0.025, (12, 12))),
     "plane-144-wendland-c2-2.6": with_kernel("wendland_c2", 2.6),
     "plane-144-projection-cubic-spline": projected(with_kernel("cubic_spline", 2.0)),
-    "plane-paddle-projection": projected(paddled()),
-    "plane-paddle-projection-4-iterations": projected(paddled(), iterations=4),
+    "plane-paddle-projection": projected(paddled(0.025)),
+    "plane-paddle-projection-4-iterations": projected(paddled(0.025), iterations=4),
+    "plane-paddle-1024-projection": projected(paddled(0.0125)),
     "plane-576-projection": projected(dam(0.0125, (24, 24))),
     "space-1000-projection": projected(dam(0.05, (10, 10, 10))),
     "space-8000-projection": projected(dam(0.025, (20, 20, 20))),

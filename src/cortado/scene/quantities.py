@@ -38,7 +38,7 @@ QUANTITIES = {
     quantity.name: quantity
     for quantity in (
         Quantity("density", "kg/m3", "The sum of smoothing kernels around a particle, walls included, times its mass."),
-        Quantity("pressure", "Pa", "What the solver finds in the step that begins at the state."),
+        Quantity("pressure", "Pa", "What a gauge would read in the step that begins at the state."),
         Quantity("speed", "m/s", "The length of the velocity."),
         Quantity("vorticity", "1/s", "The curl of the velocity, from the fluid around a particle.", Kind.TURNING),
         Quantity("wall_force", "N", "What a particle pushes the walls with; in the plane N/m.", Kind.VECTOR),

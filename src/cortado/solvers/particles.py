@@ -27,7 +27,7 @@ from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.density import Density
 from cortado.solvers.loop import IterationLog, Loop
-from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, Pressures, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.integration import integration_kernels
 from cortado.sph.part import Part, PartMaker
@@ -264,8 +264,8 @@ class ParticleSolver:
             self.sort(state, parameters)
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
-    def sorted_pressures(self) -> NDArray | None:
-        """(n,) of the last `step`, of sorted particles [Pa]; None of a solver or a scene without pressures."""
+    def sorted_pressures(self) -> Pressures | None:
+        """Those of the last `step`; None of a solver or a scene without pressures."""
         return None
 
     def in_scene_order(self, values: NDArray) -> NDArray:

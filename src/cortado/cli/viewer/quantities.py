@@ -68,7 +68,7 @@ def pressures(rollout: Rollout) -> np.ndarray:
     found = solver.sorted_pressures()
     if found is None:
         raise InputError("This scene is computed without a pressure of particles, so that there is none to show.")
-    return solver.in_scene_order(found)
+    return solver.in_scene_order(found.stress)
 
 
 def pull_on_height(

@@ -20,7 +20,7 @@ from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import LOAD, check_quantity, is_load
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
+from cortado.solvers.solver import Counts, PressureAdjoint, Pressures, PressureTangent, Solver, WithinBar
 from cortado.sph.parts import Adjoints, StepContext
 
 OF_PRESSURE = {"pressure", "wall_force"}
@@ -102,9 +102,10 @@ class QuantityEvaluator:
             fields[name].assign(fields[name].numpy() + array)
         state_bar = solver.new_state()
         if solved:
-            p_bar = solver.numbers()
-            p_bar.assign(own.p)
-            within = WithinBar(fields, p_bar, on_device.v_star)
+            push_bar, stress_bar = solver.numbers(), solver.numbers()
+            push_bar.assign(own.p)
+            stress_bar.assign(own.stress)
+            within = WithinBar(fields, push_bar, stress_bar, on_device.v_star)
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
             self._from_fields(fields, state_bar)
@@ -148,14 +149,14 @@ class QuantityEvaluator:
             context = solver.sort(rollout.initial, rollout.parameters)
         return context
 
-    def _solve(self, replay: bool) -> tuple[StepContext, NDArray]:
-        """The step, and its pressures (n,), sorted."""
+    def _solve(self, replay: bool) -> tuple[StepContext, Pressures]:
+        """The step, and its pressures."""
         solver, rollout = self._solver, self._rollout
         rollout.forward(keep=False)
         found = solver.sorted_pressures()
         if found is None:
             raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
-        pressures = found.astype(np.float64)  # a replay overwrites what was found
+        pressures = found.kept()  # a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
         self._rounds = [int(k) for k in np.atleast_1d(rounds)]
@@ -168,7 +169,7 @@ class QuantityEvaluator:
 
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
-    ) -> tuple[ParticleTangent | PressureTangent, NDArray | None]:
+    ) -> tuple[ParticleTangent | PressureTangent, Pressures | None]:
         """That of the sorted particles, and of their pressures."""
         solver, parameters = self._solver, self._rollout.parameters
         if not _need_the_step(names):
@@ -177,7 +178,7 @@ class QuantityEvaluator:
             return own, None
         whole = cast(PressureTangent, solver.tangent(along))
         whole.step(self._counts, state_dot, parameters)
-        return whole, np.concatenate(whole.pressures(self._rounds)).astype(np.float64)
+        return whole, whole.pressures(self._rounds).kept()
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)

@@ -1,7 +1,7 @@
 """What each quantity is of the sorted particles of a step, with its tangent and its adjoint.
 
 Sums over neighbours are kernels; what is done with the sum of each particle alone is NumPy in float64. n is the number
-density, m a particle's mass over its volume V on the rest lattice, p the pressure of the solver's last iteration.
+density, m a particle's mass over its volume V on the rest lattice, p the pressure that it pushes walls with.
 """
 
 from dataclasses import dataclass
@@ -47,16 +47,16 @@ class Density:
 
 
 class Pressure:
-    """p_i"""
+    """What a gauge would read."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
-        return at.p
+        return at.stress
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        return dot.p
+        return dot.stress
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        bar.p[:] += own
+        bar.stress[:] += own
 
 
 class SpeedQuantity:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cortado.device.binding import Named
 from cortado.particles.arrays import Fields
 from cortado.solvers.particles import ParticleSolver
+from cortado.solvers.solver import Pressures
 from cortado.sph.parts import Adjoints, StepContext
 from cortado.sph.vorticity import circulation_kernels
 
@@ -26,31 +27,37 @@ class Particles:
 
     fields: Mapping[str, NDArray]
     """By the names of `Fields`: ``x`` and ``v`` (n, 3), ``n`` and ``m`` (n,)."""
-    pressure: NDArray | None
-    """(n,) [Pa]; None where none was computed."""
+    pressures: Pressures | None
+    """None where none were computed."""
     on_device: "OnDevice | None" = None
     """Of adjoints those that kernels add to."""
 
     @classmethod
-    def of(cls, fields: Fields, pressure: NDArray | None) -> Self:
+    def of(cls, fields: Fields, pressures: Pressures | None) -> Self:
         """Those of fields on the device."""
-        return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressure)
+        return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressures)
 
     @classmethod
     def zeros(cls, particles: int, on_device: "OnDevice | None" = None) -> Self:
         """All 0."""
         shapes = {"x": (3,), "v": (3,), "n": (), "m": ()}
         fields = {name: np.zeros((particles, *shape)) for name, shape in shapes.items()}
-        return cls(fields, np.zeros(particles), on_device)
+        return cls(fields, Pressures(np.zeros(particles), np.zeros(particles)), on_device)
 
     def __getitem__(self, name: str) -> NDArray:
         return self.fields[name]
 
     @property
     def p(self) -> NDArray:
-        """(n,) [Pa]"""
-        assert self.pressure is not None
-        return self.pressure
+        """(n,) what they push walls with [Pa]."""
+        assert self.pressures is not None
+        return self.pressures.push
+
+    @property
+    def stress(self) -> NDArray:
+        """(n,) what a gauge would read [Pa]."""
+        assert self.pressures is not None
+        return self.pressures.stress
 
     @property
     def within(self) -> "OnDevice":

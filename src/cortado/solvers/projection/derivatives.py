@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import partial
 
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
@@ -14,7 +13,7 @@ from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.measured import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
-from cortado.solvers.solver import Counts, WithinBar
+from cortado.solvers.solver import Counts, Pressures, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
@@ -69,13 +68,15 @@ class ProjectionTangent(ParticleTangent):
         carried = {IMPULSE: self._k_dot, KICK: self._kick_dot}
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
-    def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
+    def pressures(self, rounds: Sequence[int]) -> Pressures:
         """As that of `PressureTangent`."""
-        solver = self._solver
-        k, k_dot = (a.numpy().reshape(len(rounds), -1) for a in (solver.iterates[rounds[0]]["k"], self._k_dot))
-        dt = solver.parameters["time_step"].numpy()[:, None]
-        dt_dot = self.dot.parameters["time_step"].numpy()[:, None]
-        return list(k_dot / dt - k * dt_dot / dt**2)
+        solver, at = self._solver, {**self._pull, "k": self._solver.iterates[rounds[0]]["k"], "k_dot": self._k_dot}
+        context, around = solver.context(solver.parameters), (solver.around, self._around)
+        q_dot = solver.mean_stress.tangent(context, self.dot, around, at)
+        q = solver.mean_stress.impulses(context, solver.around, at)
+        dt, dt_dot = (of.parameters["time_step"].numpy().repeat(solver.layout.particles) for of in (solver, self.dot))
+        impulses = ((at["k"].numpy(), self._k_dot.numpy()), (q.numpy(), q_dot))
+        return Pressures(*(change / dt - own * dt_dot / dt**2 for own, change in impulses))
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """The first k and the iterations."""
@@ -137,8 +138,13 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
-        own = {"k": self._last(counts)["k"], "p_bar": within.p, "k_bar": self._k_bar}
-        solver.context(parameters).launch(pressed_adjoint_kernel(solver.layout.precision), *self.bar.named, own)
+        context, kernel = solver.context(parameters), pressed_adjoint_kernel(solver.layout.precision)
+        at = {"k": self._last(counts)["k"], "T": solver.pull, "q_bar": solver.numbers()}
+        q = solver.mean_stress.impulses(context, solver.around, at)
+        for impulse, p_bar, impulse_bar in ((at["k"], within.push, self._k_bar), (q, within.stress, at["q_bar"])):
+            context.launch(kernel, *self.bar.named, impulse=impulse, p_bar=p_bar, impulse_bar=impulse_bar)
+        own = {**at, "k_bar": self._k_bar}
+        solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), own)
         self._finish(counts, state_bar, parameters, within)
 
     def _last(self, counts: Counts) -> dict[str, wp.array]:

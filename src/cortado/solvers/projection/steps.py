@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
@@ -19,6 +18,7 @@ from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.following import following_kernels
+from cortado.solvers.projection.mean_stress import MeanStress
 from cortado.solvers.projection.measured import Surroundings
 from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
@@ -26,7 +26,7 @@ from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.wall_push import ProjectionPush
-from cortado.solvers.solver import Counts
+from cortado.solvers.solver import Counts, Pressures
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
@@ -160,10 +160,16 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         self._finish(self.context(parameters), iterations, repairs, new_state)
 
-    def sorted_pressures(self) -> NDArray:
+    def sorted_pressures(self) -> Pressures:
+        at = {"k": self.iterates[0]["k"], "T": self.pull}
+        stress = self.mean_stress.impulses(self.context(self.parameters), self.around, at)
         time_steps = self.parameters["time_step"].numpy().repeat(self.layout.particles)
-        found: NDArray = self.iterates[0]["k"].numpy() / time_steps
-        return found
+        return Pressures(at["k"].numpy() / time_steps, stress.numpy() / time_steps)
+
+    @cached_property
+    def mean_stress(self) -> MeanStress:
+        """Made when pressures are asked for."""
+        return MeanStress(self.discretisation, self.layout, self.system.walled.dimension)
 
     @property
     def parameters(self) -> Parameters:

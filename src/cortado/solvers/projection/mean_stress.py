@@ -1,0 +1,190 @@
+"""The mean normal stress of the projection's pressures about a particle, which is the pressure that a gauge reads.
+
+Particle j pushes i with the force -V (T_i + T_j) g_ij and a wall with -V k_i b_ib, where T = k L, and b_ib is what wall
+particle b adds to gamma_i, all times 1 / dt. The momentum that these forces carry is spread evenly from particle to
+particle, and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
+
+    dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b w_b b_ib . (x_i - s_b),
+
+in d dimensions. k / dt itself is no stress beside a wall, where neighbours are missing, and scatters where they are
+uneven, so that the forces do not.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.binding import Named
+from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.solid_shares import ALL_WALLS
+from cortado.particles.state import Layout
+from cortado.particles.wall_terms import WallTerm
+from cortado.solvers.projection.beside import normal_part
+from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.wall_sums import WallSums
+
+TOPIC = "mean_stress"
+"""Of its Warp modules."""
+
+
+class MeanStress:
+    """dt p of the sorted particles of a step, with its derivatives. ``around`` is what surrounds them
+    (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last iteration."""
+
+    def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int):
+        self._kernels = mean_stress_kernels(discretisation, dimension)
+        self._reach = WallSums(reach_term(discretisation), layout)
+        self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
+
+    def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
+        """(n,) dt p [Pa s]"""
+        found, reach = self._arrays["q"], self._reach.total(context, ALL_WALLS, around)
+        context.launch(self._kernels.forward, at, reach=reach, q=found)
+        return found
+
+    def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
+        """(n,) that of dt p; ``around`` and ``at`` with their tangents."""
+        reach = self._reach.total(context, ALL_WALLS, *around)
+        reach_dot = self._reach.tangent(context, dot, ALL_WALLS, *around)
+        found = self._arrays["q"]
+        context.launch(self._kernels.tangent, *dot.named, at, reach=reach, reach_dot=reach_dot, q_dot=found)
+        return np.array(found.numpy())
+
+    def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
+        """From ``q_bar`` in ``at`` add to ``k_bar`` there, to the adjoints of particles, and to those of ``around``."""
+        own, pairs = self._kernels.adjoint
+        reach, reach_bar = self._reach.total(context, ALL_WALLS, *around), self._arrays["reach_bar"]
+        context.launch(own, *bar.named, at, reach=reach, reach_bar=reach_bar)
+        context.launch(pairs, *bar.named, *around, at)
+        self._reach.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
+
+
+def spread_term(d: Discretisation) -> Any:
+    """The term -1/2 x_ij . (T_i + T_j) g_ij of a pair."""
+    real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
+    six, times = symmetric(d.precision).kind, symmetric(d.precision).times
+
+    def spread(x_ij: vector, T_i: six, T_j: six, s: neighbourhood_type(d.precision)) -> real:
+        return real(-0.5) * s.volume * wp.dot(gradient(x_ij, s), times(T_i + T_j, x_ij))
+
+    return spread
+
+
+@cache
+def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """The kernels of dt p, given r as the first component of the array ``reach``."""
+    precision = discretisation.precision
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
+    whole, per = moment_functions(precision, dimension).change, wp.constant(real(1.0 / dimension))
+    module, tangent_module = discretisation.module(True, TOPIC), discretisation.tangent_module(TOPIC)
+    adjoint_module = discretisation.module(False, TOPIC)
+    spread = fluid_sum(discretisation, module=module)(spread_term(discretisation))
+    spread_tangent = made_tangent(discretisation, spread_term, tangent_module)
+    spread_adjoint = made_adjoint(discretisation, spread_term, adjoint_module)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @wp.kernel(module=module)
+    def mean_stress(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        T: wp.array(dtype=six),
+        k: wp.array(dtype=real),
+        reach: wp.array(dtype=vector),
+        # out
+        q: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = spread(i, x, T, s)
+        if lane() > 0:
+            return
+        q[i] = per * (total - k[i] * reach[i][0])
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def mean_stress_tangent(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        T: wp.array(dtype=six),
+        T_dot: wp.array(dtype=six),
+        k: wp.array(dtype=real),
+        k_dot: wp.array(dtype=real),
+        reach: wp.array(dtype=vector),
+        reach_dot: wp.array(dtype=vector),
+        # out
+        q_dot: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = spread_tangent(i, x, x_dot, T, T_dot, s)
+        if lane() > 0:
+            return
+        q_dot[i] = per * (total - k_dot[i] * reach[i][0] - k[i] * reach_dot[i][0])
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def own_adjoint(
+        k: wp.array(dtype=real),
+        reach: wp.array(dtype=vector),
+        # in and out: ``q_bar`` at first that of q, at last that of the sum over neighbours
+        q_bar: wp.array(dtype=real),
+        k_bar: wp.array(dtype=real),
+        # out
+        reach_bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        bar = per * q_bar[i]
+        k_bar[i] = k_bar[i] - bar * reach[i][0]
+        reach_bar[i] = vector(-bar * k[i], real(0.0), real(0.0))
+        q_bar[i] = bar
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def mean_stress_adjoint(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        L: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
+        k: wp.array(dtype=real),
+        q_bar: wp.array(dtype=real),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        L_bar: wp.array(dtype=matrix),
+        k_bar: wp.array(dtype=real),
+    ):
+        """T is k L."""
+        i = s.first + wp.tid() // LANES
+        x_part, T_part = spread_adjoint(i, x, T, q_bar, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + x_part
+        k_bar[i] = k_bar[i] + wp.dot(T_part, pack(L[i]))
+        L_bar[i] = L_bar[i] + k[i] * whole(
+            vector(T_part[0], T_part[1], T_part[2]), real(0.5) * vector(T_part[3], T_part[4], T_part[5])
+        )
+
+    return Kernels(mean_stress, mean_stress_tangent, (own_adjoint, mean_stress_adjoint))
+
+
+def reach_term(discretisation: Discretisation) -> WallTerm:
+    """(r, 0, 0) of the walls of a solid, with the adjoint ``reach_bar``."""
+    return WallTerm(discretisation, TOPIC, _reach_work, "reach_bar")
+
+
+def _reach_work(d: Discretisation) -> Any:
+    real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
+
+    def reach_work(
+        x_ij: vector, edge_i: real, reach_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)
+    ) -> real:
+        whole, from_surface = s.volume * gradient(x_ij, s), x_ij - foot
+        part = normal(whole, foot)
+        return wp.dot(part + edge_i * (whole - part), from_surface) * reach_bar_i[0]
+
+    return reach_work

@@ -1,0 +1,101 @@
+"""The pressure of a particle with the projection: the momentum that pressures carry, and its derivatives."""
+
+import numpy as np
+import pytest
+
+from cortado import Problem, Simulation
+from scenes import OIL, plane, scene
+from still_fluids import still_water
+from test_moving_solids import ROTOR
+from test_quantities import Weighted, cubic_spline
+from test_solid_parameters import SCENES, STEPS, check, point_of
+
+PROJECTION = {"kind": "projection", "time_step": 0.002}
+C2 = {"discretisation": {"spacing": 0.05, "kernel": "wendland_c2", "support": 2.6}}
+BOTH = [scene().phase[0].model_dump(), OIL]
+HALVES = [
+    {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "water"},
+    {"shape": "box", "lower": [0.0, 0.2], "upper": [0.4, 0.4], "phase": "oil"},
+]
+ROOM = {"container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.6, 0.6]}}
+FLOWS = {
+    "plane": lambda **own: plane(solver=PROJECTION, **own),
+    "plane, Wendland": lambda **own: plane(solver=PROJECTION, **own, **C2),
+    "space": lambda **own: scene(solver=PROJECTION, **own, **ROOM),
+    "two phases": lambda **own: plane(solver=PROJECTION, **own, phase=BOTH, fluid=HALVES),
+    "free": lambda **own: plane(solver=PROJECTION, **own, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
+}
+
+
+@pytest.mark.parametrize("make", FLOWS.values(), ids=FLOWS)
+def test_pressures_add_up_to_the_virial_of_their_forces(make):
+    """d sum p_i V_i = sum x_i . F_i in d dimensions, with V_i = s^d, to round-off, beside walls through the origin, as
+    they push along their normals: forces at their surfaces have no part in it. F_i is what the next state says."""
+    simulation = Simulation(make(), precision="float64")
+    turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
+    first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
+    forces = first["reference_density"][:, None] * second["pressure_kick"] / 0.002
+    pressures, x = simulation.quantity("pressure", first), first["positions"]
+    scale = np.abs(x * forces).sum()
+    assert simulation.dimension * pressures.sum() == pytest.approx((x * forces).sum(), abs=1e-12 * scale)
+    assert np.abs(pressures).sum() > 0.1 * scale
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_pressures_are_sums_over_all_pairs_and_walls(name):
+    """In NumPy, from the pressures' impulses and L of the solver, also beside a box that sticks out into the fluid."""
+    box = {"name": "box", "shape": "box", "lower": [0.1] * FLOWS[name]().dimension}
+    box["upper"] = [0.2 for _ in box["lower"]]
+    simulation = Simulation(FLOWS[name](solid=[box]), precision="float64")
+    turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
+    first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
+    found, d, solver = simulation.quantity("pressure", first), simulation.dimension, simulation.solver
+    x, volume = first["positions"], simulation.lattice.volume
+    L = np.empty((len(x), d, d))
+    L[solver.search.order.numpy()[: len(x)]] = solver.around["L"].numpy()[:, :d, :d]
+    T = (second["pressure_impulse"] / 0.002)[:, None, None] * L
+    (_, g), (_, wall_g) = cubic_spline(simulation, x)
+    apart = x[:, None] - x[None]
+    pairs = -0.5 * volume * np.einsum("ijk,ijkl,ijl->i", apart, T[:, None] + T[None], g)
+    weights, places, feet = (solver.search.walls[f"wall_{of}"].numpy() for of in ("weights", "positions", "feet"))
+    places, feet, wall_g = places[:, :d], feet[:, :d], volume * weights[:, None] * wall_g
+    units = feet / np.linalg.norm(feet, axis=1, keepdims=True)
+    along = (wall_g * units).sum(axis=2, keepdims=True) * units
+    normal, whole = along.sum(axis=1), wall_g.sum(axis=1)
+    square = (whole**2).sum(axis=1)
+    off = (square - (normal**2).sum(axis=1)) / (square + 0.01 * solver.constants.least_diagonal)
+    t = np.clip((off - 0.1) / 0.3, 0.0, 1.0)
+    edge = (t * t * (3.0 - 2.0 * t))[:, None, None]
+    from_surface = x[:, None] - (places + feet)[None]
+    reach = ((along + edge * (wall_g - along)) * from_surface).sum(axis=(1, 2))
+    wanted = (pairs - second["pressure_impulse"] / 0.002 * reach) / d
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+    assert (edge > 0.5).any()
+
+
+def test_water_at_rest_has_the_pressure_of_its_depth():
+    """Within 5 % over all and 4 % inside, where the impulses over dt that they are made of are 12 and 7 % off."""
+    _, over_all, inside, _ = still_water(20)
+    assert over_all < 0.05
+    assert inside < 0.04
+
+
+@pytest.mark.parametrize("name", ["projection", "space", "two phases", "two solids", "tension", "periodic"])
+def test_pressures_beside_moving_solids_have_derivatives(name):
+    """Reverse and forward mode to round-off, and differences, for gravity, viscosity, and what solids do."""
+    own = SCENES[name]()
+    simulation = Simulation(own, precision="float64")
+    weights = np.random.default_rng(2).uniform(size=simulation.particles)
+    point, along = point_of(own)
+    point |= {"gravity": np.array(own.forces.gravity) + 0.5, "time_step": np.array(0.001)}
+    along |= {"gravity": np.ones(own.dimension), "time_step": np.array(1e-4)}
+    check(Problem(simulation, STEPS, Weighted("pressure", weights)), point, along)
+
+
+def test_pressures_of_a_batch_are_those_of_single_scenes():
+    simulation = Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
+    gravities = [[0.0, -9.81], [1.0, -5.0]]
+    found = simulation.batch_of(2).run(4, {"gravity": [[g] for g in gravities]}, record=["pressure"])
+    for gravity, own in zip(gravities, found, strict=True):
+        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
+        np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
