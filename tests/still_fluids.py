@@ -1,5 +1,7 @@
 """Fluids at rest in a tank: water, and light fluid over heavy fluid."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from projected_flows import C2, PROJECTION, box, simulated
@@ -8,10 +10,30 @@ GRAVITY = 9.81
 TANK = {"container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 1.4]}, "forces": {"gravity": [0.0, -GRAVITY]}}
 
 
+class PressureErrors(NamedTuple):
+    """Rms errors of mean pressures over rho g H."""
+
+    all: float
+    inside: float
+    """Of particles 3 spacings and more away from walls and surface."""
+    near_walls: float
+    """Of those nearer to walls."""
+
+
+class StillWater(NamedTuple):
+    """A metre of water in the last fifth of a time."""
+
+    speed: float
+    """Rms [m/s]."""
+    pressure: PressureErrors
+    multiplier: PressureErrors
+    """The same of k / dt."""
+    level: float
+    """The mean height over that at first, at the end."""
+
+
 def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu"):
-    """A metre of water, so many particles deep: the rms of the speed in the last fifth of the time [m/s], the rms
-    errors of the mean pressure over g H of all particles and of those that are 3 spacings and more away from walls and
-    surface, and the mean height over that at first."""
+    """Of water so many particles deep."""
     spacing = 1.0 / deep
     simulation = simulated(
         spacing,
@@ -26,14 +48,20 @@ def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisati
     steps = round(time / time_step)
     run = simulation.run(steps, record_every=max(steps // 500, 1), record=["pressure"])
     late = run.times > 0.8 * time
-    x, p = run.positions[late].mean(axis=0), run.quantities["pressure"][late].mean(axis=0)
+    x = run.positions[late].mean(axis=0)
     depth = len(x) * spacing**2 / 0.8
-    error = p / (1000.0 * GRAVITY * depth) - (depth - x[:, 1]) / depth
     edge = 3.0 * spacing
-    inner = (x[:, 0] > edge) & (x[:, 0] < 0.8 - edge) & (x[:, 1] > edge) & (x[:, 1] < depth - edge)
+    walls = (x[:, 0] < edge) | (x[:, 0] > 0.8 - edge) | (x[:, 1] < edge)
+    places = (np.full(len(x), True), ~walls & (x[:, 1] < depth - edge), walls)
+
+    def errors(pressures):
+        found = pressures[late].mean(axis=0) / (1000.0 * GRAVITY * depth) - (depth - x[:, 1]) / depth
+        return PressureErrors(*(float(np.sqrt((found[place] ** 2).mean())) for place in places))
+
     speed = np.sqrt((run.velocities[late] ** 2).sum(axis=2).mean())
     level = run.positions[-1, :, 1].mean() / run.positions[0, :, 1].mean()
-    return float(speed), float(np.sqrt((error**2).mean())), float(np.sqrt((error[inner] ** 2).mean())), float(level)
+    multiplier = errors(run.others["pressure_impulse"] / time_step)
+    return StillWater(float(speed), errors(run.quantities["pressure"]), multiplier, float(level))
 
 
 def two_layers(ratio, time_step, deep=40, time=2.0, solver=PROJECTION, discretisation=C2, device="cpu"):

@@ -75,9 +75,10 @@ def test_pressures_are_sums_over_all_pairs_and_walls(name):
 
 def test_water_at_rest_has_the_pressure_of_its_depth():
     """Within 5 % over all and 4 % inside, where the impulses over dt that they are made of are 12 and 7 % off."""
-    _, over_all, inside, _ = still_water(20)
-    assert over_all < 0.05
-    assert inside < 0.04
+    found = still_water(20)
+    assert found.pressure.all < 0.05 < 0.1 < found.multiplier.all
+    assert found.pressure.inside < 0.04
+    assert found.pressure.near_walls < 0.054
 
 
 @pytest.mark.parametrize("name", ["projection", "space", "two phases", "two solids", "tension", "periodic"])

@@ -6,6 +6,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado.errors import CortadoWarning
 from falling_jets import falling_jet
+from oscillating_drops import C2, C4, CUBIC
 from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, taylor_green
 from sloping_films import sloping_film
 from still_fluids import still_water, two_layers
@@ -60,10 +62,10 @@ CASES: dict[str, Case] = {
         dam_break(time_step=step) for step in (0.0005, 0.001, 0.002, 0.003)
     ],
     **{
-        f"water at rest, {n} deep: speed; pressure, inner; level": (
-            lambda device, n=n: still_water(n, 10.0, device=device)
+        f"water at rest, {n} deep, {kernel['kernel']}, after {time} s": (
+            lambda device, n=n, time=time, kernel=kernel: still_water(n, time, discretisation=kernel, device=device)
         )
-        for n in (20, 40)
+        for n, time, kernel in product((20, 40), (2.5, 10.0), (C2, CUBIC, C4))
     },
     **{
         f"layers, ratio {ratio}, steps of 1 ms: speed": (lambda device, r=ratio: two_layers(r, 0.001, device=device))

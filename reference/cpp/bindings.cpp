@@ -32,16 +32,16 @@ std::vector<double> from_numpy(const Array& array) { return {array.data(), array
 using Make = std::unique_ptr<cortado::Engine> (*)(const cortado::Scene&, int);
 const std::map<std::string, Make> precisions = {
 #ifdef CORTADO_HAS_FLOAT32
-    {"float32", cortado::make_float32},
+    {"float32", cortado::make_engine<float>},
 #endif
 #ifdef CORTADO_HAS_FLOAT64
-    {"float64", cortado::make_float64},
+    {"float64", cortado::make_engine<double>},
 #endif
 #ifdef CORTADO_HAS_FLOAT80
-    {"float80", cortado::make_float80},
+    {"float80", cortado::make_engine<long double>},
 #endif
 #ifdef CORTADO_HAS_FLOAT128
-    {"float128", cortado::make_float128},
+    {"float128", cortado::make_engine<__float128>},
 #endif
 };
 

@@ -1,11 +1,4 @@
-// The engine in one precision: CORTADO_REAL is its type, CORTADO_NAME what makes it.
+// The engine in one precision and dimension: CORTADO_REAL is the type of its numbers, CORTADO_DIMENSION 2 or 3.
 #include "cortado/rollout.hpp"
 
-namespace cortado {
-
-std::unique_ptr<Engine> CORTADO_NAME(const Scene& scene, int threads) {
-    if (scene.dimension == 2) return std::make_unique<Rollout<CORTADO_REAL, 2>>(scene, threads);
-    return std::make_unique<Rollout<CORTADO_REAL, 3>>(scene, threads);
-}
-
-}  // namespace cortado
+template std::unique_ptr<cortado::Engine> cortado::engine_of<CORTADO_REAL, CORTADO_DIMENSION>(const Scene&, int);

@@ -158,16 +158,16 @@ void check(const std::string& name, std::unique_ptr<Engine> (*make)(const Scene&
 
 int main() {
 #ifdef CORTADO_HAS_FLOAT32
-    check("float32", make_float32, 1e-2);
+    check("float32", make_engine<float>, 1e-2);
 #endif
 #ifdef CORTADO_HAS_FLOAT64
-    check("float64", make_float64, 1e-11);
+    check("float64", make_engine<double>, 1e-11);
 #endif
 #ifdef CORTADO_HAS_FLOAT80
-    check("float80", make_float80, 1e-13);
+    check("float80", make_engine<long double>, 1e-13);
 #endif
 #ifdef CORTADO_HAS_FLOAT128
-    check("float128", make_float128, 1e-13);
+    check("float128", make_engine<__float128>, 1e-13);
 #endif
     if (failures == 0) std::puts("every check of the engine passed");
     return failures > 0;

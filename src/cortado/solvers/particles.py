@@ -265,7 +265,7 @@ class ParticleSolver:
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
     def sorted_pressures(self) -> Pressures | None:
-        """Those of the last `step`; None of a solver or a scene without pressures."""
+        """Those of the last `step`, unless one was replayed since; None of a solver or a scene without pressures."""
         return None
 
     def in_scene_order(self, values: NDArray) -> NDArray:

@@ -1,4 +1,4 @@
-// What the engine can do, without templates: the only header that the binding to Python sees.
+// What the engine can do, without its templates: the only header that the binding to Python sees.
 #pragma once
 
 #include <array>
@@ -102,10 +102,14 @@ public:
                               const LossAdjoint& loss, const Observer& observe) const = 0;
 };
 
-// `threads` >= 1. Results do not depend on it. Which of these there are is for the build to say.
-std::unique_ptr<Engine> make_float32(const Scene& scene, int threads);
-std::unique_ptr<Engine> make_float64(const Scene& scene, int threads);
-std::unique_ptr<Engine> make_float80(const Scene& scene, int threads);
-std::unique_ptr<Engine> make_float128(const Scene& scene, int threads);
+// In D dimensions, with numbers of a type. Which of these there are is for the build to say.
+template <class Real, int D>
+std::unique_ptr<Engine> engine_of(const Scene& scene, int threads);
+
+// `threads` >= 1. Results do not depend on it.
+template <class Real>
+std::unique_ptr<Engine> make_engine(const Scene& scene, int threads) {
+    return scene.dimension == 2 ? engine_of<Real, 2>(scene, threads) : engine_of<Real, 3>(scene, threads);
+}
 
 }  // namespace cortado

@@ -243,4 +243,9 @@ private:
     Model<Real, D> model_;
 };
 
+template <class Real, int D>
+std::unique_ptr<Engine> engine_of(const Scene& scene, int threads) {
+    return std::make_unique<Rollout<Real, D>>(scene, threads);
+}
+
 }  // namespace cortado

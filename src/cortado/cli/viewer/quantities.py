@@ -34,7 +34,7 @@ def quantities_of(
     return {
         "speed": lambda: np.linalg.norm(velocities, axis=1),
         "density": lambda: densities(simulation().rollout(1, controls, state)),
-        "pressure": lambda: pressures(simulation().rollout(1, controls, state)),
+        "pressure": lambda: simulation().quantity("pressure", state, controls),
         "vorticity": lambda: sizes_of(simulation().quantity("vorticity", state, controls)),
         "wall_force": lambda: sizes_of(simulation().quantity("wall_force", state, controls)),
     }
@@ -58,17 +58,6 @@ def densities(rollout: Rollout) -> np.ndarray:
     if not isinstance(solver, ParticleSolver):
         raise InputError("The solver of this scene has no densities of particles to show.")
     return solver.densities(rollout.initial, rollout.parameters)
-
-
-def pressures(rollout: Rollout) -> np.ndarray:
-    """(n,) that act in the first step of a rollout of one step [Pa]."""
-    solver = rollout.solver
-    assert isinstance(solver, ParticleSolver)
-    rollout.forward(keep=False)
-    found = solver.sorted_pressures()
-    if found is None:
-        raise InputError("This scene is computed without a pressure of particles, so that there is none to show.")
-    return solver.in_scene_order(found.stress)
 
 
 def pull_on_height(

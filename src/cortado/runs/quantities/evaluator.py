@@ -103,7 +103,7 @@ class QuantityEvaluator:
         state_bar = solver.new_state()
         if solved:
             push_bar, stress_bar = solver.numbers(), solver.numbers()
-            push_bar.assign(own.p)
+            push_bar.assign(own.push)
             stress_bar.assign(own.stress)
             within = WithinBar(fields, push_bar, stress_bar, on_device.v_star)
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)

@@ -72,7 +72,7 @@ class WallLoads:
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
         """That of f."""
-        strength_dot = self._scale / at["n"] ** self._power * (dot.p - self._power * at.p * dot["n"] / at["n"])
+        strength_dot = self._scale / at["n"] ** self._power * (dot.push - self._power * at.push * dot["n"] / at["n"])
         pushed = vectors(self._push.total(sums.context, solid))
         pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
         found = strength_dot[:, None] * pushed + self._strength(at)[:, None] * pushed_dot
@@ -82,14 +82,14 @@ class WallLoads:
         """From that of f, add to those of the particles."""
         step, strength = sums.context, self._strength(at)
         strength_bar = (forces_bar * vectors(self._push.total(step, solid))).sum(axis=1)
-        bar.p[:] += strength_bar * self._scale / at["n"] ** self._power
+        bar.push[:] += strength_bar * self._scale / at["n"] ** self._power
         bar["n"][:] -= self._power * strength_bar * strength / at["n"]
         within = bar.within
         self._push.adjoint(step, within.bar, solid, sums.on_device(strength[:, None] * forces_bar), within.v_star)
         self._rubbing.adjoint(at, sums, forces_bar, bar, solid)
 
     def _strength(self, at: Particles) -> NDArray:
-        return np.asarray(self._scale * at.p / at["n"] ** self._power)
+        return np.asarray(self._scale * at.push / at["n"] ** self._power)
 
 
 @dataclass(frozen=True)

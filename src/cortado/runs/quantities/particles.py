@@ -48,7 +48,7 @@ class Particles:
         return self.fields[name]
 
     @property
-    def p(self) -> NDArray:
+    def push(self) -> NDArray:
         """(n,) what they push walls with [Pa]."""
         assert self.pressures is not None
         return self.pressures.push
