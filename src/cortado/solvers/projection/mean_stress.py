@@ -32,7 +32,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.wall_sums import WallSums
 
 TOPIC = "mean_stress"
-"""Of its Warp modules."""
+"""Of its Warp modules, with the dimension behind it where that counts."""
 
 
 class MeanStress:
@@ -85,8 +85,9 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
     whole, per = moment_functions(precision, dimension).change, wp.constant(real(1.0 / dimension))
-    module, tangent_module = discretisation.module(True, TOPIC), discretisation.tangent_module(TOPIC)
-    adjoint_module = discretisation.module(False, TOPIC)
+    topic = f"{TOPIC}_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
     spread = fluid_sum(discretisation, module=module)(spread_term(discretisation))
     spread_tangent = made_tangent(discretisation, spread_term, tangent_module)
     spread_adjoint = made_adjoint(discretisation, spread_term, adjoint_module)
