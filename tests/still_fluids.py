@@ -32,26 +32,28 @@ class StillWater(NamedTuple):
     """The mean height over that at first, at the end."""
 
 
-def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu"):
-    """Of water so many particles deep."""
-    spacing = 1.0 / deep
+def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu", dimension=2):
+    """Of water so many particles deep, 0.8 m wide, and as long in space."""
+    spacing, across = 1.0 / deep, [0.8] * (dimension - 2)
     simulation = simulated(
         spacing,
+        dimension,
         precision="float32",
         discretisation=discretisation,
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[box([0.0, 0.0], [0.8, 1.0])],
+        fluid=[box([0.0] * dimension, [0.8, 1.0, *across])],
         solver={**solver, "time_step": time_step},
         device=device,
-        **TANK,
+        container={"shape": "box", "lower": [0.0] * dimension, "upper": [0.8, 1.4, *across]},
+        forces={"gravity": [0.0, -GRAVITY, 0.0][:dimension]},
     )
     steps = round(time / time_step)
     run = simulation.run(steps, record_every=max(steps // 500, 1), record=["pressure"])
     late = run.times > 0.8 * time
     x = run.positions[late].mean(axis=0)
-    depth = len(x) * spacing**2 / 0.8
-    edge = 3.0 * spacing
-    walls = (x[:, 0] < edge) | (x[:, 0] > 0.8 - edge) | (x[:, 1] < edge)
+    depth, edge = len(x) * spacing**dimension / 0.8 ** (dimension - 1), 3.0 * spacing
+    sides = np.delete(x, 1, axis=1)
+    walls = ((sides < edge) | (sides > 0.8 - edge)).any(axis=1) | (x[:, 1] < edge)
     places = (np.full(len(x), True), ~walls & (x[:, 1] < depth - edge), walls)
 
     def errors(pressures):

@@ -67,6 +67,7 @@ CASES: dict[str, Case] = {
         )
         for n, time, kernel in product((20, 40), (2.5, 10.0), (C2, CUBIC, C4))
     },
+    "water at rest in space, 20 deep": lambda device: still_water(20, device=device, dimension=3),
     **{
         f"layers, ratio {ratio}, steps of 1 ms: speed": (lambda device, r=ratio: two_layers(r, 0.001, device=device))
         for ratio in (2, 10, 100, 1000)
