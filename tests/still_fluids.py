@@ -7,7 +7,12 @@ import numpy as np
 from projected_flows import C2, PROJECTION, box, simulated
 
 GRAVITY = 9.81
-TANK = {"container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 1.4]}, "forces": {"gravity": [0.0, -GRAVITY]}}
+
+
+def tank(dimension=2):
+    """Tables of a tank 0.8 m wide, and as long in space, and of gravity."""
+    container = {"shape": "box", "lower": [0.0] * dimension, "upper": [0.8, 1.4, 0.8][:dimension]}
+    return {"container": container, "forces": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
 
 
 class PressureErrors(NamedTuple):
@@ -33,19 +38,18 @@ class StillWater(NamedTuple):
 
 
 def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu", dimension=2):
-    """Of water so many particles deep, 0.8 m wide, and as long in space."""
-    spacing, across = 1.0 / deep, [0.8] * (dimension - 2)
+    """Of water so many particles deep."""
+    spacing = 1.0 / deep
     simulation = simulated(
         spacing,
         dimension,
         precision="float32",
         discretisation=discretisation,
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[box([0.0] * dimension, [0.8, 1.0, *across])],
+        fluid=[box([0.0] * dimension, [0.8, 1.0, 0.8][:dimension])],
         solver={**solver, "time_step": time_step},
         device=device,
-        container={"shape": "box", "lower": [0.0] * dimension, "upper": [0.8, 1.4, *across]},
-        forces={"gravity": [0.0, -GRAVITY, 0.0][:dimension]},
+        **tank(dimension),
     )
     steps = round(time / time_step)
     run = simulation.run(steps, record_every=max(steps // 500, 1), record=["pressure"])
@@ -80,7 +84,7 @@ def two_layers(ratio, time_step, deep=40, time=2.0, solver=PROJECTION, discretis
         fluid=bodies,
         solver={**solver, "time_step": time_step},
         device=device,
-        **TANK,
+        **tank(),
     )
     steps = round(time / time_step)
     run = simulation.run(steps, record_every=max(steps // 200, 1))

@@ -44,12 +44,12 @@ def test_pressures_add_up_to_the_virial_of_their_forces(make):
 @pytest.mark.parametrize("name", FLOWS)
 def test_pressures_are_sums_over_all_pairs_and_walls(name):
     """In NumPy, from the pressures' impulses and L of the solver, also beside a box that sticks out into the fluid."""
-    box = {"name": "box", "shape": "box", "lower": [0.1] * FLOWS[name]().dimension}
-    box["upper"] = [0.2 for _ in box["lower"]]
+    d = FLOWS[name]().dimension
+    box = {"name": "box", "shape": "box", "lower": [0.1] * d, "upper": [0.2] * d}
     simulation = Simulation(FLOWS[name](solid=[box]), precision="float64")
     turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
     first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
-    found, d, solver = simulation.quantity("pressure", first), simulation.dimension, simulation.solver
+    found, solver = simulation.quantity("pressure", first), simulation.solver
     x, volume = first["positions"], simulation.lattice.volume
     L = np.empty((len(x), d, d))
     L[solver.search.order.numpy()[: len(x)]] = solver.around["L"].numpy()[:, :d, :d]
@@ -111,3 +111,12 @@ def test_pressures_of_a_batch_are_those_of_single_scenes():
     for gravity, own in zip(gravities, found, strict=True):
         alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
         np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
+
+
+def test_loads_do_without_stresses():
+    """Their kernels are not even made: loads are read in every step."""
+    simulation = Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
+    simulation.quantity("rotor.load")
+    assert "mean_stress" not in vars(simulation.solver)
+    simulation.quantity("pressure")
+    assert "mean_stress" in vars(simulation.solver)

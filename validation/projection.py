@@ -62,10 +62,12 @@ CASES: dict[str, Case] = {
         dam_break(time_step=step) for step in (0.0005, 0.001, 0.002, 0.003)
     ],
     **{
-        f"water at rest, {n} deep, {kernel['kernel']}, after {time} s": (
-            lambda device, n=n, time=time, kernel=kernel: still_water(n, time, discretisation=kernel, device=device)
+        f"water at rest, {n} deep, {kernel['kernel']}, after {seconds} s": (
+            lambda device, n=n, seconds=seconds, kernel=kernel: still_water(
+                n, seconds, discretisation=kernel, device=device
+            )
         )
-        for n, time, kernel in product((20, 40), (2.5, 10.0), (C2, CUBIC, C4))
+        for n, seconds, kernel in product((20, 40), (2.5, 10.0), (C2, CUBIC, C4))
     },
     "water at rest in space, 20 deep": lambda device: still_water(20, device=device, dimension=3),
     **{

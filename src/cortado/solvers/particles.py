@@ -27,7 +27,7 @@ from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.density import Density
 from cortado.solvers.loop import IterationLog, Loop
-from cortado.solvers.solver import Counts, Pressures, ResumingAdjoint, StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.integration import integration_kernels
 from cortado.sph.part import Part, PartMaker
@@ -264,9 +264,14 @@ class ParticleSolver:
             self.sort(state, parameters)
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
-    def sorted_pressures(self) -> Pressures | None:
-        """Those of the last `step`, unless one was replayed since; None of a solver or a scene without pressures."""
+    def sorted_pressures(self) -> NDArray | None:
+        """(n,) with which sorted particles push walls in the last `step`, unless one was replayed since [Pa]; None of a
+        solver or a scene without pressures."""
         return None
+
+    def sorted_stresses(self) -> NDArray | None:
+        """(n,) what a gauge would read there [Pa]."""
+        return self.sorted_pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
         """(n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
-import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
@@ -75,27 +74,17 @@ class ResumingAdjoint(StepAdjoint, Protocol):
         """As that of `Solver`, but without the iterations of the pressure. The step before comes next."""
 
 
-@dataclass(frozen=True)
-class Pressures:
-    """Of the sorted particles of a step, all scenes of a batch one behind the other, or tangents of them."""
-
-    push: NDArray
-    """(n,) what particles push walls with [Pa]."""
-    stress: NDArray
-    """(n,) what a gauge would read [Pa]."""
-
-    def kept(self) -> "Pressures":
-        """Copies in float64."""
-        return Pressures(*(np.array(own, dtype=np.float64) for own in (self.push, self.stress)))
-
-
 class PressureTangent(StepTangent, Protocol):
     """That of a solver with pressures, which quantities and sensors can be differentiated through."""
 
     dot: Tangents
 
-    def pressures(self, rounds: Sequence[int]) -> Pressures:
-        """Those of the pressures of the last step, whose first loop went round so often in each scene."""
+    def pressures(self, rounds: Sequence[int]) -> NDArray:
+        """Tangents (n,) of the pressures of the last step, of sorted particles, with which they push walls; its first
+        loop went round so often in each scene."""
+
+    def stresses(self, rounds: Sequence[int]) -> NDArray:
+        """The same of what a gauge would read."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +93,10 @@ class WithinBar:
 
     fields: Fields
     """Of the fields at its start."""
-    push: wp.array
-    stress: wp.array
-    """(n,) of the `Pressures`."""
+    p: wp.array
+    """(n,) of the pressures with which they push walls."""
+    stress: wp.array | None
+    """(n,) of what a gauge would read; None where it has none."""
     v_star: wp.array
     """(n,) of the velocities v* = v + dt a that the explicit forces lead to; what they depend on dt is counted
     elsewhere."""

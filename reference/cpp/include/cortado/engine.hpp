@@ -1,4 +1,4 @@
-// What the engine can do, without its templates: the only header that the binding to Python sees.
+// What the engine can do, without how: the only header that the binding to Python sees.
 #pragma once
 
 #include <array>

@@ -15,15 +15,17 @@ from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.formulas import formulas
 from cortado.runs.quantities.moment import Moment
-from cortado.runs.quantities.particles import OnDevice, Particles, Sums
+from cortado.runs.quantities.particles import OnDevice, Particles, Pressures, Sums
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import LOAD, check_quantity, is_load
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.solver import Counts, PressureAdjoint, Pressures, PressureTangent, Solver, WithinBar
+from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
 from cortado.sph.parts import Adjoints, StepContext
 
-OF_PRESSURE = {"pressure", "wall_force"}
+STRESS = "pressure"
+"""The quantity that is the mean stress, which others do not need."""
+OF_PRESSURE = {STRESS, "wall_force"}
 """Quantities of particles that need the step after the state to be solved; others need its neighbours alone."""
 
 
@@ -102,10 +104,11 @@ class QuantityEvaluator:
             fields[name].assign(fields[name].numpy() + array)
         state_bar = solver.new_state()
         if solved:
-            push_bar, stress_bar = solver.numbers(), solver.numbers()
-            push_bar.assign(own.push)
-            stress_bar.assign(own.stress)
-            within = WithinBar(fields, push_bar, stress_bar, on_device.v_star)
+            p_bar, stress_bar = solver.numbers(), solver.numbers() if STRESS in wanted else None
+            p_bar.assign(own.push)
+            if stress_bar is not None:
+                stress_bar.assign(own.stress)
+            within = WithinBar(fields, p_bar, stress_bar, on_device.v_star)
             self._pressure_adjoint.from_within(self._counts, within, state_bar, self._rollout.parameters)
         else:
             self._from_fields(fields, state_bar)
@@ -135,7 +138,7 @@ class QuantityEvaluator:
         rollout.parameters.set(moment.parameters)
         rollout.substeps = moment.substeps
         if _need_the_step(names):
-            context, pressures = self._solve(replay)
+            context, pressures = self._solve(names, replay)
         else:
             context, pressures = self._look_around(moment.substeps), None
         return Particles.of(self._solver.fields, pressures), Sums(self._solver, context)
@@ -149,14 +152,15 @@ class QuantityEvaluator:
             context = solver.sort(rollout.initial, rollout.parameters)
         return context
 
-    def _solve(self, replay: bool) -> tuple[StepContext, Pressures]:
-        """The step, and its pressures."""
+    def _solve(self, names: Iterable[str], replay: bool) -> tuple[StepContext, Pressures]:
+        """The step, and its pressures as far as they are wanted."""
         solver, rollout = self._solver, self._rollout
         rollout.forward(keep=False)
         found = solver.sorted_pressures()
         if found is None:
             raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
-        pressures = found.kept()  # a replay overwrites what was found
+        pushes = np.array(found, dtype=np.float64)  # a copy: a replay overwrites what was found
+        pressures = Pressures(pushes, np.array(solver.sorted_stresses(), dtype=np.float64) if STRESS in names else None)
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
         self._rounds = [int(k) for k in np.atleast_1d(rounds)]
@@ -178,7 +182,8 @@ class QuantityEvaluator:
             return own, None
         whole = cast(PressureTangent, solver.tangent(along))
         whole.step(self._counts, state_dot, parameters)
-        return whole, whole.pressures(self._rounds).kept()
+        stresses = np.array(whole.stresses(self._rounds), dtype=np.float64) if STRESS in names else None
+        return whole, Pressures(np.array(whole.pressures(self._rounds), dtype=np.float64), stresses)
 
     def _from_fields(self, fields: Fields, state_bar: State) -> None:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)

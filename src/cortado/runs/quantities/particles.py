@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from cortado.device.binding import Named
 from cortado.particles.arrays import Fields
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.solver import Pressures
 from cortado.sph.parts import Adjoints, StepContext
 from cortado.sph.vorticity import circulation_kernels
 
@@ -19,6 +18,16 @@ from cortado.sph.vorticity import circulation_kernels
 def vectors(array: wp.array) -> NDArray:
     """(n, 3) in float64."""
     return np.asarray(array.numpy(), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Pressures:
+    """Of the sorted particles of a step, in float64, off the device: copies."""
+
+    push: NDArray
+    """(n,) with which they push walls [Pa]."""
+    stress: NDArray | None
+    """(n,) what a gauge would read [Pa]; None where nobody asks for it."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,7 @@ class Particles:
     @property
     def stress(self) -> NDArray:
         """(n,) what a gauge would read [Pa]."""
-        assert self.pressures is not None
+        assert self.pressures is not None and self.pressures.stress is not None
         return self.pressures.stress
 
     @property

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
@@ -13,7 +14,7 @@ from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangen
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
-from cortado.solvers.solver import Counts, Pressures, WithinBar
+from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import StepContext
 from cortado.sph.wall_slope import wall_slope_term
@@ -38,8 +39,9 @@ class PcisphAdjoint(ParticleAdjoint):
         """As that of `PressureAdjoint`."""
         state_bar.clear()
         self._begin(counts, state_bar, parameters)
-        for p_bar in (within.push, within.stress):
-            add(p_bar, self._p_bar)
+        add(within.p, self._p_bar)
+        if within.stress is not None:
+            add(within.stress, self._p_bar)
         self._finish(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
@@ -183,11 +185,12 @@ class PcisphTangent(ParticleTangent):
             p_dot_before = p_dot
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 
-    def pressures(self, rounds: Sequence[int]) -> Pressures:
+    def pressures(self, rounds: Sequence[int]) -> NDArray:
         """As that of `PressureTangent`."""
         own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
-        found = np.concatenate([own[(k - 1) % 2][b] for b, k in enumerate(rounds)])
-        return Pressures(found, found)
+        return np.concatenate([own[(k - 1) % 2][b] for b, k in enumerate(rounds)])
+
+    stresses = pressures
 
     def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
         """The tangent of the pressure relaxation."""

@@ -4,11 +4,13 @@
 iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.
 """
 
+from numpy.typing import NDArray
+
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.parts import Iterates, PcisphKernels
-from cortado.solvers.solver import Counts, Pressures
+from cortado.solvers.solver import Counts
 from cortado.sph.parts import StepContext
 
 
@@ -50,11 +52,8 @@ class PcisphSteps(ParticleSolver):
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
 
-    def sorted_pressures(self) -> Pressures | None:
-        if self.limits is None:
-            return None
-        found = self.iterates.p[1].numpy()
-        return Pressures(found, found)
+    def sorted_pressures(self) -> NDArray | None:
+        return None if self.limits is None else self.iterates.p[1].numpy()
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""

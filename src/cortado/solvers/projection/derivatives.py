@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
@@ -13,7 +14,7 @@ from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.measured import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
-from cortado.solvers.solver import Counts, Pressures, WithinBar
+from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
@@ -68,15 +69,23 @@ class ProjectionTangent(ParticleTangent):
         carried = {IMPULSE: self._k_dot, KICK: self._kick_dot}
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
-    def pressures(self, rounds: Sequence[int]) -> Pressures:
+    def pressures(self, rounds: Sequence[int]) -> NDArray:
+        """As that of `PressureTangent`."""
+        return self._over_time(self._solver.iterates[rounds[0]]["k"], self._k_dot.numpy())
+
+    def stresses(self, rounds: Sequence[int]) -> NDArray:
         """As that of `PressureTangent`."""
         solver, at = self._solver, {**self._pull, "k": self._solver.iterates[rounds[0]]["k"], "k_dot": self._k_dot}
         context, around = solver.context(solver.parameters), (solver.around, self._around)
-        q_dot = solver.mean_stress.tangent(context, self.dot, around, at)
-        q = solver.mean_stress.impulses(context, solver.around, at)
-        dt, dt_dot = (of.parameters["time_step"].numpy().repeat(solver.layout.particles) for of in (solver, self.dot))
-        impulses = ((at["k"].numpy(), self._k_dot.numpy()), (q.numpy(), q_dot))
-        return Pressures(*(change / dt - own * dt_dot / dt**2 for own, change in impulses))
+        change = solver.mean_stress.tangent(context, self.dot, around, at)
+        return self._over_time(solver.mean_stress.impulses(context, solver.around, at), change)
+
+    def _over_time(self, impulses: wp.array, change: NDArray) -> NDArray:
+        """The tangent of impulses over the time step, from that of impulses."""
+        particles = self._solver.layout.particles
+        dt, dt_dot = (of.parameters["time_step"].numpy().repeat(particles) for of in (self._solver, self.dot))
+        found: NDArray = change / dt - impulses.numpy() * dt_dot / dt**2
+        return found
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """The first k and the iterations."""
@@ -138,13 +147,14 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
-        context, kernel = solver.context(parameters), pressed_adjoint_kernel(solver.layout.precision)
-        at = {"k": self._last(counts)["k"], "T": solver.pull, "q_bar": solver.numbers()}
-        q = solver.mean_stress.impulses(context, solver.around, at)
-        for impulse, p_bar, impulse_bar in ((at["k"], within.push, self._k_bar), (q, within.stress, at["q_bar"])):
-            context.launch(kernel, *self.bar.named, impulse=impulse, p_bar=p_bar, impulse_bar=impulse_bar)
-        own = {**at, "k_bar": self._k_bar}
-        solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), own)
+        context, known = solver.context(parameters), self.bar.named
+        pressed, k = pressed_adjoint_kernel(solver.layout.precision), self._last(counts)["k"]
+        context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
+        if within.stress is not None:
+            at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": solver.numbers()}
+            q = solver.mean_stress.impulses(context, solver.around, at)
+            context.launch(pressed, *known, impulse=q, p_bar=within.stress, impulse_bar=at["q_bar"])
+            solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), at)
         self._finish(counts, state_bar, parameters, within)
 
     def _last(self, counts: Counts) -> dict[str, wp.array]:

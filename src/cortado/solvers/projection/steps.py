@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
@@ -26,7 +27,7 @@ from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
 from cortado.solvers.projection.wall_push import ProjectionPush
-from cortado.solvers.solver import Counts, Pressures
+from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
@@ -160,15 +161,20 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         self._finish(self.context(parameters), iterations, repairs, new_state)
 
-    def sorted_pressures(self) -> Pressures:
+    def sorted_pressures(self) -> NDArray:
+        return self._over_time(self.iterates[0]["k"])
+
+    def sorted_stresses(self) -> NDArray:
         at = {"k": self.iterates[0]["k"], "T": self.pull}
-        stress = self.mean_stress.impulses(self.context(self.parameters), self.around, at)
-        time_steps = self.parameters["time_step"].numpy().repeat(self.layout.particles)
-        return Pressures(at["k"].numpy() / time_steps, stress.numpy() / time_steps)
+        return self._over_time(self.mean_stress.impulses(self.context(self.parameters), self.around, at))
+
+    def _over_time(self, impulses: wp.array) -> NDArray:
+        found: NDArray = impulses.numpy() / self.parameters["time_step"].numpy().repeat(self.layout.particles)
+        return found
 
     @cached_property
     def mean_stress(self) -> MeanStress:
-        """Made when pressures are asked for."""
+        """Made when stresses are asked for."""
         return MeanStress(self.discretisation, self.layout, self.system.walled.dimension)
 
     @property
