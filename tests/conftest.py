@@ -2,6 +2,7 @@
 
 import gc
 import math
+import os
 import shutil
 from collections import Counter
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from short import is_slow, seconds_of, short
+from skips import complaints, reason_of
 
 WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
 collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_study.py"]
@@ -74,6 +76,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if found != "unit":
             item.add_marker(getattr(pytest.mark, found))
     items.sort(key=lambda item: spent[item.path])
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fails a run that skips what a package would cure, where `CORTADO_REQUIRE_ALL` is set."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or os.environ.get("CORTADO_REQUIRE_ALL", "") in ("", "0"):
+        return
+    for complaint in complaints(reason_of(report) for report in reporter.stats.get("skipped", [])):
+        reporter.write_line(complaint, red=True)
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture

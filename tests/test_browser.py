@@ -165,7 +165,7 @@ def until(page: Any, shown: Any, come: Callable[[], bool]) -> None:
 
 def choose(page: Any, colour: str) -> None:
     page.get_by_label("Colour").click()
-    page.get_by_role("option", name=colour).click()
+    page.get_by_role("option", name=colour, exact=True).click()
 
 
 @pytest.mark.parametrize("text", [TINY_SCENE, BLOCK], ids=["plane", "space"])

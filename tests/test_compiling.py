@@ -1,8 +1,12 @@
 """What is compiled for a step, and when: all at once, only what the scene needs, and by several processes at a time."""
 
+import gc
 import os
 import subprocess
 import sys
+import warnings
+from pathlib import Path
+from shutil import rmtree
 from threading import Event, Timer
 
 import numpy as np
@@ -109,6 +113,18 @@ assert os.waitpid(child, 0)[1] == 0
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_fork_while_headers_are_precompiled(tmp_path):
     result(process(tmp_path, FORK))
+
+
+def test_a_folder_of_headers_that_is_gone_is_replaced_in_silence():
+    """As after a child of a fork, which deletes the folder that it shares with its parent."""
+    headers = compiling._Headers()
+    rmtree(headers._path())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert Path(headers._path()).is_dir()
+        gc.collect()
+    assert "cortado-headers" not in " ".join(str(one.message) for one in caught)
+    headers._folder.cleanup()
 
 
 TENSION = {"gravity": [0.0, -9.81], "viscosity": "laminar", "surface_tension": 0.01}

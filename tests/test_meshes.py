@@ -61,7 +61,7 @@ def read(path: str, scale: float = 1.0, container=ROOM, support: float = SUPPORT
 def quietly_read(path: str) -> Mesh:
     """Without a warning."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", CortadoWarning)
         return read(path, support=SPACING)
 
 

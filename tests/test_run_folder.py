@@ -412,7 +412,7 @@ def test_a_run_that_is_there_is_not_warned_of_again(run, cortado_command):
     with pytest.warns(cortado.CortadoWarning, match="limit of stability"):
         cortado.Scene.from_json(run.read_text())
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", cortado.CortadoWarning)
         scene = RunFolder.open(run.parent).read_scene(["picture.width=100"])
     assert scene.solver.time_step == 0.05 and scene.picture.width == 100
     code, _, err = cortado_command("picture", "a", "--set", "picture.width=96")

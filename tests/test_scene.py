@@ -342,7 +342,7 @@ def test_the_stability_limit_is_the_smallest_of_three():
 
 def test_a_large_time_step_is_a_warning():
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", CortadoWarning)
         limit = stability_limit(Scene(**plane()))
         Scene(**plane(solver={"time_step": limit}))
     sentence = r"solver\.time_step is .* s, but the limit of stability is .* s, which comes from \w+\."
@@ -371,7 +371,7 @@ def test_a_step_too_long_for_deep_fluid_is_warned_of():
     with pytest.raises(DivergedError, match=r"depth limits the time step to about 0\.0014 s, but it is 0\.002 s"):
         Simulation(scene).run(60)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", CortadoWarning)
         shorter = lock_exchange(0.0014)
     assert Simulation(shorter).run(60).positions[-1].max() < 0.42
 
@@ -417,7 +417,7 @@ def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
         return np.abs(run.velocities[-1]).max()
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", CortadoWarning)
         assert speed(limit) < max(2.0 * speed(0.5 * limit), 0.2)
     advice = r"viscosity limits the time step to about .* s, but it is .* s: try"
     with pytest.warns(CortadoWarning, match="from viscosity"), pytest.raises(DivergedError, match=advice):

@@ -7,6 +7,7 @@ import pytest
 
 from conftest import VALIDATION, tier
 from short import KEPT, MEASURED, SLOW, chosen, short, values_of, write_seconds
+from skips import complaints
 
 TESTS = Path(__file__).parent
 
@@ -77,3 +78,9 @@ def test_every_value_is_in_a_chosen_case():
 @pytest.mark.parametrize("third", [4])
 def test_what_is_set_together_is_one_value(request, one, other, third):
     assert values_of(request.node) == {("one,other", (id(one), id(other))), ("third", (id(third),))}
+
+
+def test_a_skip_that_a_package_would_cure_is_told():
+    assert complaints(["there is no CUDA device"] * 300 + ["root may write anywhere"]) == []
+    assert complaints(["PyTorch is not installed"]) == ["1 skipped, at most 0 may be: PyTorch is not installed"]
+    assert complaints(["root may write anywhere"] * 99)[0].startswith("99 skipped")

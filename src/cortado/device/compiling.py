@@ -203,6 +203,8 @@ class _Headers:
     def _path(self) -> str:
         """Of the folder of the headers; they are made again where it is gone, as after a child of a fork has ended."""
         if self._folder is None or not Path(self._folder.name).is_dir():
+            if self._folder is not None:
+                self._folder.cleanup()  # or else Python warns of it when it is collected
             self._folder = tempfile.TemporaryDirectory(prefix="cortado-headers-", ignore_cleanup_errors=True)
             self._made.clear()
         return self._folder.name

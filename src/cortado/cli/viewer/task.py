@@ -2,8 +2,10 @@
 
 import time
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 
@@ -38,8 +40,9 @@ class TaskView:
         self.made, simulation = made, made.problem.simulation
         self._every = max(made.problem.steps // FRAMES, 1)
         unit = "1/m" if made.renderer else "m²/m"
-        self._log = TemporaryDirectory()
-        """Of the replay log, with which the search goes on."""
+        self._log = Path(mkdtemp(prefix="cortado-view-"))
+        """The folder of the replay log, with which the search goes on. It is deleted with this object."""
+        finalize(self, rmtree, self._log, ignore_errors=True)
         self._coordinates: Arrays = made.start
         self._estimator = made.task.optimise.gradient.estimator()
         self.taken = 0
@@ -80,7 +83,7 @@ class TaskView:
             self.taken + 1,
             bounds=made.bounds,
             gradient=self._estimator,
-            checkpoint=Path(self._log.name),
+            checkpoint=self._log,
             resume=True,
         )
         loss, pulls = self._judged(found.last_parameters)
