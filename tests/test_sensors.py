@@ -11,6 +11,7 @@ from cortado.cli import main
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.series import SensorMatch
+from cortado.runs.sensors.sensor import value_of
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from finite_differences import distance
 from scenes import jet, plane, scene
@@ -307,3 +308,27 @@ def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch,
     assert capsys.readouterr().err.replace("bare", "").splitlines()[-1] == told[0]
     rows = list(csv.reader((tmp_path / "looked" / "sensors.csv").open()))
     assert rows[-1][1] == "nan"
+
+
+def test_an_interruption_between_two_sensors_keeps_what_was_read(cortado_command, tmp_path, monkeypatch):
+    """And the run goes on with the same bits."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE + TABLES)
+    run = ("run", "scene.toml", "--steps", "6", "--record-every", "2", "--no-pictures", "--out")
+    assert cortado_command(*run, "whole")[0] == 0
+    reads = []
+
+    def interrupted(sensor, at):
+        reads.append(sensor)
+        if len(reads) == 10:  # the second sensor of the state after four steps
+            raise KeyboardInterrupt
+        return value_of(sensor, at)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cortado.runs.sensors.log.value_of", interrupted)
+        code, _, err = cortado_command(*run, "stopped")
+    assert code == 130 and "Interrupted; " in err and "Traceback" not in err
+    assert len(list(csv.reader((tmp_path / "stopped" / "sensors.csv").open()))) == 5
+    assert cortado_command(*run, "stopped", "--resume")[0] == 0
+    texts = [(tmp_path / name / "sensors.csv").read_text() for name in ("whole", "stopped")]
+    assert texts[0] == texts[1]

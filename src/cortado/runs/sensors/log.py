@@ -52,12 +52,12 @@ class SensorLog:
                 raise InputError(f"sensors has {shown(sensor)} as {name!r}, but must have a sensor of cortado.sensors.")
         self.sensors = dict(sensors)
         self._units = {name: dict(sensor.columns(dimension)) for name, sensor in self.sensors.items()}
-        self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
+        self._rows: list[dict[str, NDArray[Any]]] = []
+        """One for each state. A state counts when all sensors have read it, so that an interruption leaves whole rows."""
 
     def read(self, at: Reading) -> None:
         """Have every sensor read a state."""
-        for name, sensor in self.sensors.items():
-            self._rows[name].append(self._value(name, sensor, at))
+        self._rows.append({name: self._value(name, sensor, at) for name, sensor in self.sensors.items()})
 
     def known(self, readings: Mapping[str, Readings]) -> float:
         """The last step of which there are all readings of these sensors; infinite without sensors."""
@@ -67,7 +67,7 @@ class SensorLog:
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
         """Have what was read of the first state and after so many steps."""
-        self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
+        self._rows = [{name: readings[name].values[k] for name in self.sensors} for k in range(steps + 1)]
 
     def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
         """NaN where the step after the state loses a particle: the run says so where it takes it."""
@@ -79,9 +79,9 @@ class SensorLog:
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
         """What was read, at the first of these times [s]."""
         found = {}
-        for name, rows in self._rows.items():
-            values = np.array(rows).reshape(len(rows), len(self._units[name]))
-            found[name] = Readings(np.asarray(times)[: len(rows)], values, self._units[name])
+        for name, units in self._units.items():
+            values = np.array([row[name] for row in self._rows]).reshape(len(self._rows), len(units))
+            found[name] = Readings(np.asarray(times)[: len(self._rows)], values, units)
         return found
 
 
