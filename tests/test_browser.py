@@ -137,7 +137,7 @@ def test_a_report_is_turned(page, tmp_path, monkeypatch):
 @pytest.fixture
 def look(page, tmp_path, monkeypatch) -> Iterator[Callable[[str], Any]]:
     """Opens the viewer of a file with a text, or of a folder, in the page."""
-    pytest.importorskip("viser", reason="no viser: pip install 'cortado-sph[view]'")
+    pytest.importorskip("viser", reason="no viser: pip install viser")
     monkeypatch.chdir(tmp_path)
     with ExitStack() as stack:
 

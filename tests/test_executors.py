@@ -389,9 +389,7 @@ def test_a_scheduler_that_is_not_there_is_a_sentence(monkeypatch, address, words
 
 def test_without_distributed_there_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    wanted = (
-        r"^Several processes need Dask's distributed, which is not installed: pip install 'cortado-sph\[distributed\]'"
-    )
+    wanted = r"^Several processes need Dask's distributed, which is not installed: pip install distributed"
     with pytest.raises(InputError, match=wanted):
         Distributed("tcp://127.0.0.1:8786")
     with pytest.raises(InputError, match=wanted), local_workers(2):

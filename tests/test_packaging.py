@@ -67,10 +67,11 @@ def test_the_source_distribution_holds_every_source(tmp_path, backend, root, pat
     assert len(sources) > 10 and sources <= held, sources - held
 
 
-def test_one_name_stands_wherever_cortado_is_installed():
-    """Another project has the name cortado on the package index."""
+def test_nobody_is_told_to_install_cortado_from_the_package_index():
+    """It is not there, and another project has the name cortado."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["name"] == "cortado-sph"
-    files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "src").rglob("*.py"), ROOT / "pyproject.toml"]
-    named = {name for file in files for name in re.findall(r"([\w-]+)\[(?:video|test)\]", file.read_text())}
-    assert named == {"cortado-sph"}
+    pages = [ROOT / "README.md", ROOT / "requirements-tested.txt", *(ROOT / "docs").rglob("*.md")]
+    files = [*pages, *(ROOT / "docs").rglob("*.ipynb"), *(ROOT / "src").rglob("*.py")]
+    told = {file: re.findall(r"pip install[^\n]*?\bcortado[\w-]*", file.read_text()) for file in files}
+    assert not {file: found for file, found in told.items() if found}

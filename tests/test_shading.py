@@ -411,7 +411,7 @@ def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
 def test_a_package_that_is_missing_is_named(monkeypatch):
     assert lacking(scene_of()) is None
     monkeypatch.setattr(shading_film, "find_spec", lambda name: None)
-    advice = r"pip install 'cortado-sph\[pictures\]'\."
+    advice = r"pip install av\."
     with pytest.raises(AssertionError, match="Shaded pictures need PyAV, which is not installed: " + advice):
         raise AssertionError(lacking(scene_of()))
     assert lacking(scene_of(picture={"film_frames": 0})) is None

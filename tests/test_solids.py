@@ -320,3 +320,9 @@ def test_positions_in_a_solid_are_refused():
     places[3] = [0.6, 0.1]
     with pytest.raises(InputError, match="outside the container or in a solid"):
         simulation.run(1, {"initial_positions": places})
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_a_polygon_needs_three_corners(count):
+    with pytest.raises(SceneError, match="but must be a list of at least 3 entries, each a list"):
+        PolygonSolid(name="a", corners=[[0.1 * k, 0.3] for k in range(count)])

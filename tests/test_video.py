@@ -83,7 +83,7 @@ def test_what_follows_no_film_that_is_there_begins_anew(tmp_path):
 
 def test_a_missing_package_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'cortado-sph\[video\]'"):
+    with pytest.raises(InputError, match=r"pip install av"):
         write_video(tmp_path / "a.mp4", [heart(16)])
 
 

@@ -277,7 +277,7 @@ def test_what_cannot_be_shown_is_said_in_a_sentence(scene, arguments, sentence, 
 
 def test_without_viser_a_sentence_says_what_to_install(scene, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
-    with pytest.raises(cortado.InputError, match=r"pip install 'cortado-sph\[view\]'"):
+    with pytest.raises(cortado.InputError, match=r"pip install viser"):
         opened(scene, [], "cpu", "float32", PORT)
 
 

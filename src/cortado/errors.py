@@ -115,20 +115,20 @@ class EngineMissingError(CortadoError, ImportError):
 
     def __str__(self) -> str:
         return (
-            "The reference engine is not installed: pip install cortado-reference, or from a clone of the repository "
-            "pip install ./reference, which needs a C++17 compiler (g++, for all precisions)."
+            "The reference engine is not installed: in a clone of the repository pip install ./reference, which needs "
+            "a C++17 compiler (g++, for all precisions)."
         )
 
 
 class ExtraMissingError(InputError, ImportError):
     """A library that comes with an extra of Cortado is not installed. Exit code 2."""
 
-    def __init__(self, name: str, extra: str):
-        super().__init__(name, extra)
+    def __init__(self, name: str, package: str):
+        super().__init__(name, package)
 
     def __str__(self) -> str:
-        name, extra = self.args
-        return f"{name} is needed for that, but is not installed: pip install 'cortado-sph[{extra}]'."
+        name, package = self.args
+        return f"{name} is needed for that, but is not installed: pip install {package}."
 
 
 class LibraryMissingError(CortadoError, ImportError):

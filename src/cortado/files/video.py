@@ -169,7 +169,7 @@ def pyav() -> Any:
     try:
         import av
     except ModuleNotFoundError as problem:
-        raise InputError("Videos need PyAV, which is not installed: pip install 'cortado-sph[video]'.") from problem
+        raise InputError("Videos need PyAV, which is not installed: pip install av.") from problem
     return av
 
 

@@ -59,7 +59,7 @@ def lacking(scene: Scene) -> str | None:
     if not missing:
         return None
     verb = "which is" if len(missing) == 1 else "which are"
-    return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install 'cortado-sph[pictures]'."
+    return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install av."
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:

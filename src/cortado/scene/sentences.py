@@ -153,7 +153,9 @@ def wanted(schema: Schema, name: str = "") -> str:
         case {"type": "array", "items": items, "maxItems": _}:
             return f"a list with one component for each axis, each {wanted(items)}"
         case {"type": "array", "items": items}:
-            return f"a list{' of at least one entry' if 'minItems' in schema else ''}, each {wanted(items)}"
+            least = schema.get("minItems", 0)
+            entries = f" of at least {'one entry' if least == 1 else f'{least} entries'}" if least else ""
+            return f"a list{entries}, each {wanted(items)}"
         case {"minProperties": _, "properties": properties}:
             return f"a table of at least one parameter out of {', '.join(properties)}"
     return "a table"

@@ -66,7 +66,7 @@ class Window:
 
             from cortado.cli.viewer.server import GuardedServer
         except ModuleNotFoundError:
-            raise InputError("viser is not installed, which shows it: pip install 'cortado-sph[view]'.") from None
+            raise InputError("viser is not installed, which shows it: pip install viser.") from None
         self.scene = scene
         self._guarded = GuardedServer(port, f"Cortado: {scene.name}")
         self.server: Any = self._guarded.viser

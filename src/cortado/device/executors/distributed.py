@@ -268,7 +268,7 @@ def distributed_module() -> Any:
         import distributed
     except ModuleNotFoundError:
         raise InputError(
-            "Several processes need Dask's distributed, which is not installed: pip install 'cortado-sph[distributed]'."
+            "Several processes need Dask's distributed, which is not installed: pip install distributed."
         ) from None
     return distributed
 

@@ -149,5 +149,5 @@ def _pxr() -> Any:
         import pxr.UsdGeom
         import pxr.Vt
     except ImportError as error:
-        raise ExtraMissingError("USD", "export") from error
+        raise ExtraMissingError("USD", "usd-core") from error
     return pxr

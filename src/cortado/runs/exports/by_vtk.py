@@ -98,6 +98,6 @@ def _vtk() -> Any:
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
         from vtkmodules.util import numpy_support
     except ImportError as error:
-        raise ExtraMissingError("VTK", "export") from error
+        raise ExtraMissingError("VTK", "vtk") from error
     modules = (vtkCommonCore, vtkCommonDataModel, vtkIOXML, numpy_support)
     return SimpleNamespace(**{name: value for one in modules for name, value in vars(one).items()})

@@ -21,7 +21,7 @@ def labelled(trajectory: Trajectory) -> Any:
     try:
         import xarray
     except ImportError as error:
-        raise ExtraMissingError("xarray", "export") from error
+        raise ExtraMissingError("xarray", "xarray") from error
     axes, of_particles = AXES[: trajectory.dimension], ("time", "particle")
     variables: Variables = {
         "position": ((*of_particles, "space"), trajectory.positions, {"units": "m"}),

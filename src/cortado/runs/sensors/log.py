@@ -53,7 +53,7 @@ class SensorLog:
         self.sensors = dict(sensors)
         self._units = {name: dict(sensor.columns(dimension)) for name, sensor in self.sensors.items()}
         self._rows: list[dict[str, NDArray[Any]]] = []
-        """One for each state. A state counts when all sensors have read it, so that an interruption leaves whole rows."""
+        """One for each state that all sensors have read: an interruption leaves whole rows."""
 
     def read(self, at: Reading) -> None:
         """Have every sensor read a state."""
