@@ -289,3 +289,29 @@ def test_an_option_says_the_kind_of_a_camera_and_set_the_rest():
     assert camera_override(None) == []
     with pytest.raises(SceneError, match="solid is 'raft', but must be"):
         scene().replaced(*camera_override("follow:raft"))
+
+
+# ---- spilt drops ---------------------------------------------------------------------------------------------------
+
+
+def spilt(dimension, drops, frames=11):
+    """(frames, n, d) [m] a block of 1000 particles that moves aside by a tenth of its size, but for some that fall."""
+    generator = np.random.default_rng(3)
+    block = generator.uniform(0.0, 0.4, (1000, dimension))
+    states = np.array([block + [0.04 * k / frames, *[0.0] * (dimension - 1)] for k in range(frames)])
+    falls = -4.0 * np.linspace(0.0, 1.0, frames)[:, None] ** 2 * generator.uniform(0.2, 1.0, drops)
+    states[:, :drops, 1] += falls
+    return states
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_drops_that_fall_away_leave_the_picture_and_do_not_make_it_small(dimension):
+    """39 drops, or 49 of 1000; but the picture follows a fifth of the fluid, and all of it if it falls whole."""
+    block = {"shape": "box", "lower": [0.0] * dimension, "upper": [0.4] * dimension, "phase": "water"}
+    still = {"gravity": [0.0, -9.81, 0.0][:dimension]}
+    made = scene(dimension=dimension, fluid=[block], container={"shape": "none"}, forces=still)
+    alone, few, many, part, whole = (
+        np.ptp(painter(made, spilt(dimension, drops)).stage.ends, axis=0)[1] for drops in (0, 39, 49, 200, 1000)
+    )
+    assert alone < 0.5 and few < 1.5 * alone and many < 1.5 * alone
+    assert part > 2.0 and whole > 3.9

@@ -19,7 +19,7 @@ from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.srgb import to_srgb
 from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
-from cortado.pictures import painter as artists
+from cortado.pictures import framing
 from cortado.pictures.environment import environment_of
 from cortado.pictures.film import film, lacking
 from cortado.pictures.labels import labelled, side_by_side
@@ -379,12 +379,22 @@ def test_a_film_that_is_stopped_keeps_its_frames_and_goes_on(tmp_path):
     assert len(drawn) == 60
 
 
-def test_a_film_shows_every_frame_in_real_time_or_as_slowly_as_it_says():
-    long, short = Pace.of(np.linspace(0.0, 8.0, 201)), Pace.of(0.0015 * np.arange(421))
-    assert len(long.frames) == 201 and long.speed == 1.0 and str(long) == "201 frames, 8.0 s, in real time"
-    assert len(short.frames) == 421 and short.speed == 0.05 and str(short) == "421 frames, 12.6 s, at 0.05 x"
-    np.testing.assert_allclose(np.diff(short.times), 0.03)
-    assert Pace.of(10.0 * np.arange(101)).speed == 50.0  # a frame every 10 s
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (np.linspace(0.0, 8.0, 201), "201 frames, 8.0 s, in real time"),
+        (np.linspace(0.0, 8.0, 5001), "201 frames, 8.0 s, in real time; 4800 of the 5001 that were recorded are left"),
+        (0.0015 * np.arange(421), "106 frames, 4.2 s, at 0.15 x; 315 of the 421 that were recorded are left out"),
+        (np.linspace(0.0, 60.0, 6001), "151 frames, 6.0 s, at 10 x; 5850 of the 6001 that were recorded are left out"),
+        (np.linspace(0.0, 0.4, 41), "41 frames, 1.6 s, at 0.25 x, with 25 frames a second, as no more were recorded: "),
+        (10.0 * np.arange(101), "101 frames, 4.0 s, at 250 x, with 25 frames a second, as no more were recorded: "),
+        (np.zeros(1), "1 frame, 0.0 s, in real time"),
+    ],
+)
+def test_a_film_has_25_frames_a_second_and_lasts_some_seconds(times, said):
+    pace = Pace.of(times)
+    assert str(pace).startswith(said)
+    assert len(times) == 1 or pace.frames_per_second == pytest.approx(25.0, rel=0.02)
 
 
 @pytest.mark.parametrize("span", [0.0063, 0.36, 1.0, 3.0, 100.0])
@@ -401,8 +411,8 @@ def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
     some = Pace.of(times, 101)
     assert len(some.frames) == 101 and some.frames[:3] == (0, 4, 8) and some.frames[-1] == 400
     assert str(some) == "101 frames, 4.0 s, at 0.5 x; 300 of the 401 that were recorded are left out"
-    asked = Pace.of(times, speed=1.0)  # 200 in a second are more than one sees
-    assert len(asked.frames) == 121 and asked.times[-1] == 2.0 and "280 of the 401" in str(asked)
+    asked = Pace.of(times, speed=1.0)
+    assert len(asked.frames) == 51 and asked.times[-1] == 2.0 and "350 of the 401" in str(asked)
     with pytest.warns(CortadoWarning, match=r"the film has 7 frames of the 90 that picture.film_frames asks for"):
         assert len(pace_of(np.arange(7.0), Picture(film_frames=90)).frames) == 7
     assert str(Pace.unknown(50)) == "50 frames, 4.0 s, step by step"
@@ -419,10 +429,12 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
 
 @pytest.mark.parametrize("enough", [1, 40, 90, 1000])
 def test_a_painter_looks_at_every_so_many_positions_of_all_states(enough, monkeypatch):
-    monkeypatch.setattr(artists, "ENOUGH", enough)
+    monkeypatch.setattr(framing, "ENOUGH", enough)
     states = np.random.default_rng(0).random((9, 13, 3))
-    every = states.reshape(-1, 3)
-    np.testing.assert_array_equal(artists.spread(list(states)), every[:: max(len(every) // enough, 1)])
+    found = framing.thinned(states)
+    assert len(found) == 9 and sum(map(len, found)) <= max(2 * enough, 9)
+    for own, state in zip(found, states, strict=True):
+        assert len(own) and all((place == state).all(axis=1).any() for place in own)
 
 
 def test_words_and_panels():
@@ -508,7 +520,7 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
     main(["picture", "a", "--film", "--lines", "64", "--colour", "speed"])
     assert (
-        "film.mp4: 4 frames, 1.7 s, at 0.005 x, with 2.4 frames a second, as no more were recorded: --fps 16667 "
+        "film.mp4: 4 frames, 0.9 s, at 0.0095 x, with 4.5 frames a second, as no more were recorded: --fps 16667 "
         in capsys.readouterr().out
     )
     main(["optimise", "task.toml", "--out", "b"])

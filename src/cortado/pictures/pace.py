@@ -12,12 +12,16 @@ from cortado.errors import CortadoWarning
 from cortado.scene.picture import Picture
 from cortado.words import counted
 
-SHORTEST = 4.0
-"""[s] that a film lasts at least, if it has frames enough."""
-SLOWEST, USUAL, QUICKEST = 6.0, 25.0, 60.0
-"""Frames that a film shows in a second: fewer are seen one by one, of more the eye sees no more."""
+SHORTEST, LONGEST = 4.0, 10.0
+"""[s] that a film lasts at least and at most, if it has frames enough and nobody asks for another number of them."""
+FEW = 1.0
+"""[s] that a film of a few frames lasts, with at least `SLOWEST` of them in a second."""
+SLOWEST, USUAL = 6.0, 25.0
+"""Frames that a film shows in a second: fewer are seen one by one."""
 SMOOTH = 12.0
 """Frames in a second below which a film says how more are recorded."""
+SHORT = 1.5
+"""How many times as fast a film goes for want of frames before it says so."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 """Speeds that are easy to think of, and these times powers of ten."""
 
@@ -41,16 +45,17 @@ class Pace:
 
     @classmethod
     def of(cls, times: Sequence[float] | NDArray, count: int | None = None, speed: float | None = None) -> "Pace":
-        """That of a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly chosen; all if
-        left out. ``speed``: if left out that of real time, or as much slower as the film needs to last `SHORTEST`, and
-        to show no more frames in a second than are seen."""
-        count, span = min(count or len(times), len(times)), float(times[-1] - times[0])
-        enough = USUAL / (speed or _easy_speed(span, round(USUAL * max(SHORTEST, span)) + 1))
+        """The pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly chosen; if
+        left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows `USUAL` in a
+        second, and any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or longer
+        than `LONGEST`."""
+        span = float(times[-1] - times[0])
+        full = speed or _easy_speed(span)
         if speed is None:
-            speed = _easy_speed(span, count)
-        elif span > 0.0:
-            count = min(count, floor(QUICKEST * span / speed) + 1)
-        chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, count)).astype(int)).tolist()
+            speed = _speed(span, min(count or len(times), len(times)), full if count is None else 0.0)
+        most = min(count or round(USUAL * span / speed) + 1, len(times))
+        enough = USUAL / full
+        chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, most)).astype(int)).tolist()
         shown = tuple((times[k] - times[0]) / speed for k in chosen)
         return cls(tuple(chosen), shown, speed, len(times), enough)
 
@@ -63,7 +68,7 @@ class Pace:
     @property
     def frames_per_second(self) -> float:
         """In the mean."""
-        return (len(self.frames) - 1) / self.times[-1] if self.times[-1] > 0.0 else QUICKEST
+        return (len(self.frames) - 1) / self.times[-1] if self.times[-1] > 0.0 else USUAL
 
     @property
     def in_words(self) -> str:
@@ -81,7 +86,7 @@ class Pace:
     def _more(self) -> str:
         """What records enough frames."""
         if self.of_search and self.speed is not None:
-            return f"picture.film_frames={self.enough * self.speed * self.times[-1] + 1.0:.0f}"
+            return f"picture.film_frames={self.enough * self._span + 1.0:.0f}"
         return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
 
     def __str__(self) -> str:
@@ -89,10 +94,20 @@ class Pace:
         kept = f"{counted(len(self.frames), 'frame')}, {self.seconds:.1f} s, {self.in_words}"
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
-        if self.speed is not None and 1 < len(self.frames) == self.recorded and self.frames_per_second < SMOOTH:
-            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: "
-            kept += f"{self._more} records {USUAL:g} for each second of the film"
+        if self.speed is not None and 1 < len(self.frames) == self.recorded and self._lacks:
+            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: {self._more} "
+            kept += f"records {USUAL:g} for each second of a film of {self.enough * self._span / USUAL:.2g} s"
         return kept
+
+    @property
+    def _span(self) -> float:
+        """[s] that the run lasts."""
+        return self.times[-1] * (self.speed or 0.0)
+
+    @property
+    def _lacks(self) -> bool:
+        """Whether the film is seen frame by frame, or is much shorter than one of a run with frames enough."""
+        return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
 
 
 def pace_of(times: Sequence[float] | NDArray, picture: Picture) -> Pace:
@@ -106,11 +121,22 @@ def pace_of(times: Sequence[float] | NDArray, picture: Picture) -> Pace:
     return Pace.of(times, asked, picture.film_speed)
 
 
-def _easy_speed(span: float, count: int) -> float:
-    """Of a film with so many frames of a run that lasts ``span`` [s]."""
+def _speed(span: float, count: int, easy: float) -> float:
+    """The speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]: ``easy`` if they are enough
+    for that, or else the speed at which they are `USUAL` in a second."""
     if span <= 0.0:
         return 1.0
-    lasts = max(min(SHORTEST, count / SLOWEST), (count - 1) / QUICKEST)
-    most = min(span / lasts, max(1.0, SLOWEST * span / count))
-    power = 10.0 ** floor(log10(most) + 1e-9)
-    return next((round(easy * power, 12) for easy in EASY if easy * power <= most * (1.0 + 1e-9)), power)
+    room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))
+    return easy if span <= 1.01 * room * easy else float(f"{span / room:.2g}")
+
+
+def _easy_speed(span: float) -> float:
+    """The speed of a film that has frames enough, of a run that lasts ``span`` [s]."""
+    wanted = span / min(max(span, SHORTEST), LONGEST)
+    if wanted <= 0.0:
+        return 1.0
+    power = 10.0 ** floor(log10(wanted) + 1e-9)
+    speeds = [round(easy * power, 12) for easy in (10.0, *EASY)]
+    if wanted > 1.0:
+        return min(speed for speed in speeds if speed >= wanted * (1.0 - 1e-9))
+    return max(speed for speed in speeds if speed <= wanted * (1.0 + 1e-9))

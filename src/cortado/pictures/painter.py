@@ -10,15 +10,12 @@ from cortado.pictures.particles import mixed
 from cortado.pictures.plane import PlanePainter
 from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.space import SpacePainter
-from cortado.pictures.stage import Stage, extent_of
+from cortado.pictures.stage import Stage
 from cortado.scene.scene import Scene
-
-ENOUGH = 1_000_000
-"""Positions, of all particles in all frames, that tell where the fluid comes to."""
 
 
 def painter(
-    scene: Scene, positions: Points, device: Any = "cpu", poses: Iterable[Scene] = ()
+    scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
     """The painter of a scene; arguments as of `stage_of`, and the ``device`` of the rays."""
     return painter_on(stage_of(scene, positions, poses), device)
@@ -29,22 +26,11 @@ def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter |
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
-def stage_of(scene: Scene, positions: Points, poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """What is around the fluid of a scene, which will be at positions (frames, n, d) [m]; ``poses``: the same scene
+def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
+    """What is around the fluid of a scene, which will be at positions (n, d) or (frames, n, d)
+    [m]; ``poses``: the same scene
     with its solids where they will be, for them to be in the picture, too."""
-    particles = spread([np.asarray(positions).reshape(-1, scene.dimension)])
-    if scene.dimension == 2:
-        return PlaneStage.of(scene, *extent_of(particles), poses)
-    return Stage.of(scene, particles, poses)
-
-
-def spread(states: Sequence[Points]) -> Points:
-    """(m, d) [m] of all positions in states (n, d) those that a painter looks at, without the room that all take."""
-    stride, found, before = max(sum(map(len, states)) // ENOUGH, 1), list[Points](), 0
-    for positions in states:
-        found.append(positions[-before % stride :: stride])
-        before += len(positions)
-    return np.concatenate(found)
+    return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:

@@ -1,6 +1,6 @@
 """Everything around the fluid in the plane: paper, the walls of a container or a tank, their shadow, and solids."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
+from cortado.pictures.framing import fluid_extent, thinned
 from cortado.pictures.gloss import glossy
-from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
 from cortado.scene.containers import BoxContainer
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -45,15 +46,17 @@ class PlaneStage:
     """Lower and upper ends (2,) [m] of what the picture has in its middle; those of what is shown if left out."""
 
     @classmethod
-    def of(cls, scene: Scene, lower: Points, upper: Points, poses: Iterable[Scene] = ()) -> "PlaneStage":
-        """That of a scene in 2-D, the fluid of which is between lower and upper (2,) [m]; ``poses`` as of `painter`."""
+    def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
+        """The stage of a scene in 2-D, the fluid of which is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` as of
+        `painter`."""
         container = scene.container if isinstance(scene.container, BoxContainer) else None
         spacing, solids = scene.discretisation.spacing, shown_solids(scene)
         if container is not None:
             lower, upper = (np.asarray(end) for end in container.extent())
         else:
-            paper = 0.0 if any(one.is_tank for one in solids) else spacing
-            lower, upper = extent_with((lower - paper, upper + paper), [scene, *poses])
+            paper, scenes = 0.0 if any(one.is_tank for one in solids) else spacing, [scene, *poses]
+            lower, upper = fluid_extent(thinned(positions), extents_of_solids(scenes))
+            lower, upper = extent_with((lower - paper, upper + paper), scenes)
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
 
     @property

@@ -1,6 +1,6 @@
 """The solids of a scene as pictures show them: shapes in poses, with colours."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -72,10 +72,19 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     return (*found, *(one for one in images if _overlap(one.body.extent(), ends)))
 
 
+def extents_of_solids(scenes: Iterable[Scene]) -> list[tuple[Points, Points]]:
+    """Lower and upper ends (d,) [m] of each solid in scenes."""
+    return [one.body.extent() for scene in scenes for one in shown_solids(scene)]
+
+
 def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:
     """Lower and upper ends (d,) [m] of all that is between such, and of the solids of scenes."""
-    bodies = [one.body.extent() for scene in scenes for one in shown_solids(scene)]
-    both = np.array([ends, *bodies])
+    return union([ends, *extents_of_solids(scenes)])
+
+
+def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of all that is in boxes, which are pairs of such ends."""
+    both = np.array(boxes)
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 

@@ -1,14 +1,15 @@
 """Where a picture is taken: which way is up, the floor, the container of glass, the lamps, and a camera."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
+from cortado.pictures.framing import fluid_extent, thinned
 from cortado.pictures.media import media_of
-from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
 from cortado.scene.camera_paths import View
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
@@ -63,16 +64,17 @@ class Stage:
     """In the frame of the picture."""
 
     @classmethod
-    def of(cls, scene: Scene, positions: Points, poses: Iterable[Scene] = ()) -> "Stage":
-        """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]; ``poses`` as of `painter`."""
-        lower, upper = extent_of(positions)
-        picture = scene.picture or Picture()
-        ends = scene.container.extent()
+    def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
+        """The stage of a scene in 3-D, the fluid of which is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` as of
+        `painter`."""
+        states, picture, ends = thinned(positions), scene.picture or Picture(), scene.container.extent()
+        scenes = [scene, *poses]
+        lower, upper = fluid_extent(states, extents_of_solids(scenes) if ends is None else [ends])
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
             air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
             air = 0.0 * air if any(table.side == "inside" for table in scene.solid) else air
-            lower, upper = extent_with((lower - air, upper + air), [scene, *poses])
+            lower, upper = extent_with((lower - air, upper + air), scenes)
         else:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
         origin = 0.5 * (lower + upper)
@@ -85,7 +87,7 @@ class Stage:
         elevation = FROM_ABOVE if into_cup else FROM_THE_SIDE
         media, transparency = media_of(scene, float((high - low).max()))
         spacing = scene.discretisation.spacing
-        cuts = ends is not None and not spilled(scene.container, positions, spacing)
+        cuts = ends is not None and not spilled(scene.container, np.concatenate(states), spacing)
         nowhere = np.zeros(3), np.zeros(3), 0.0
         seen = (low, high), elevation, *nowhere
         own = cls(frame, origin, low, high, *seen, picture, scene.container, spacing, transparency, media, cuts, ())
@@ -229,11 +231,6 @@ class Stage:
     def _direction(self, azimuth: float, elevation: float) -> Points:
         """(3,) unit vector; the azimuth [degrees] counts from the camera at home, to the right."""
         return _towards(self.azimuth + azimuth, elevation)
-
-
-def extent_of(positions: Points) -> tuple[Points, Points]:
-    """Lower and upper ends (d,) [m] of nearly all positions (n, d) [m]: a few drops may be further away."""
-    return np.quantile(positions, 0.002, axis=0), np.quantile(positions, 0.998, axis=0)
 
 
 def _box(points: Points) -> tuple[Points, Points]:

@@ -53,11 +53,11 @@ class Picture(Table):
     shaded: Flag = True
     """Whether light and shadow fall on the fluid; without them its colours are those of the scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
-    """Frames of a film, evenly chosen of those that were recorded; all of them if left out, no film if 0. A search
-    records as many for its films, 121 if left out."""
+    """Frames of a film, evenly chosen from those that were recorded; 25 in each of its seconds if left out, and no film
+    if 0. A search records as many for its films, 121 if left out."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
-    """Seconds of the run in a second of its film: 1 is real time, 0.25 a quarter of it; films show at most 60 frames in
-    a second. If left out real time, or as much slower as a film needs to last 4 s and to show every frame."""
+    """Seconds of the run in a second of its film: 1 is real time, 0.25 a quarter of it. If left out real time, or
+    slower or faster where the film would be shorter than 4 s or longer than 10 s."""
 
     @property
     def sun_and_sky(self) -> Light:

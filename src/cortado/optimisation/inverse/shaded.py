@@ -21,7 +21,7 @@ from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
 from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page, Panel
-from cortado.pictures.painter import colours_of, painter, spread
+from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scenery import State
 from cortado.runs.emitted import is_out, those
 from cortado.runs.report import Figures
@@ -93,7 +93,7 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
     picture, half = scene.picture or Picture(), len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
     panel = picture.model_copy(update=size)
-    places = spread([run[step].positions for run in runs for step in run])
+    places = [run[step].positions for run in runs for step in run]
     artist = painter(scene.model_copy(update={"picture": panel}), places, device)
 
     def composed(images: list[Points]) -> Points:

@@ -10,7 +10,7 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.pictures.contained_liquid import contained_liquid
-from cortado.pictures.painter import colours_of, spread
+from cortado.pictures.painter import colours_of
 from cortado.pictures.scale import Scale
 from cortado.pictures.shown_solids import ShownSolid, shown_solids
 from cortado.pictures.solid_mesh import SolidMesh
@@ -142,7 +142,7 @@ class Exported:
     @cached_property
     def _stage(self) -> Stage:
         """Of a run in 3-D: whether its fluid ends at the walls of its container."""
-        return Stage.of(self.scene, spread(list(self._trajectory.positions)))
+        return Stage.of(self.scene, self._trajectory.positions)
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
         try:
