@@ -74,7 +74,7 @@ def test_the_run_and_its_film_are_told(capsys):
     main(["describe", "scene.toml", "--time", "1.05", "--set", "picture.film_speed=0.5"])
     out = capsys.readouterr().out
     assert "500 steps, 1.05 s of motion: about" in out and "film        53 frames, 2.1 s, at 0.5 x; 448 of" in out
-    assert "; about 64 s to draw, 0.5 s for the first state; splashes take up to twice as long\n" in out
+    assert "; about 26 s to draw, 0.5 s for the first state; splashes take up to twice as long\n" in out
     none = cortado.Simulation(cortado.load_scene("scene.toml", ["picture.film_frames=0"]))
     assert RunLength.of(none, 10, None, EverySteps(1)).film is None
 
