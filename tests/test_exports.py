@@ -13,8 +13,8 @@ import cortado
 from cortado import ComputationError, InputError, Trajectory
 from cortado.pictures.scale import Scale
 from cortado.runs.exports import by_vtk
-from cortado.runs.exports.by_usd import time_codes
 from cortado.runs.exports.export import FORMATS
+from cortado.runs.exports.whole_frames import WholeFrames
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
@@ -162,13 +162,65 @@ def test_usd_has_a_surface_that_encloses_the_fluid_and_solids_in_motion(tmp_path
     np.testing.assert_allclose(extent, [[-0.06] * 3, [0.06] * 3], atol=1e-3)
 
 
-def test_time_codes_are_frames_or_times():
-    """Evenly spaced frames have whole numbers in spite of round-off; chosen steps keep their distances."""
-    rate, codes = time_codes(0.1 * np.arange(11) + 3.0)
-    assert rate == pytest.approx(10.0) and codes.tolist() == list(range(11))
-    rate, codes = time_codes(np.array([0.0, 0.1, 0.4]))
-    assert rate == pytest.approx(5.0) and codes == pytest.approx([0.0, 0.5, 2.0])
-    assert time_codes(np.array([0.2]))[1].tolist() == [0.0]
+@pytest.mark.parametrize(
+    ("times", "rate", "count", "left_out"),
+    [
+        (0.1 * np.arange(11) + 3.0, 10.0, 11, 0.0),
+        (np.array([*0.04 * np.arange(26), 1.01]), 25.0, 26, 0.01),  # the last state comes early
+        (0.021 * np.arange(101), 1.0 / 0.021, 101, 0.0),  # every ten steps of 2.1 ms
+        (np.ceil(0.04 * np.arange(51) / 0.003) * 0.003, 25.0, 51, 0.001),  # the first step at 25 a second or after it
+        (np.array([0.2]), 24.0, 1, 0.0),
+    ],
+)
+def test_whole_frames_are_as_many_in_a_second_as_were_asked_for(times, rate, count, left_out):
+    found = WholeFrames.of(times)
+    assert found.rate == pytest.approx(rate) and len(found.times) == count
+    assert found.left_out == pytest.approx(left_out, abs=1e-9)
+    np.testing.assert_allclose(found.times, times[0] + np.arange(count) / rate)
+    np.testing.assert_allclose(times[found.recorded] + found.shifts, found.times)
+    assert len(set(found.recorded)) == count  # no state twice, none left out
+
+
+def test_steps_that_grow_are_shown_at_even_times():
+    times = np.cumsum(np.linspace(0.002, 0.02, 200))
+    found = WholeFrames.of(times)
+    np.testing.assert_allclose(np.diff(found.times), 1.0 / found.rate)
+    np.testing.assert_allclose(times[found.recorded] + found.shifts, found.times)
+    assert (
+        np.abs(found.shifts).max() <= 0.5 * np.diff(times).max() + 1e-12 and "along their velocities" in found.in_words
+    )
+
+
+def test_usd_moves_late_states_to_whole_time_codes(tmp_path, capsys):
+    """All that moves here does so evenly, so that it is where it should be at each code."""
+    usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    times, first = np.array([0.0, 0.042, 0.081, 0.12, 0.13]), lattice()
+    motion = SolidMotion(
+        np.array([[0.55 + t, 0.15, 0.1] for t in times]), np.array([[0.0, 10.0 * t, 0.0] for t in times])
+    )
+    late = replace(
+        trajectory(),
+        times=times,
+        steps=np.array([0, 14, 27, 40, 44]),
+        positions=np.array([first + [0.0, 0.1 * t, 0.0] for t in times]),
+        velocities=np.broadcast_to([0.0, 0.1, 0.0], (5, *first.shape)),
+        mass_fractions=np.tile(trajectory().mass_fractions[:1], (5, 1, 1)),
+        quantities={},
+        solids=SolidMotions({"my rotor": motion}),
+    )
+    stage = usd.Stage.Open(str(late.export(tmp_path / "usd", to="usd")))
+    assert (stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (3.0, 25.0)
+    points = geometry.Points.Get(stage, "/run/particles").GetPointsAttr()
+    assert points.GetTimeSamples() == [0.0, 1.0, 2.0, 3.0]
+    rotor = geometry.Xform.Get(stage, "/run/solid_my_rotor")
+    own = np.array(geometry.Mesh.Get(stage, "/run/solid_my_rotor/mesh").GetPointsAttr().Get())
+    for code in range(4):
+        np.testing.assert_allclose(points.Get(code), first + [0.0, 0.004 * code, 0.0], atol=1e-6)
+        matrix = np.array(rotor.ComputeLocalToWorldTransform(code))
+        wanted = box_corners(0.4 * code, [0.55 + 0.04 * code, 0.15, 0.1])
+        assert same_points(np.c_[own, np.ones(len(own))] @ matrix[:, :3], wanted)
+    told = capsys.readouterr().out
+    assert "by at most 2 ms; the last state, 10 ms after the last whole frame, is left out" in told
 
 
 # ---- for series --------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,12 @@ class Frame:
         fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
         fields = {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
         return chosen(self.quantities, name, fields)
+
+    def moved(self, duration: float) -> Frame:
+        """About the state a short time [s] later, or earlier: every particle goes on along its velocity."""
+        if duration == 0.0:
+            return self
+        return replace(self, positions=self.positions + duration * self.velocities, time=self.time + duration)
 
     def __repr__(self) -> str:
         return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"

@@ -43,6 +43,17 @@ class SolidMotion:
         places, turns = self.positions[frames], self.rotations[frames]
         return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
+    def at(self, known: NDArray[Any], times: NDArray[Any]) -> Self:
+        """The motion at ``times`` (k,) [s], between its frames at times ``known`` (frames,) [s]; without velocities."""
+        places = np.stack([np.interp(times, known, x) for x in self.positions.T], axis=1)
+        if self.rotations.ndim == 1:
+            turns = np.interp(times, known, self.rotations)
+        else:
+            from scipy.spatial.transform import Rotation, Slerp
+
+            turns = Slerp(known, Rotation.from_rotvec(self.rotations))(times).as_rotvec()
+        return replace(self, positions=places, rotations=turns, velocities=None, angular_velocities=None)
+
 
 class SolidMotions(dict[str, SolidMotion]):
     """Of the solids of a run that move, by their names."""
@@ -55,6 +66,12 @@ class SolidMotions(dict[str, SolidMotion]):
     def in_frames(self, frames: slice) -> "SolidMotions":
         """In some of the frames."""
         return SolidMotions({name: motion[frames] for name, motion in self.items()})
+
+    def at(self, known: NDArray[Any], times: NDArray[Any]) -> "SolidMotions":
+        """At ``times`` [s], between frames at times ``known`` [s]."""
+        if np.array_equal(known, times):
+            return self
+        return SolidMotions({name: motion.at(known, times) for name, motion in self.items()})
 
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> SolidMotions:

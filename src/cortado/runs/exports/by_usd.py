@@ -8,29 +8,28 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError, ExtraMissingError
 from cortado.files.atomic import sentences, unfinished
+from cortado.files.progress import announce
 from cortado.runs.exports.by_trimesh import Advance
 from cortado.runs.exports.exported import Exported, ExportedFrame, Mesh, Pose
-
-EVEN = 1e-6
-"""Frames whose distances in time differ by less than this part are evenly spaced."""
+from cortado.runs.exports.whole_frames import WholeFrames
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     """``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a
     transform ``/run/solid_NAME`` with a mesh; returns its path.
 
-    Frame k is at time code k where frames are evenly spaced in time, and each of another length at its time in the
-    mean distance of frames; the file says how many time codes a second has. Lengths are metres, colours linear.
+    Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
+    these are, and a line where they are not recorded ones. Lengths are metres, colours linear.
     """
     pxr = _pxr()
     path = folder / "run.usdc"
-    rate, codes = time_codes(run.times)
+    whole = WholeFrames.of(run.times)
     temporary = unfinished(path).with_suffix(".usdc")
     with sentences(path):
         try:
             stage = pxr.Usd.Stage.CreateNew(str(temporary))
-            writer = _Writer(pxr, stage, run, codes, rate)
-            for code, frame in zip(codes, run.frames(), strict=True):
+            writer = _Writer(pxr, stage, run, len(whole.times), whole.rate)
+            for code, frame in enumerate(run.frames(whole)):
                 writer.add(float(code), frame)
                 advance()
             stage.GetRootLayer().Save()
@@ -42,31 +41,23 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
             ) from problem
         finally:
             temporary.unlink(missing_ok=True)
+    if whole.in_words:
+        announce(f"{path.name}: {whole.in_words}.")
     return path
-
-
-def time_codes(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """Time codes a second, and the code (frames,) of each frame at times (frames,) [s]."""
-    steps = np.diff(times)
-    if not len(steps):
-        return 24.0, np.zeros(len(times))
-    rate = len(steps) / float(times[-1] - times[0])
-    even = bool((np.abs(steps * rate - 1.0) < EVEN).all())
-    return rate, np.arange(len(times), dtype=np.float64) if even else (times - times[0]) * rate
 
 
 class _Writer:
     """Adds frames to a stage."""
 
-    def __init__(self, pxr: Any, stage: Any, run: Exported, codes: np.ndarray, rate: float):
+    def __init__(self, pxr: Any, stage: Any, run: Exported, frames: int, rate: float):
         self._pxr, self._run, geometry = pxr, run, pxr.UsdGeom
         geometry.SetStageMetersPerUnit(stage, 1.0)
         gravity = np.abs(np.asarray(run.scene.forces.gravity))
         geometry.SetStageUpAxis(stage, geometry.Tokens.z if gravity.argmax() == 2 else geometry.Tokens.y)
         stage.SetTimeCodesPerSecond(rate)
         stage.SetFramesPerSecond(rate)
-        stage.SetStartTimeCode(float(codes[0]))
-        stage.SetEndTimeCode(float(codes[-1]))
+        stage.SetStartTimeCode(0.0)
+        stage.SetEndTimeCode(float(frames - 1))
         stage.SetDefaultPrim(geometry.Xform.Define(stage, "/run").GetPrim())
         self._particles = geometry.Points.Define(stage, "/run/particles")
         self._particles.CreateWidthsAttr(self._floats(np.array([run.spacing])))
@@ -75,7 +66,6 @@ class _Writer:
         if self._surface is not None:
             self._begin_mesh(self._surface)
         self._poses: dict[str, tuple[Any, Any]] = {}
-        self._first = float(codes[0])
         for solid in run.solids:
             form = geometry.Xform.Define(stage, f"/run/{solid.part}")
             self._poses[solid.name] = form.AddTranslateOp(), form.AddOrientOp(geometry.XformOp.PrecisionDouble)
@@ -93,7 +83,7 @@ class _Writer:
         for name, values in frame.fields.items():
             self._field(name, values).Set(self._floats(values), code)
         for solid in self._run.solids:
-            if solid.moves or code == self._first:
+            if solid.moves or code == 0.0:
                 own = code if solid.moves else self._pxr.Usd.TimeCode.Default()
                 self._set_pose(solid.name, frame.poses[solid.name], own)
 

@@ -17,10 +17,11 @@ from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.surface import nearest_colours, spheres
 from cortado.runs.colouring import coloured_by
+from cortado.runs.exports.whole_frames import WholeFrames
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
 from cortado.runs.measuring import Measuring
-from cortado.runs.solid_motion import posed, sized
+from cortado.runs.solid_motion import SolidMotions, posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -123,18 +124,23 @@ class Exported:
         """(3, 3) the rotation that makes y the axis against gravity; in the plane there is nothing to turn."""
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
-    def frames(self) -> Iterator[ExportedFrame]:
-        """One after the other, as surfaces take memory."""
-        return (self._frame(k, frame) for k, frame in enumerate(self._trajectory))
+    def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
+        """All recorded states, or those of an animation, one after the other, as surfaces take memory."""
+        if whole is None:
+            return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
+        solids = self._trajectory.solids.at(self.times, whole.times)
+        states = enumerate(zip(whole.recorded.tolist(), whole.shifts.tolist(), strict=True))
+        return (self._frame(self._trajectory[k].moved(shift), k, solids, frame) for frame, (k, shift) in states)
 
-    def _frame(self, number: int, frame: Frame) -> ExportedFrame:
+    def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
+        """A state near one that was recorded, with the solids where they are in a frame of their motion."""
         positions, velocities = in_space(frame.positions), in_space(frame.velocities)
         colours = colours_of(self.scene, frame.mass_fractions, len(positions))
         if self._scale is not None and self._values is not None:
-            colours = self._scale.colours(self._values[number])
+            colours = self._scale.colours(self._values[recorded])
         fractions = np.zeros((len(positions), 0)) if frame.mass_fractions is None else frame.mass_fractions
         fields = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
-        placed = _first_of_each(posed(self.scene, self._trajectory.solids, number))
+        placed = _first_of_each(posed(self.scene, solids, number))
         poses = {name: Pose(_turn_in_space(one.turn), in_space(one.position[None])[0]) for name, one in placed.items()}
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
         return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
