@@ -9,7 +9,7 @@ from cortado.pictures.shown_solids import union
 
 DROPS = 0.002
 """The share of particles at either end of an axis that may lie outside of a picture."""
-SPILT, BEYOND = 0.05, 0.15
+SPILT, BEYOND = 0.1, 0.15
 """The share of particles at either end of an axis that does not widen the picture if it is far away; and how much wider
 than all others a picture is, in their widths."""
 NEAR = 0.25
