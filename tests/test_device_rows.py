@@ -82,6 +82,9 @@ def test_a_lost_scene_has_no_derivative() -> None:
         _, residual = stepper.step(own.on_device(), {"gravity": on_device(gravity)})
     found = stepper.vjp(residual, {"positions": on_device(numbers(1, 2, 25, 3))})[1]["gravity"].numpy()
     assert np.isfinite(found[0]).all() and np.isnan(found[1]).all()
+    silent = numbers(1, 2, 25, 3) * np.array([[[1.0]], [[0.0]]])
+    one, lost = stepper.vjp(residual, {"positions": on_device(silent)})[1]["gravity"].numpy()
+    assert one.tobytes() == found[0].tobytes() and not lost.any()
 
 
 def test_a_schedule_is_replaced_by_rows() -> None:

@@ -247,6 +247,77 @@ def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(jax, layer, simula
     assert nested.shape == (1, 3) and nested[0, 1] == loss(gravities[1])
 
 
+GONE = np.array([[0.4, -9.0], [9e5, 0.0], [-1.0, -8.0]])
+"""Gravities, the second of which throws the fluid through the wall."""
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_lost_scene_of_a_map_adds_nothing_where_its_cotangent_is_0(jax, layer, precision):
+    """To the derivatives of what the scenes share: of values, of values from states, and of scanned steps, through
+    which it passes without numbers."""
+    np_, sheared_one = jax.numpy, Simulation(sheared(), precision=precision)
+    problem = matched(sheared_one)
+    first, kept = layer.state(sheared_one), np.array([0, 2])
+
+    def states(rows, viscosity):
+        own = jax.tree.map(lambda array: np_.broadcast_to(array, (len(rows), *array.shape)), first)
+
+        def body(before, _):
+            move = lambda one, g: layer.step(sheared_one, one, {"gravity": g, "viscosity": viscosity}, steps=4)  # noqa: E731
+            after = jax.vmap(move)(before, rows)
+            return after, None
+
+        return jax.lax.scan(body, own, None, length=2)[0]
+
+    def values(rows, viscosity):
+        return jax.vmap(lambda g: layer.value(problem)({"gravity": g, "viscosity": viscosity}))(rows)
+
+    def later(rows, viscosity):
+        return jax.vmap(lambda one: layer.value(problem)({"viscosity": viscosity}, one))(states(rows, viscosity))
+
+    def ends(rows, viscosity):
+        return states(rows, viscosity)["positions"].sum(axis=(1, 2))
+
+    rows, viscosity = np_.asarray(GONE, sheared_one.precision.numpy), np_.asarray(9.0, sheared_one.precision.numpy)
+    for each in (values, later, ends):
+        found = each(rows, viscosity)
+        assert np.isnan(found).tolist() == [False, True, False]
+        assert np.asarray(found)[kept].tobytes() == np.asarray(each(rows[kept], viscosity)).tobytes()
+        total = lambda v, rows=rows, each=each: np_.nansum(each(rows, v))  # noqa: E731
+        wanted = jax.grad(lambda v, each=each: each(rows[kept], v).sum())(viscosity)
+        assert wanted != 0.0
+        for gradient in (jax.grad(total), *([jax.jit(jax.grad(total))] if each is ends else [])):
+            assert np.asarray(gradient(viscosity)).tobytes() == np.asarray(wanted).tobytes()
+        assert np.isnan(jax.grad(lambda v, each=each: each(rows, v).sum())(viscosity))
+        by_row = np.asarray(jax.grad(lambda r, each=each: np_.nansum(each(r, viscosity)))(rows))
+        assert (by_row[1] == 0.0).all() and by_row[kept].all()
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_lost_evaluations_of_a_map_that_goes_one_by_one_leave_the_others(jax, layer, simulation, problem):
+    """As an estimator without batches does, and what measures: from states of lost scenes, too."""
+    estimator, kept = gradients.RandomizedSmoothing(samples=2), np.array([0, 2])
+    loss = jax.vmap(lambda g, v: layer.value(problem, estimator)({"gravity": g, "viscosity": v}), (0, None))
+    found, wanted = loss(GONE, 9.0), loss(GONE[kept], 9.0)
+    assert np.isnan(found).tolist() == [False, True, False] and found[kept].tobytes() == wanted.tobytes()
+    found = jax.grad(lambda v: jax.numpy.nansum(loss(GONE, v)))(9.0)
+    assert found == jax.grad(lambda v: loss(GONE[kept], v).sum())(9.0) != 0.0
+    first = layer.state(simulation)
+
+    def densities(gravities):
+        def measured(gravity):
+            end = layer.step(simulation, first, {"gravity": gravity}, steps=2)
+            return layer.measure(simulation, "density")(end).sum()
+
+        return jax.vmap(measured)(gravities)
+
+    found, wanted = densities(GONE), densities(GONE[kept])
+    assert np.isnan(found).tolist() == [False, True, False] and found[kept].tobytes() == wanted.tobytes()
+    along = jax.grad(lambda g: jax.numpy.nansum(densities(g)))(jax.numpy.asarray(GONE))
+    assert np.isfinite(along).all() and along[kept].all() and not along[1].any()
+
+
 def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
     """There are as many maps as steps."""
     gravities = np.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])

@@ -48,6 +48,9 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
         assert again.positions.tobytes() == whole.positions[: FIRST + 1].tobytes()  # nothing of the restart stays
 
 
+FRACTIONS = "state mass_fractions of particle 0 are"
+
+
 def test_states_that_do_not_fit_are_refused():
     simulation = Simulation(pour(), precision="float64")
     state = simulation.run(3).last_state
@@ -66,6 +69,8 @@ def test_states_that_do_not_fit_are_refused():
             {"state": other(reference_density=np.zeros(simulation.particles))},
             "state reference_density must be greater than 0",
         ),
+        ({"state": other(mass_fractions=np.full((simulation.particles, 2), [2.0, -1.0]))}, FRACTIONS + " 2, -1"),
+        ({"state": other(mass_fractions=np.full((simulation.particles, 2), [0.9, 0.2]))}, FRACTIONS + " 0.9, 0.2"),
         ({"state": other(emitted=np.array([np.nan]))}, "state emitted has a value that is not finite"),
         ({"state": emitterless}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
         ({"state": simulation.initial}, "must be a RestartState"),
@@ -181,6 +186,14 @@ def test_a_run_with_a_rest_density_goes_on_with_it_and_not_without(make):
     assert "to be given again where it goes on" in refused(simulation, state)
     refused(simulation, replace(state, origin=None))
     refused(simulation, simulation.run(5).last_state, controls)
+
+
+def test_fractions_of_2_are_no_reference_densities():
+    simulation = Simulation(plane())
+    state = simulation.run(2).last_state
+    state["mass_fractions"][5] = 2.0
+    found = refused(simulation, state)
+    assert found == "state mass_fractions of particle 5 are 2, but must be from 0 to 1 and add up to 1."
 
 
 def test_two_particles_of_a_state_at_one_place_are_refused():

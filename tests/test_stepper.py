@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import InputError, Problem, Scene, Simulation, certify, gradients
+from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, certify, gradients
 from scenes import MIXING, jet, plane, plane_of_three, pour, scene, two_layers
 
 SWAY = {"times": [0.0, 0.03, 0.06, 0.1], "values": [[0.0, -9.81], [8.0, -9.81], [-5.0, -7.0], [0.0, -9.81]]}
@@ -127,15 +127,27 @@ def test_a_state_of_a_step_cannot_be_changed_and_one_that_is_made_of_it_is_judge
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_and_cannot_go_on():
+def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_and_goes_on_without():
     simulation = Simulation(plane(), batch=2)
     fast = np.zeros((2, simulation.particles, 2))
     fast[1, 0] = [400.0, 0.0]
     one, lost = simulation.step(simulation.state({"initial_velocities": fast}), steps=3)
     assert_same_state(one, Simulation(plane()).run(3).last_state)
     assert np.isnan(lost["positions"]).all() and np.isnan(lost["velocities"]).all()
+    by_hand = replace(lost, fields={name: np.array(value) for name, value in lost.fields.items()}, origin=None)
+    with pytest.warns(CortadoWarning, match=r"scene 1: .* particle 0 \(and 63 more\) had been lost in steps before"):
+        after = [simulation.step([one, state], steps=2) for state in (lost, by_hand)]
+    for on, gone in after:
+        assert_same_state(on, Simulation(plane()).run(5).last_state)
+        assert all(np.isnan(value).all() for value in gone.fields.values())
+    runs = simulation.run(2, state=[one, lost])
+    assert list(runs.lost) == [1] and len(runs[1]) == 1 and np.isnan(runs.positions[:, 1]).all()
+    partly = {**by_hand.fields, "velocities": np.zeros((64, 2))}
+    for state in (replace(lost, fields=partly), replace(one, fields={**one.fields, "positions": lost["positions"]})):
+        with pytest.raises(InputError, match="state positions has a value that is not finite"):
+            simulation.step([one, state])
     with pytest.raises(InputError, match="not finite"):
-        simulation.step([one, lost])
+        Simulation(plane()).step(lost)
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -148,6 +160,16 @@ def test_derivatives_of_a_scene_of_a_batch_that_is_lost_have_no_numbers_and_go_b
     wanted = alone.vjp(alone.state(), {}, {"positions": states[0]["positions"]}, steps=3)[0]
     assert bar["velocities"][0].tobytes() == wanted["velocities"].tobytes()
     assert np.isnan(bar["velocities"][1]).all() and np.isnan(bar["time"][1])
+    silent = np.zeros((2, simulation.particles, 2))
+    silent[0] = states[0]["positions"]
+    viscosity = {"viscosity": np.array(1.0)}
+    states, residual = simulation.stepper(3).step(simulation.state({"initial_velocities": fast}), viscosity)
+    bar, shared = simulation.stepper(3).vjp(residual, {"positions": silent})
+    assert bar["velocities"][0].any() and not bar["velocities"][1].any() and bar["time"][1] == 0.0
+    assert shared["viscosity"][0] != 0.0 == shared["viscosity"][1]
+    dot = simulation.stepper(3).jvp(residual, {"positions": silent})
+    assert dot["positions"][0].any() and not dot["positions"][1].any() and dot["time"][1] == 0.0
+    assert np.isnan(simulation.stepper(3).jvp(residual, {"positions": silent}, viscosity)["positions"][1]).all()
     partly = np.zeros((2, simulation.particles, 2))
     partly[1, 3] = np.nan
     with pytest.raises(InputError, match="positions has a value that is not finite"):

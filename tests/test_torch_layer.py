@@ -222,6 +222,27 @@ def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(layer, simulation,
     np.testing.assert_array_equal(summed, torch.vmap(torch.func.grad(loss))(gravities))
 
 
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_a_lost_scene_of_a_map_adds_nothing_where_its_cotangent_is_0(layer, simulation, problem):
+    """To the derivatives of what the scenes share: of values, and of chained steps, through which it passes."""
+    gravities, first, viscosity = tensor([[0.4, -9.0], [9e5, 0.0], [-1.0, -8.0]]), layer.state(simulation), tensor(9.0)
+
+    def end(gravity, viscosity):
+        state = first
+        for _ in range(2):
+            state = layer.step(simulation, state, {"gravity": gravity, "viscosity": viscosity}, steps=3)
+        return state["positions"].sum()
+
+    def loss(gravity, viscosity):
+        return layer.value(problem)({"gravity": gravity, "viscosity": viscosity})
+
+    for function in (end, loss):
+        each = torch.vmap(function, in_dims=(0, None))
+        assert torch.isnan(each(gravities, viscosity)).tolist() == [False, True, False]
+        found = torch.func.grad(lambda v, each=each: torch.nansum(each(gravities, v)))(viscosity)
+        assert found == torch.func.grad(lambda v, each=each: each(gravities[[0, 2]], v).sum())(viscosity) != 0.0
+
+
 def test_an_estimator_without_batches_is_mapped_one_by_one(layer, problem):
     estimator = gradients.RandomizedSmoothing(samples=4)
     loss = layer.value(problem, estimator)

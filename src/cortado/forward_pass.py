@@ -14,7 +14,7 @@ from cortado.losses import SnapshotAdjoint
 from cortado.losses.loss import StepBar
 from cortado.particles.state import Parameters, State
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.rollout.residual import Residual, without_lost
+from cortado.rollout.residual import OfLost, Residual, without_lost
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import add_to_row
 from cortado.scene.parameters.values import Arrays
@@ -79,7 +79,12 @@ class ProblemForwardPass:
         derivative = self._derivative(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
-        return self._gradient(derivative, first), without_lost(self.rollout, initial_state)
+        return self._gradient(derivative, first), without_lost(self._lost, initial_state)
+
+    @property
+    def _lost(self) -> OfLost:
+        """Their losses have no numbers, and so no derivatives."""
+        return dict.fromkeys(self.rollout.lost, np.nan)
 
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
         self._residual.bring_back()
@@ -101,5 +106,5 @@ class ProblemForwardPass:
         gradient = self._space.gradient(self.rollout, values, first, derivative.parameters())
         if "colours" in values:
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        gradient = without_lost(self.rollout, gradient)
+        gradient = without_lost(self._lost, gradient)
         return {name: gradient[name] for name in values}

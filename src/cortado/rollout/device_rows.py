@@ -1,6 +1,6 @@
 """Parameters over time whose values are on the device, and stay there, as do the derivatives with respect to them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from math import prod
 from typing import Any
@@ -15,6 +15,7 @@ from cortado.errors import InputError
 from cortado.particles.arrays import components
 from cortado.particles.state import Parameters
 from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.residual import OfLost
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameters.parameter import Axis, Role
 from cortado.scene.parameters.values import Arrays, Values
@@ -65,15 +66,15 @@ class DeviceRows:
             launch(self._spread, numbers.shape, numbers.device, **arguments)
             parameters.set({name: own})
 
-    def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: Iterable[int]) -> dict[str, wp.array]:
+    def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
         """From the adjoints of the parameters to those of the rows, in their shapes, without numbers where scenes of a
         batch were ``lost``."""
         adjoints = {}
         for name, array in rows.items():
             bars, shape = _numbers(found[name]), self._in_three(name, array).shape
             of_steps = self._folded(bars, (bars.shape[0], *shape[1:]))
-            for member in lost:
-                of_steps[member].fill_(np.nan)
+            for member, number in lost.items():
+                of_steps[member].fill_(number)
             adjoints[name] = self._folded(of_steps, shape).reshape(array.shape)
         return adjoints
 

@@ -13,6 +13,7 @@ from cortado.particles.fields import Entry
 from cortado.particles.state import State
 from cortado.rollout.host_states import HostStates, States, clocks_after, require_fields, time_of
 from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.residual import OfLost
 from cortado.rollout.rollout import Rollout
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.restart import RestartState
@@ -68,15 +69,16 @@ class DeviceStates(HostStates):
 
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
         """As `HostStates.state`, in arrays of its own."""
-        made: dict[tuple[int, int, bool], RestartState] = {}
+        made: dict[tuple[int, int], RestartState] = {}
         """One for all scenes of a clock and an origin: a batch has hundreds."""
         keys = []
-        for b, (clock, origin) in enumerate(zip(clocks_after(rollout, steps), rollout.origins, strict=True)):
-            keys.append((id(clock), id(origin), b in rollout.lost))
+        for clock, origin in zip(clocks_after(rollout, steps), rollout.origins, strict=True):
+            keys.append((id(clock), id(origin)))
             if keys[-1] not in made:
                 made[keys[-1]] = RestartState({}, clock, origin)
-        self._simulation.judged_states.update(scene for (*_, is_lost), scene in made.items() if not is_lost)
-        return DeviceState(_without_lost(rollout, state.copy()), tuple(made[key] for key in keys))
+        self._simulation.judged_states.update(made.values())
+        own = _without_lost(dict.fromkeys(rollout.lost, np.nan), state.copy())
+        return DeviceState(own, tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         """As `HostStates.write`."""
@@ -85,9 +87,9 @@ class DeviceStates(HostStates):
         copy_to(to, what, fields)
         return time_of(what, given, to)
 
-    def read(self, rollout: Rollout, state: State) -> dict[str, Any]:
+    def read(self, state: State, lost: OfLost) -> dict[str, Any]:
         """As `HostStates.read`, in the precision of the simulation."""
-        own = _without_lost(rollout, state.copy())
+        own = _without_lost(lost, state.copy())
         return {name: own.numbers(name) for name in own.names}
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
@@ -116,15 +118,10 @@ class DeviceStates(HostStates):
                 raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
 
     def _require_judged(self, state: DeviceState) -> None:
-        """Arrays on the device are not looked at: they are those of a step of this simulation, in which no scene was
-        lost."""
-        unknown = {scene for scene in set(state.scenes) if scene not in self._simulation.judged_states}
-        others = [b for b, scene in enumerate(state.scenes) if scene in unknown] if unknown else []
-        if len(others) == len(state.scenes):
+        """Arrays on the device are not looked at: they are those of a step of this simulation."""
+        if not all(scene in self._simulation.judged_states for scene in set(state.scenes)):
             advice = "simulation.on_host(state) is taken by any of the same scene"
             raise InputError(f"state is of another simulation, but must be of this one: {advice}.")
-        if others:
-            raise InputError(f"state has no numbers of scene {others[0]}, which was lost, but must have some of each.")
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays
@@ -162,9 +159,9 @@ def _taken(what: str, value: Any) -> wp.array:
         raise InputError(f"{what} cannot be taken: {error}") from error
 
 
-def _without_lost(rollout: Rollout, state: State) -> State:
-    """A state without numbers for scenes that were lost."""
-    for b in rollout.lost:
+def _without_lost(lost: OfLost, state: State) -> State:
+    """A state, or derivatives of one, without numbers for scenes that were lost."""
+    for b, number in lost.items():
         for array in state.member(b).arrays() if state.batch is not None else state.arrays():
-            array.fill_(np.nan)
+            array.fill_(number)
     return state

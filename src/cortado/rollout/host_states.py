@@ -11,7 +11,7 @@ from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict
 from cortado.particles.state import State
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.residual import without_lost
+from cortado.rollout.residual import OfLost, without_lost
 from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import Simulated
@@ -40,10 +40,10 @@ class HostStates:
 
     def state(self, rollout: Rollout, state: State, steps: int) -> Any:
         """A state of the rollout, after so many steps, which nobody can change; of a scene that is lost it has no
-        numbers."""
+        numbers, with which the scene may go on."""
         scenes = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
         found = self.states(state, [RestartState({}, clock, origin) for clock, origin in scenes], rollout.lost)
-        self._simulation.judged_states.update(one for b, one in enumerate(found) if b not in rollout.lost)
+        self._simulation.judged_states.update(found)
         return found[0] if self._simulation.batch is None else found
 
     def states(
@@ -83,10 +83,10 @@ class HostStates:
             if not lost and not np.isfinite(scene).all():
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
-    def read(self, rollout: Rollout, state: State) -> dict[str, Any]:
+    def read(self, state: State, lost: OfLost) -> dict[str, Any]:
         """Derivatives of a state's fields, by name."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
-        return without_lost(rollout, found)
+        return without_lost(lost, found)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Of the fields of a state, by name; of a batch with a first axis for the scenes."""

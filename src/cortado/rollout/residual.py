@@ -1,10 +1,17 @@
 """What one evaluation of a rollout leaves for ways back and along tangents, while others follow."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from cortado.particles.state import Parameters, State
 from cortado.rollout.evaluation import PutAside
 from cortado.rollout.rollout import Rollout
 from cortado.scene.parameters.values import Arrays
+
+OfLost = Mapping[int, float]
+"""By the numbers of the scenes of a batch that were lost what derivatives of them are: 0 where only zeros were given,
+else NaN."""
 
 
 class Residual:
@@ -32,9 +39,20 @@ class Residual:
             self.rollout.pending.add(self)
 
 
-def without_lost(rollout: Rollout, found: Arrays) -> Arrays:
-    """Derivatives, of a batch with a first axis for the scenes, without numbers for scenes that were lost."""
+def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Parameters | None = None) -> OfLost:
+    """Of derivatives that are linear in those that were ``given`` of a state and its time, (batch,), and of
+    parameters."""
+    found = {}
     for b in rollout.lost:
+        own = [array.numpy() for array in given.member(b).arrays()]
+        own += [] if parameters is None else [array.numpy()[b] for array in parameters.arrays()]
+        found[b] = np.nan if times[b] or any(array.any() for array in own) else 0.0
+    return found
+
+
+def without_lost(lost: OfLost, found: Arrays) -> Arrays:
+    """Derivatives, of a batch with a first axis for the scenes, without numbers for scenes that were lost."""
+    for b, number in lost.items():
         for array in found.values():
-            array[b] = np.nan
+            array[b] = number
     return found

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import as_one_number, as_precise_numbers, is_whole
+from cortado.device.precision import Precision
 from cortado.discretise.crowding import check_apart, nearest
 from cortado.errors import InputError, shown
 from cortado.rollout.parameter_checks import outside, place_in_words
@@ -17,6 +18,8 @@ SAME = 1e-6
 MIXED = 0.02
 """The same of the volume of particles among which phases have diffused, and of fractions that do not quite add up
 to 1."""
+BEYOND = 0.5
+"""How far fractions may be below 0 or above 1: diffusion leaves them a little outside."""
 CLOSE, FAR = 0.7, 1.4
 """In spacings: the distance from a particle to the nearest other one is greater than the first for half of them, and
 less than the second for a part of them."""
@@ -56,19 +59,25 @@ def check_state(
     state: RestartState, shapes: Mapping[str, tuple[int, ...]], origin: Origin, simulation: Simulated
 ) -> None:
     """A state to go on from is one of the simulation, whose fields have these shapes, and of these particles; raises
-    `InputError`. One that was judged before can only be of other rest densities."""
+    `InputError`. One that was judged before can only be of other rest densities, and that of a scene of a batch that
+    was lost has no numbers to judge."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
     if state.fields.keys() != shapes.keys():
         raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
-    fields = {name: _numbers(name, state[name], wanted, simulation) for name, wanted in shapes.items()}
+    fields = {name: _shaped(name, state[name], wanted) for name, wanted in shapes.items()}
     check_clock(state.clock)
+    if simulation.batch is not None and all(np.isnan(array).all() for array in fields.values()):
+        return
+    for name, array in fields.items():
+        _check_numbers(name, array, simulation.precision)
     scene, positions = simulation.scene, fields["positions"]
     if state.origin is None:
         _check_spacing(positions[: simulation.free_particles], simulation)
     else:
         _check_origin(state.origin, origin)
+    _check_fractions(fields["mass_fractions"])
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
     for particle in outside(scene, positions[: simulation.free_particles])[:1] if held else ():
@@ -80,16 +89,19 @@ def check_state(
         check_apart("state positions", positions, origin.spacing, scene.container.periods(scene.dimension))
 
 
-def _numbers(name: str, value: object, shape: tuple[int, ...], simulation: Simulated) -> NDArray:
-    array, precision = as_precise_numbers(f"state {name}", value), simulation.precision
+def _shaped(name: str, value: object, shape: tuple[int, ...]) -> NDArray:
+    array = as_precise_numbers(f"state {name}", value)
     if array.shape != shape:
         raise InputError(f"state {name} has shape {array.shape}, but must be {shape}.")
+    return array
+
+
+def _check_numbers(name: str, array: NDArray, precision: Precision) -> None:
     if not np.isfinite(array).all():
         raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
     if (size := np.abs(array).max(initial=0.0)) > precision.greatest:
         wanted = f"at most {precision.greatest:g} in {precision.name}"
         raise InputError(f"state {name} has a value of size {size:g}, but must be {wanted}.")
-    return array
 
 
 def check_clock(clock: Clock) -> None:
@@ -139,6 +151,15 @@ def _listed(value: object) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(_listed, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _check_fractions(fractions: NDArray) -> None:
+    """The mass fractions (n, phases) of each particle are shares of one whole."""
+    beyond = np.abs(fractions - 0.5).max(axis=1) > 0.5 + BEYOND
+    bad = np.flatnonzero(beyond | (np.abs(fractions.sum(axis=1) - 1.0) > MIXED))
+    if bad.size:
+        found = f"state mass_fractions of particle {bad[0]} are {_listed(tuple(fractions[bad[0]].tolist()))}"
+        raise InputError(f"{found}, but must be from 0 to 1 and add up to 1.")
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:

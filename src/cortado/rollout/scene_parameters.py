@@ -209,7 +209,7 @@ class SceneParameters:
         """From the adjoints of what steps depend on, of those that are `changing`, to that of the time at which they
         begin."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
-        return sum(float((run[name] * rate).sum()) for name, rate in rates.items())
+        return sum((float((run[name] * rate).sum()) for name, rate in rates.items()), 0.0)
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
         """From the adjoints of what steps depend on and of those fields of the first state that depend on parameters,

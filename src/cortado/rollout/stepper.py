@@ -19,7 +19,7 @@ from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.host_states import Given, HostStates, States
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.residual import Residual, without_lost
+from cortado.rollout.residual import Residual, of_lost, without_lost
 from cortado.rollout.rollout import BackwardStep, Rollout
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameters.values import Arrays, Values
@@ -133,7 +133,8 @@ class Stepper:
 
         The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
         ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
-        all else that is returned is in float64. A batch has a first axis for the scenes. A parameter on the device has
+        all else that is returned is in float64. A batch has a first axis for the scenes; of one that was lost all is
+        NaN, or 0 where its adjoint is 0 throughout. A parameter on the device has
         its adjoint there, in its own shape. Raises `InputError` for fields that the state does not have, or that have
         other shapes.
         """
@@ -146,9 +147,10 @@ class Stepper:
         gradient = space.gradient(rollout, values, first, found, elsewhere=residual.rows)
         if "time_step" in gradient:  # a longer step ends later
             gradient["time_step"] = gradient["time_step"] + rollout.steps * times
-        time_bar = without_lost(rollout, {STATE_TIME: before})
-        rows = self._rows.adjoints(residual.rows, found, rollout.lost)
-        return {**place.read(rollout, first), **time_bar}, {**without_lost(rollout, gradient), **rows}
+        lost = of_lost(rollout, self._bar, times)
+        time_bar = without_lost(lost, {STATE_TIME: before})
+        rows = self._rows.adjoints(residual.rows, found, lost)
+        return {**place.read(first, lost), **time_bar}, {**without_lost(lost, gradient), **rows}
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
@@ -168,10 +170,11 @@ class Stepper:
             )
         space.set_direction(rollout, values, along, dot, parameters_dot, np.broadcast_to(times, len(rollout.clocks)))
         self._rows.write(rows, parameters_dot)
+        lost = of_lost(rollout, dot, times, parameters_dot)
         rollout.tangent(dot, parameters_dot, lambda number, state: None)
         sizes = along.get("time_step", np.zeros(()))
         later = times + rollout.steps * np.broadcast_to(sizes, times.shape)
-        return {**place.read(rollout, dot), **without_lost(rollout, {STATE_TIME: later})}
+        return {**place.read(dot, lost), **without_lost(lost, {STATE_TIME: later})}
 
     def _shaped(self, times: np.ndarray) -> np.ndarray:
         """A number of each scene, (members,), as a state of this simulation has it, () or (batch,)."""

@@ -1,18 +1,22 @@
 """What a layer is: a function of named arrays, with its derivatives in both modes."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.words import counted
 
 STATE, PARAMETER = "state ", "parameter "
 """What the names of fields of a state, and of parameters, begin with among those of a layer's arrays: so they do not
 meet, and sentences begin with them."""
+POSITIONS = (STATE + "positions", "positions")
+"""What a layer that looks at particles calls where they are."""
 KEPT = 2
 """Sizes of batches of a layer that are kept for the next call."""
 Array = Any
@@ -79,6 +83,20 @@ class Layer(ABC):
         return found
 
 
+@dataclass(frozen=True)
+class Lost:
+    """An evaluation of several that has no numbers."""
+
+    given: Shapes
+    """Of what it was given."""
+    why: str
+
+    def along(self, of: Named, shapes: Shapes) -> Named:
+        """Derivatives in these shapes: 0 where only zeros are given of those that they are linear in, else NaN."""
+        number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
+        return {name: np.full(shape, number) for name, shape in shapes.items()}
+
+
 class OneByOne(Layer):
     """Several evaluations of a layer that takes them only one after the other."""
 
@@ -95,16 +113,36 @@ class OneByOne(Layer):
         return {name: (self._size, *shape) for name, shape in self._layer.outputs().items()}
 
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        found = [self._layer.evaluate(one, keep) for one in self._each(given)]
+        found = [self._evaluated(own, keep) for own in self._each(given)]
+        lost = {number: one for number, (_, one) in enumerate(found) if isinstance(one, Lost)}
+        if lost:
+            first, one = next(iter(lost.items()))
+            said = f"{len(lost)} of {counted(self._size, 'evaluation')} were lost. First evaluation {first}: {one.why}"
+            warnings.warn(said, CortadoWarning, stacklevel=2)
         return stacked([one for one, _ in found]), [residual for _, residual in found] if keep else None
 
+    def _evaluated(self, given: Named, keep: bool) -> tuple[Named, Any]:
+        """Of one of them, which goes without numbers where its particles have none, or one of them is lost."""
+        shapes = {name: np.shape(array) for name, array in given.items()}
+        positions = next((array for name, array in given.items() if name in POSITIONS), np.zeros(1))
+        lost = Lost(shapes, "its particles had been lost in steps before it.")
+        if not np.isnan(on_host(positions)).all():
+            try:
+                return self._layer.evaluate(given, keep)
+            except DivergedError as error:
+                lost = Lost(shapes, str(error))
+        return {name: np.full(shape, np.nan, self.real) for name, shape in self._layer.outputs().items()}, lost
+
     def pull(self, residual: Any, bars: Named) -> Named:
-        each = zip(residual, self._each(bars), strict=True)
-        return stacked([self._layer.pull(own, one) for own, one in each])
+        layer, each = self._layer, zip(residual, self._each(bars), strict=True)
+        found = (own.along(one, own.given) if isinstance(own, Lost) else layer.pull(own, one) for own, one in each)
+        return stacked(found)
 
     def push(self, residual: Any, dots: Named) -> Named:
-        each = zip(residual, self._each(dots), strict=True)
-        return stacked([self._layer.push(own, one) for own, one in each])
+        layer, each = self._layer, zip(residual, self._each(dots), strict=True)
+        made = layer.outputs()
+        found = (own.along(one, made) if isinstance(own, Lost) else layer.push(own, one) for own, one in each)
+        return stacked(found)
 
     def _each(self, given: Named) -> list[dict[str, Array]]:
         return [rows(given, number) for number in range(self._size)]

@@ -122,7 +122,18 @@ class Value(Layer):
     @in_turn
     def push(self, residual: Evaluation, dots: Named) -> Named:
         own = {name: on_host(dot).astype(np.float64) for name, dot in dots.items() if name.startswith(STATE)}
-        return {LOSS: np.asarray(residual.along({**own, **named(PARAMETER, self._parameters.values(dots))}))}
+        found = np.asarray(residual.along({**own, **named(PARAMETER, self._parameters.values(dots))}))
+        return {LOSS: np.where(self._moved(dots), found, 0.0)}
+
+    def _moved(self, dots: Named) -> Any:
+        """Of each scene, (batch,) or (), whether a tangent is not 0; tangents that all scenes of a batch share are of
+        each."""
+        found = np.zeros(self.outputs()[LOSS], dtype=bool)
+        for name, dot in dots.items():
+            array = on_host(dot)
+            own = self._each or name.startswith(STATE)
+            found |= array.reshape(*found.shape, -1).any(axis=-1) if own else bool(array.any())
+        return found
 
     def check_mapped(self) -> None:
         if self._problem.simulation.batch is not None:
@@ -136,5 +147,7 @@ class Value(Layer):
 
 
 def _times(found: np.ndarray, bar: Any) -> np.ndarray:
-    """A derivative, of a batch with a first axis for the scenes, times that with respect to the loss."""
-    return found * np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
+    """A derivative, of a batch with a first axis for the scenes, times that with respect to the loss; 0 where this is
+    0, also of what has no numbers."""
+    factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
+    return np.where(factor == 0.0, 0.0, found) * factor
