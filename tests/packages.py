@@ -6,9 +6,12 @@ from pathlib import Path
 TOY = '''
 from typing import Annotated
 
+import warp as wp
+
 import cortado
 from cortado.errors import InputError, SceneError
 from cortado.scene.fields import quantity
+from cortado.scene.parameters.parameter import Axis, Parameter
 from own_forces import Breeze
 from solvers import MakeFalling, MakeRemembering
 
@@ -37,6 +40,57 @@ class Settings:
         return None
 
 
+class Failing:
+    """Ends or fails at one of its uses, which ``at`` names."""
+
+    batches = True
+    shares = ()
+
+    def __init__(self, at: str, ends: bool = False):
+        self._at, self._ends = at, ends
+        self._reach("__init__")
+
+    def _reach(self, place):
+        if place == self._at:
+            raise SystemExit(0) if self._ends else RuntimeError("toys break")
+
+    @property
+    def parameters(self):
+        self._reach("parameters")
+        return [Parameter("failing.k", "", "nothing", Axis.SCALAR, lambda source: self._reach("value") or 1.0)]
+
+    def force(self, setting):
+        self._reach("force")
+        return Acting(self._reach)
+
+    def build(self, setting):
+        self._reach("build")
+        return MakeFalling().build(setting)
+
+
+class Acting:
+    batches = True
+
+    def __init__(self, reach):
+        self._reach = reach
+
+    @property
+    def shares(self):
+        self._reach("shares")
+        return ()
+
+    def accelerate(self, step, before, after):
+        self._reach("accelerate")
+        wp.copy(after, before)
+
+    def tangent(self, step, dot, before, after):
+        self._reach("tangent")
+        wp.copy(after, before)
+
+    def adjoint(self, step, acceleration_bar, bar):
+        self._reach("adjoint")
+
+
 def clashing(kind=1):
     return Settings(1)
 
@@ -48,13 +102,18 @@ ENTRIES = {
         "drag": "toy_parts:drag",
         "breeze": "toy_parts:Breeze",
         "settings": "toy_parts:Settings",
+        "failing": "toy_parts:Failing",
         "clashing": "toy_parts:clashing",
         "number": "toy_parts:MakeFalling",
         "nothing": "toy_parts:nothing",
         "lost": "toy_parts:lost",
         "broken": "toy_broken",
     },
-    "cortado.solvers": {"remembering": "toy_parts:MakeRemembering", "falling": "toy_parts:MakeFalling"},
+    "cortado.solvers": {
+        "remembering": "toy_parts:MakeRemembering",
+        "falling": "toy_parts:MakeFalling",
+        "failing": "toy_parts:Failing",
+    },
 }
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import InputError, Problem, Scene, SceneError, Simulation, load_scene, losses, reference
+from cortado import ComputationError, InputError, Problem, Scene, SceneError, Simulation, load_scene, losses, reference
+from cortado.scene.package_parts import guarded
 from own_forces import Breeze
 from packages import install, on_path
 from solvers import MakeRemembering
@@ -210,6 +211,32 @@ def test_what_does_not_fit_is_a_sentence(file, text, said):
     with pytest.raises(SceneError, match=f"^{path}: .*{said}") as caught:
         load_scene(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize(
+    ("at", "code"),
+    [("__init__", 2), ("parameters", 2), ("value", 2), ("force", 2), ("shares", 1), ("accelerate", 1), ("build", 2)],
+)
+def test_a_part_that_fails_in_use_is_a_sentence_and_no_success(file, tmp_path, cortado_command, at, code, ends):
+    keys = 'kind = "failing"', f'at = "{at}"', f"ends = {str(ends).lower()}"
+    made = file(solver(*keys) if at == "build" else force(*keys))
+    found, _, told = cortado_command("run", made, "--steps", 2, "--out", tmp_path / "out", "--no-pictures")
+    assert found == code and len(told.splitlines()) == 1, told
+    cause = "SystemExit: 0" if ends else "RuntimeError: toys break"
+    assert re.search(rf'"failing" .*: {cause} \(the package toy, .*toy_parts.py, line \d+\)', told), told
+
+
+@pytest.mark.parametrize("mode", ["tangent", "adjoint"])
+def test_a_part_that_fails_in_a_derivative_is_a_sentence(file, mode):
+    judged = problem(Simulation(file(force('kind = "failing"', f'at = "{mode}"')), precision="float64"))
+    with pytest.raises(ComputationError, match=rf'"failing" fails in {mode} of Acting: RuntimeError: toys break'):
+        judged.tangent({}, {"gravity": [0.0, 1.0]}) if mode == "tangent" else judged.value_and_gradient({})
+
+
+def test_an_interruption_within_a_part_is_one():
+    with pytest.raises(KeyboardInterrupt), guarded("it fails:", "a package"):
+        raise KeyboardInterrupt
 
 
 def test_two_packages_of_one_name_are_told(tmp_path, monkeypatch):

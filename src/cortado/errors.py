@@ -106,6 +106,8 @@ def shown(value: Any) -> str:
         text = repr(list(value) if isinstance(value, tuple) else value)
     except ValueError:
         return "too long to print"
+    except Exception:  # an object of a user's, whose own words cannot be made
+        text = f"<a {type(value).__name__}>"
     text = " ".join(text.split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 

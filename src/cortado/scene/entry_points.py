@@ -3,7 +3,8 @@
 Entry points are read where a scene names a kind that is not Cortado's own, and nowhere else.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from inspect import Parameter, signature
 from typing import Annotated, Any, get_origin
@@ -12,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cortado.errors import CortadoError, SceneError, Words, shown
 from cortado.scene.fields import MISSING, Flag, Text, count, quantity
+from cortado.scene.package_parts import PackageMaker, guarded
 from cortado.scene.sentences import wanted
 
 MOST = 1_000_000_000
@@ -48,19 +50,26 @@ def _package(entry: EntryPoint) -> str:
 def loaded(entry: EntryPoint) -> Callable[..., Any]:
     """The class or function that an entry point names; raises a `SceneError` about ``kind``."""
     where = f"is {shown(entry.name)}, for which {_package(entry)} registers {entry.value}"
-    try:
+    with _told("kind", entry, f"{where}, but that cannot be imported:"):
         found = entry.load()
-    except (Exception, SystemExit) as problem:
-        sentence = f"{where}, but that cannot be imported: {_in_words(problem)}."
-        raise SceneError(None, "kind", entry.name, sentence=sentence) from problem
     if not callable(found):
         sentence = f"{where}, but that is {shown(found)}, and must be a class or a function."
         raise SceneError(None, "kind", entry.name, sentence=sentence)
     return found
 
 
-def _in_words(problem: BaseException) -> str:
-    return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
+@contextmanager
+def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
+    """Has whatever a package raises end as a `SceneError` about a field, other errors of Cortado's own included."""
+    try:
+        with guarded(what, _package(entry)):
+            yield
+    except SceneError:
+        raise
+    except CortadoError as problem:
+        found = str(problem)
+        sentence = found if found.startswith(what) else f"{what} {found}"
+        raise SceneError(None, field, entry.name, sentence=sentence) from problem
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
@@ -86,11 +95,13 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Parameter] | None:
     """Those that have names, and ``**others`` if it takes them; None where Python cannot tell."""
-    try:
-        found = signature(factory, eval_str=True).parameters
-    except (NameError, SyntaxError, AttributeError):
-        found = signature(factory).parameters
-    except (TypeError, ValueError):
+    for evaluated in (True, False):
+        try:
+            found = signature(factory, eval_str=evaluated).parameters
+            break
+        except Exception:  # annotations may be any text
+            continue
+    else:
         return None
     unnamed = (Parameter.POSITIONAL_ONLY, Parameter.VAR_POSITIONAL)
     return {name: one for name, one in found.items() if one.kind not in unnamed}
@@ -122,15 +133,10 @@ def _checked(name: str, value: Any, argument: Parameter | None) -> Any:
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
     """What a factory makes of the keys of a table, which must have a method of that name; raises a `SceneError`."""
     called = f'of the kind "{entry.name}"'
-    try:
+    with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)
-    except SceneError:
-        raise
-    except CortadoError as problem:
-        raise SceneError(None, "", entry.name, sentence=f"{called} cannot be made: {problem}") from problem
-    except Exception as problem:
-        raise SceneError(None, "", entry.name, sentence=f"{called} cannot be made: {_in_words(problem)}.") from problem
-    if isinstance(found, type) or not callable(getattr(found, method, None)):
+        fits = not isinstance(found, type) and callable(getattr(found, method, None))
+    if not fits:
         sentence = f"{called} is made by {entry.value}, but that returned {shown(found)}, and must return an object"
         raise SceneError(None, "", entry.name, sentence=f"{sentence} with a method {method}(setting).")
-    return found
+    return PackageMaker(found, entry.name, _package(entry))
