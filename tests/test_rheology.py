@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
 from cortado import InputError, Problem, SceneError, Simulation, losses
-from cortado.forces import Rheology
+from cortado.forces import OverTime, Rheology
 from cortado.sph.laws import LAWS, bingham, carreau, herschel_bulkley, power_law
 from scenes import HONEY, plane
 
@@ -145,6 +146,52 @@ def test_where_there_can_be_no_law_it_is_a_sentence():
         Simulation(made, forces=[Rheology(cross, time=1.0, index=1.0)])
     with pytest.raises(InputError, match="must have shear_rate, viscosity first"):
         Rheology(turned)
+
+
+@pytest.mark.parametrize("named", [None, {"kind": "bingham", **KINDS["bingham"]}])
+def test_two_laws_are_one_too_many(named):
+    laws = [Rheology(cross, time=0.4, index=0.8), Rheology(cross, "other", time=0.1, index=0.5)]
+    with pytest.raises(
+        InputError, match=r"^Rheology\(.*\) and Rheology\(.*\) both take the place of .* viscosity, but"
+    ):
+        Simulation(thick(named), forces=laws[: 2 if named is None else 1])
+
+
+def beyond(shear_rate, viscosity, slope):
+    return viscosity - slope * shear_rate
+
+
+def pole(shear_rate, viscosity, where):
+    return viscosity / wp.max(where - shear_rate, 0.0)
+
+
+def root(shear_rate, viscosity, least):
+    return viscosity * wp.sqrt(1.0 - least * shear_rate)
+
+
+def in_time(shear_rate, viscosity, t, slope):
+    return viscosity - slope
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        (lambda: Rheology(beyond, slope=1e-4), r"beyond returns -\d.* Pa s at a shear rate of 1\.\d*e\+04 1/s"),
+        (lambda: Rheology(pole, where=1e3), r"pole returns inf Pa s at a shear rate of 1e\+03"),
+        (lambda: Rheology(root, least=1e-5), "root returns -?nan Pa s at a shear rate of 1"),
+        (lambda: Rheology(in_time, slope=OverTime([0.0, 2.0], [0.0, 2.0])), "in_time returns -0.5 Pa s"),
+    ],
+)
+def test_a_law_that_is_negative_or_not_finite_is_refused(law, said):
+    with pytest.raises(InputError, match=said):
+        Simulation(thick(), precision="float64", forces=[law()])
+
+
+def test_a_law_that_a_scene_names_is_tried_too():
+    with pytest.raises(
+        InputError, match=r"power_law returns inf Pa s at a shear rate of .* for the viscosity of honey"
+    ):
+        Simulation(thick(phase=[{**HONEY, "viscosity": 1e28, "rheology": {"kind": "power_law", "flow_index": 3.0}}]))
 
 
 def turned(viscosity, shear_rate):

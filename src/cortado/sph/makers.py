@@ -55,7 +55,13 @@ def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Param
 
 def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[SolidTable] = ()) -> Known:
     """The parameters of a simulation with these forces, the solver that this makes, and solids; raises `InputError`
-    where two have one name."""
+    where two have one name, or take the place of one force."""
+    taken: dict[str, ForceMaker] = {}
+    for maker in forces:
+        if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
+            what = place.rpartition(".")[2].replace("_", " ")
+            found = f"{shown(taken[place])} and {shown(maker)} both take the place of the scene's force of {what}"
+            raise InputError(f"{found}, but only one can: leave out the other, in forces or as the phase's rheology.")
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
     return Known([*own, *((parameter, "a solid") for parameter in motion_parameters(solids))])

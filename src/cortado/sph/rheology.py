@@ -1,9 +1,13 @@
 """Generalised Newtonian fluids: viscosity as a stress with a law that is one function of a user's."""
 
+import numpy as np
+
 from cortado.errors import InputError
+from cortado.particles.arrays import padded
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import stress_of
-from cortado.sph.own_force import OwnFunction, topic
+from cortado.sph.law_trial import check_law
+from cortado.sph.own_force import OverTime, OwnFunction, topic
 from cortado.sph.parts import Setting
 from cortado.sph.viscosity_law import Law
 from cortado.sph.viscous_stress import ViscousStress
@@ -19,13 +23,26 @@ class Rheology(OwnFunction):
     """The module of the scene's force that does not act beside it."""
 
     def force(self, setting: Setting) -> ViscousStress:
-        """The viscous force with this law; raises `InputError` for a function that Warp cannot compile."""
+        """The viscous force with this law; raises `InputError` for a function that Warp cannot compile, or that returns
+        a viscosity that is negative or not finite."""
         check_form(setting.scene)
         ranks = tuple(p.rank for p in self.parameters)
         law = Law(self._formula, ranks, topic("rheology", self._formula, ranks, setting.scene.dimension) + "_")
         made = stress_of(setting.scene)(setting, law, self.parameters)
-        made.compile(f"{self.kind} function {self._formula.name}")
+        what, layout = f"{self.kind} function {self._formula.name}", setting.layout
+        made.compile(what)
+        viscosities = {phase.name: phase.viscosity for phase in setting.scene.phase}
+        check_law(what, law, viscosities, self._thetas(), layout.precision, layout.device)
         return made
+
+    def _thetas(self) -> np.ndarray:
+        """(k, numbers) what the function's parameters are, at every time at which one of them changes."""
+        times = np.unique([0.0, *(t for v in self._values.values() if isinstance(v, OverTime) for t in v.times)])
+        columns = [times] if len(self._formula.inputs) == 3 else []
+        for value in self._values.values():
+            rows = value.at(times) if isinstance(value, OverTime) else np.stack([value] * len(times))
+            columns += [padded(rows)] if rows.ndim == 2 else [rows]
+        return np.column_stack([np.zeros((len(times), 0)), *columns])
 
 
 def check_form(scene: Scene) -> None:
