@@ -120,6 +120,10 @@ MISTAKES = {
     "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),
     "an array": (lambda: as_loss(np.zeros((N, 2))), "loss is a ndarray"),
     "too few arguments": (lambda: as_loss(lambda x, v: None), r"takes the arguments '\(x, v\)', but must take 3"),
+    "a function of the end": (
+        lambda: as_loss(lambda end: 0.0),
+        r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$",
+    ),
     "too many arguments": (lambda: as_loss(lambda x, v, c, loss: None), "must take 3: positions, velocities"),
     "an adjoint without an argument": (lambda: as_loss(Narrow()), "the loss's adjoint takes the arguments"),
     "frames that are a list": (lambda: Frames([Given()]), "losses is .* but must be a table"),

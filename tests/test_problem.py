@@ -1,11 +1,13 @@
 """What a Problem promises besides right derivatives: clean state, clear sentences."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
+import cortado
+from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
 from cortado.rollout.checkpoints import checkpoint_interval
 from cortado.sph.free_energy import MISCIBLE
 from scenes import jet, plane, plane_of_three, splash, two_layers
@@ -267,3 +269,31 @@ def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
         simulation.run(steps)
     with pytest.raises(InputError, match=r"record_every is .*, but must be"):
         simulation.run(3, record_every=steps)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (
+            lambda it: Problem(it.simulation, 3),
+            r"^Problem is given no loss, but must be called as Problem",
+        ),
+        (
+            lambda it: cortado.optimise(it, {}, "adam"),
+            "^optimise is given no iterations, but must be called as",
+        ),
+        (lambda it: cortado.certify(it, nmes=["gravity"]), "certify is called in a wrong way .* 'nmes'"),
+        (lambda it: Simulation(), "^Simulation is given no scene, but must be called as Simulation"),
+    ],
+)
+def test_what_a_call_lacks_is_a_sentence(problem, call, said):
+    with pytest.raises(InputError, match=said):
+        call(problem)
+
+
+def test_a_warning_points_at_the_line_that_led_to_it():
+    thin = [{"name": "water", "rest_density": 1.0, "viscosity": 0.05}]
+    with pytest.warns(CortadoWarning) as said:
+        plane(phase=thin)
+        Scene.from_json(plane().to_json().replace("1000.0", "1.0"))
+    assert {Path(one.filename).name for one in said} == {"scenes.py", "test_problem.py"}

@@ -1,5 +1,7 @@
 """What can go wrong, each with one sentence for the user."""
 
+import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +15,18 @@ class CortadoError(Exception):
 
 class CortadoWarning(UserWarning):
     """Something that works but is probably not meant."""
+
+
+_INSIDE = ("cortado", "pydantic", "contextlib", "functools")
+"""Modules whose lines are none of a user's."""
+
+
+def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
+    """Warn at the line of the user's that led here."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(sentence, category, stacklevel=level)
 
 
 class InputError(CortadoError):

@@ -1,14 +1,14 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from cortado.arrays import check_step_numbers, check_steps, require_function, require_methods, whole_number
+from cortado.calls import told
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, DivergedError, InputError
+from cortado.errors import DivergedError, InputError, warn
 from cortado.fingerprint import fingerprint_of
 from cortado.fixed import fixed
 from cortado.forward_pass import ProblemForwardPass
@@ -58,6 +58,7 @@ class Problem:
     scene lists them.
     """
 
+    @told
     def __init__(
         self,
         simulation: Simulation,
@@ -147,11 +148,9 @@ class Problem:
         kept = slice(None) if self._going is None else self._going
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
         if broken:
-            warnings.warn(
+            warn(
                 f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
-                f"{self.simulation.precision.name} holds: try fewer steps, float64, or an estimator for long runs.",
-                CortadoWarning,
-                stacklevel=4,
+                f"{self.simulation.precision.name} holds: try fewer steps, float64, or an estimator for long runs."
             )
         return found
 

@@ -1,6 +1,5 @@
 """A scene on a device in a precision: the thing that runs."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
@@ -12,6 +11,7 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.arrays import whole_number
+from cortado.calls import told
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
@@ -20,7 +20,7 @@ from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.threads import WARP, Turn, in_turn
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import InputError, shown, warn
 from cortado.fixed import fixed
 from cortado.particles.state import State
 from cortado.pictures.notebook import with_picture
@@ -66,6 +66,7 @@ class Simulation(Stepping, Measuring, Picturing):
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
     """
 
+    @told
     @WARP
     def __init__(
         self,
@@ -230,7 +231,7 @@ class Simulation(Stepping, Measuring, Picturing):
         rollout.forward(keep, keep=False)
         unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []
         for sentence in (*trouble(rollout, self.scene), *unread):
-            warnings.warn(sentence, CortadoWarning, stacklevel=5)
+            warn(sentence)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         own = {name: np.array([one[name] for one in looks]) for name in watch.names}
         found = recorded(rollout, self.scene, np.array(steps), fields, self.constants(rollout), own)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
+from cortado.calls import told
 from cortado.certificate.alignment import Alignment, alignment
 from cortado.certificate.consistency import Consistency, balanced, check_consistency
 from cortado.certificate.growth import growth
@@ -131,6 +132,7 @@ class Certificate:
         return _plain(found)
 
 
+@told
 def certify(
     problem: Problem | Simulation | Scene | str | PathLike[str],
     parameters: Values | Sequence[str] = ("gravity",),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import CortadoWarning, DivergedError, OutOfRangeError
+from cortado.errors import CortadoWarning, DivergedError, OutOfRangeError, warn
 from cortado.gradients.ensemble_members import Ensemble
 from cortado.gradients.estimator import Differentiable, Estimate
 from cortado.gradients.points import without_runs
@@ -44,7 +44,7 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
         if isinstance(present[0], DivergedError):
             raise present[0].among_others(preface)
         raise OutOfRangeError(f"{preface} {present[0]}")
-    warnings.warn(f"{said} are left out of the average. The first: {present[0]}", LeftOutWarning, stacklevel=3)
+    warn(f"{said} are left out of the average. The first: {present[0]}", LeftOutWarning)
     return kept
 
 

@@ -77,12 +77,15 @@ def as_loss(loss: Any) -> Loss:
         return CheckedBatchedLoss(loss) if isinstance(loss, BatchedLoss) else CheckedLoss(loss)
     if not callable(loss):
         raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
-    _require_arguments("loss", loss, ("positions", "velocities", "an array for the loss"))
+    arguments = ("positions", "velocities", "an array for the loss")
+    other = ", of Warp arrays; a loss of the end of a trajectory is an object with value(end) and adjoint(end)"
+    _require_arguments("loss", loss, arguments, other)
     return CheckedLoss(Recorded(loss))
 
 
-def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...]) -> None:
-    """An `InputError` where a function does not take so many arguments, if Python can tell."""
+def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
+    """An `InputError` where a function does not take so many arguments, if Python can tell; ``other``: what else the
+    loss could be, in words."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -90,9 +93,8 @@ def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[st
     try:
         signature.bind(*wanted)
     except TypeError:
-        raise InputError(
-            f"{what} takes the arguments {shown(str(signature))}, but must take {len(wanted)}: {', '.join(wanted)}."
-        ) from None
+        found = f"{what} takes the arguments {shown(str(signature))}"
+        raise InputError(f"{found}, but must take {len(wanted)}: {', '.join(wanted)}{other}.") from None
 
 
 def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:

@@ -1,13 +1,12 @@
 """`cortado.evaluate`: a problem at many points that do not depend on one another, such as a population of a search."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from cortado.arrays import as_one_number, require_function, require_methods, require_table
 from cortado.device.executors.executor import Executor, InProcess, OnResult, checked_executor
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import InputError, shown, warn
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
 from cortado.gradients.points import FalliblePoint, evaluated, without_runs
@@ -58,7 +57,7 @@ def evaluate(
             raise error
         said = without_runs([*lost.values()], counted(len(found), "point"))
         sentence = f"{said}, and their losses are NaN. The first of them is point {first}: {error}"
-        warnings.warn(sentence, CortadoWarning, stacklevel=2)
+        warn(sentence)
     return found
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import require_function, require_truth
+from cortado.calls import told
 from cortado.errors import InputError
 from cortado.files.input_files import as_path
 from cortado.gradients.left_out import tallied
@@ -26,6 +27,7 @@ from cortado.optimisation.start import checked_bounds, checked_start, require_co
 from cortado.words import counted
 
 
+@told
 def optimise(
     problem: Optimisable | LossFunction,
     start: Mapping[str, Any],

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.device.memory import require
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import InputError, warn
 from cortado.files.atomic import write_atomically
 from cortado.files.input_files import as_path, reason, regular_file
 from cortado.files.srgb import check_light, from_srgb, to_srgb
@@ -139,7 +139,7 @@ def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int,
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < MOST_CROPPED:
         found = f"The picture {path} has {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
-        warnings.warn(f"{found}: only its middle is taken, {share:.0%} of it.", CortadoWarning, stacklevel=3)
+        warn(f"{found}: only its middle is taken, {share:.0%} of it.")
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:

@@ -1,6 +1,5 @@
 """How fast a film goes through the times of a run, and which of its frames it shows."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor, log10
@@ -8,7 +7,7 @@ from math import floor, log10
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import CortadoWarning
+from cortado.errors import warn
 from cortado.scene.picture import Picture
 from cortado.words import counted
 
@@ -117,7 +116,7 @@ def pace_of(times: Sequence[float] | NDArray, picture: Picture) -> Pace:
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
         advice = "a smaller --record-every or more steps give more"
-        warnings.warn(f"{found}, as the run has no more; {advice}.", CortadoWarning, stacklevel=3)
+        warn(f"{found}, as the run has no more; {advice}.")
     return Pace.of(times, asked, picture.film_speed)
 
 

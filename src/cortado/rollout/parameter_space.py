@@ -1,13 +1,12 @@
 """Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back."""
 
-import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from cortado.device.threads import WARP
-from cortado.errors import CortadoWarning, InputError, OutOfRangeError, shown
+from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
 from cortado.rollout.choosing import begin_choosing
 from cortado.rollout.first_positions import FirstPositions
@@ -158,7 +157,7 @@ class ParameterSpace:
         """Once."""
         if sentence and sentence not in self._told:
             self._told.add(sentence)
-            warnings.warn(sentence, CortadoWarning, stacklevel=5)
+            warn(sentence)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
@@ -312,7 +311,7 @@ class ParameterSpace:
         upright = self._one.upright(values)
         unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
         for sentence in filter(None, (crowded, unstable)):
-            warnings.warn(sentence, CortadoWarning, stacklevel=4)
+            warn(sentence)
 
     def _together(self, fields: list[Arrays]) -> Arrays:
         """The fields of the states of all scenes, given those of each or once those of all."""

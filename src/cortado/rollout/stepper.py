@@ -1,6 +1,5 @@
 """Steps of a simulation as a function of a state and of parameters, with its derivatives."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ import warp as wp
 
 from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import InputError, shown, warn
 from cortado.particles.state import Parameters, State
 from cortado.rollout.adjoint_step import AdjointStep
 from cortado.rollout.device_rows import DeviceRows
@@ -229,5 +228,5 @@ class Stepper:
         """Take the steps; ``keep`` checkpoints for a way back. Warnings and errors as of `Simulation.run`."""
         last = self.rollout.forward(keep=keep)
         for sentence in trouble(self.rollout, self._simulation.scene):
-            warnings.warn(sentence, CortadoWarning, stacklevel=6)
+            warn(sentence)
         return last

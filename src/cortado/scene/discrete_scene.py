@@ -3,7 +3,6 @@
 It is the same for every device, every precision and every engine.
 """
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +21,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice
-from cortado.errors import CortadoWarning
+from cortado.errors import warn
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.sampling import FluidSample, fluid_particles, period
@@ -108,7 +107,7 @@ def discretise(scene: Scene) -> DiscreteScene:
         crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
         told = check_crowding(crowding, spacing, "the points of the fluid")
         if told is not None:
-            warnings.warn(told, CortadoWarning, stacklevel=3)
+            warn(told)
     return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
 
 

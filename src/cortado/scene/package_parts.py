@@ -68,7 +68,7 @@ class PackageMaker:
             return parameter
         functions = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
         what = f'"{self._kind}" fails in its parameter {parameter.name}:'
-        own = {n: self._guarded(f, what) for n, f in functions.items() if isfunction(f) and not _is_ours(f)}
+        own: dict[str, Any] = {n: self._guarded(f, what) for n, f in functions.items() if isfunction(f) and not _is_ours(f)}
         return replace(parameter, **own) if own else parameter
 
     def _guarded(self, method: Callable[..., Any], what: str) -> Callable[..., Any]:
@@ -85,7 +85,7 @@ class PackageMaker:
 def _at_work(made: Any, kind: str, package: str) -> Any:
     """What a part of a package made, such as a solver: the methods and properties of its class are guarded from then
     on, and what they return."""
-    cls = type(made)
+    cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
             made.__class__ = _guarded_class(cls, kind, package)

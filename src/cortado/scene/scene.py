@@ -5,14 +5,13 @@ Whatever is wrong raises a `SceneError`, one sentence.
 
 import json
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from pydantic import model_validator
 
-from cortado.errors import CortadoWarning, InputError, SceneError, shown
+from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.sentences import sentences
@@ -33,15 +32,15 @@ class Scene(SceneTables):
         for phase in self.phase:
             if phase.rest_density < LIGHTEST:
                 found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
-                warnings.warn(f"{found}, less than any liquid has: is it in g/cm3?", CortadoWarning, stacklevel=2)
+                warn(f"{found}, less than any liquid has: is it in g/cm3?")
         time_step = self.solver.time_step
         if time_step == "auto":
             check_bounded(self)
         elif broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
-            warnings.warn(f"{found}, which comes from {broken[0]}.", CortadoWarning, stacklevel=2)
+            warn(f"{found}, which comes from {broken[0]}.")
         if wrong := wall_sentence(self):
-            warnings.warn(wrong, CortadoWarning, stacklevel=2)
+            warn(wrong)
         return self
 
     def replaced(self, *overrides: str) -> "Scene":

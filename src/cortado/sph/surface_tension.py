@@ -10,14 +10,13 @@ takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, 
 meets them at 180 degrees.
 """
 
-import warnings
 from math import pi, sqrt
 
 import numpy as np
 import warp as wp
 
 from cortado.discretise.calibration import lattice_offsets
-from cortado.errors import CortadoWarning
+from cortado.errors import warn
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
@@ -104,11 +103,9 @@ def force(setting: Setting) -> Force:
 def _check_support(scene: Scene, least: float) -> None:
     support = scene.discretisation.support
     if support < least:
-        warnings.warn(
+        warn(
             f"discretisation.support is {support:g}, but surface tension needs at least {least:g} to hold a "
-            "fluid together.",
-            CortadoWarning,
-            stacklevel=2,
+            "fluid together."
         )
 
 
@@ -119,10 +116,8 @@ def _check_viscosity(scene: Scene, particles: int, part: float) -> None:
         least = part * sqrt(phase.rest_density * tension * radius)
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
-            warnings.warn(
+            warn(
                 f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but for so much fluid with a surface "
                 f"tension of {tension:g} N/m it should be at least {least:.2g} Pa s: with less, the surface takes up "
-                "energy and throws out particles.",
-                CortadoWarning,
-                stacklevel=2,
+                "energy and throws out particles."
             )

@@ -1,7 +1,6 @@
 """``cortado convergence``: the same scene at several resolutions: the order of convergence, and the limit."""
 
 import json
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,7 +11,7 @@ import numpy as np
 
 from cortado.cli.commands.compare import SAME_TIME
 from cortado.cli.commands.named_runs import named_runs
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import InputError, warn
 from cortado.optimisation.sweep.richardson import Extrapolation
 from cortado.runs.differences import differences
 from cortado.runs.run_files import read_json
@@ -113,12 +112,10 @@ def _warn_of_masses(runs: Sequence[Resolved]) -> None:
     """Say where runs have unlike amounts of fluid, which no order of convergence is about."""
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
     if most.mass > (1.0 + SAME_MASS) * least.mass:
-        warnings.warn(
+        warn(
             f"the runs do not have the same fluid: {least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, "
             f"{most.mass:.4g} kg with {most.size(SPACING):g} m. Choose spacings that divide the sizes of all bodies of "
-            "fluid.",
-            CortadoWarning,
-            stacklevel=3,
+            "fluid."
         )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.cli.commands.executor import HERE, Where
-from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, warn
 from cortado.files.atomic import UNFINISHED, sentences, write_atomically
 from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import keeping
@@ -227,8 +227,8 @@ def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int)
         said = (
             f"{len(warned)} of {counted(runs, 'run')} came with a warning. The first is run {first}: {warned[first][0]}"
         )
-        warnings.warn(said, CortadoWarning, stacklevel=3)
+        warn(said)
     if failures:
         first = min(failures)
         said = f"{len(failures)} of {counted(runs, 'run')} failed and are left out. The first is run {first}: "
-        warnings.warn(f"{said}{failures[first]}", CortadoWarning, stacklevel=3)
+        warn(f"{said}{failures[first]}")

@@ -1,7 +1,6 @@
 """``cortado run``: a scene, forward."""
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -15,7 +14,7 @@ from cortado.cli.commands.run_report import write_run_report
 from cortado.cli.commands.run_summary import RunSummary
 from cortado.device.compiling import compile_ahead
 from cortado.device.memory import frame_parts, require
-from cortado.errors import CortadoWarning, DivergedError, InputError
+from cortado.errors import DivergedError, InputError, warn
 from cortado.files.folder_lock import locked
 from cortado.files.interruption import keeping
 from cortado.files.progress import announce
@@ -95,7 +94,7 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
         with keeping(lambda: _kept(folder)):
             _compute(recording, asked)
     for told in trouble(rollout, scene):
-        warnings.warn(told, CortadoWarning, stacklevel=2)
+        warn(told)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 

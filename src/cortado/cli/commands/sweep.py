@@ -11,7 +11,7 @@ from cortado.cli.arguments import ALL_FRAMES, STEPS, FrameOptions
 from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, warn
 from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import Interrupted, keeping
 from cortado.files.progress import track, untracked
@@ -57,7 +57,7 @@ class Member:
             found = self.finished(combination) or self._computed(combination)
         for warning in caught:
             if issubclass(warning.category, CortadoWarning):
-                warnings.warn(f"{combination.name}: {warning.message}", CortadoWarning, stacklevel=2)
+                warn(f"{combination.name}: {warning.message}")
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
@@ -226,9 +226,7 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
     off = max(ends, key=lambda end: abs(end - duration))
     if abs(off - duration) > SAME_TIME * duration:
         last = done[ends.index(off)].name
-        warnings.warn(
+        warn(
             f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
-            f"ends at {off:g} s. Choose a --time that is a multiple of every time step.",
-            CortadoWarning,
-            stacklevel=2,
+            f"ends at {off:g} s. Choose a --time that is a multiple of every time step."
         )

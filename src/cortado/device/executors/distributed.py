@@ -6,7 +6,6 @@ Its own executor, `Client.get_executor`, takes all items at once, and waits for 
 import asyncio
 import queue
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from uuid import uuid4
 
 from cortado.device.executors.calls import Answer, Lacking, Payload, call, in_words, pickled
 from cortado.device.executors.executor import Executor, Item, OnResult, Result, check_call
-from cortado.errors import ComputationError, CortadoWarning, InputError, shown
+from cortado.errors import ComputationError, InputError, shown, warn
 
 if TYPE_CHECKING:
     import distributed
@@ -192,7 +191,7 @@ class _Map:
         found = self._next()
         if isinstance(found, str):
             sentence = f"The worker {found} was lost; what it was computing is computed again by another one."
-            warnings.warn(sentence, CortadoWarning, stacklevel=2)
+            warn(sentence)
         elif found in self._sent:
             number, item = self._sent.pop(found)
             try:
@@ -254,7 +253,7 @@ class _Map:
 def _result(answer: Answer) -> Any:
     """What the function returned; raises what it raised."""
     for text, category in answer.warnings:
-        warnings.warn(text, category, stacklevel=2)
+        warn(text, category)
     if answer.error is None:
         return answer.result
     if answer.traceback:

@@ -12,7 +12,7 @@ from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_checks import FoundMesh, found_mesh
 from cortado.discretise.solids.mesh_fit import check_fit, check_unit
 from cortado.discretise.solids.triangle_tree import Numbers
-from cortado.errors import CortadoWarning, InputError, Words, shown
+from cortado.errors import InputError, Words, shown, warn
 from cortado.files.input_files import reason, regular_file
 
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
@@ -49,7 +49,7 @@ def read_mesh(
     else:
         notes = (*notes, *check_fit(mesh, what, scale, spacing, support, container))
     for note in notes:
-        warnings.warn(note, CortadoWarning, stacklevel=2)
+        warn(note)
     return mesh
 
 

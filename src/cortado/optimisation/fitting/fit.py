@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import require_function, require_table, whole_number
+from cortado.calls import told
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.optimisation.fitting.bar_slopes import over_the_bars
 from cortado.optimisation.fitting.certainty import Certainty, counted_covariance, noise_of, spread
@@ -26,6 +27,7 @@ ROUGHLY = 1e-3
 """Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
 
 
+@told
 def fit(
     experiments: Experiment | Sequence[Experiment],
     start: Mapping[str, Any],
