@@ -66,10 +66,11 @@ class PackageMaker:
     def _judged(self, parameter: Any) -> Any:
         if not isinstance(parameter, Parameter):
             return parameter
-        functions = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
+        given = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
+        own = [name for name, value in given.items() if isfunction(value) and not _is_ours(value)]
         what = f'"{self._kind}" fails in its parameter {parameter.name}:'
-        own: dict[str, Any] = {n: self._guarded(f, what) for n, f in functions.items() if isfunction(f) and not _is_ours(f)}
-        return replace(parameter, **own) if own else parameter
+        changes: dict[str, Any] = {name: self._guarded(given[name], what) for name in own}
+        return replace(parameter, **changes) if own else parameter
 
     def _guarded(self, method: Callable[..., Any], what: str) -> Callable[..., Any]:
         def call(*arguments: Any, **more: Any) -> Any:
