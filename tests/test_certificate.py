@@ -11,10 +11,11 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado import DivergedError, InputError, Problem, Simulation, gradients, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.consistency import balanced
+from cortado.certificate.figure import gradient_check
 from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.loss_history import LossHistory
@@ -432,6 +433,68 @@ def test_the_advice():
     lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
     assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, alignment=None).estimator == "AdjointViscosity()"
+
+
+def losing(monkeypatch, step, is_copy):
+    """Runs of copies lose a particle in a step."""
+    ends = Problem._ends
+
+    def lost(self, values, *arguments, **options):
+        if self.simulation.batch is None and self.steps >= step and is_copy(self, values):
+            raise DivergedError(step, 3, "try a smaller time step", "left the container")
+        return ends(self, values, *arguments, **options)
+
+    monkeypatch.setattr(Problem, "_ends", lost)
+
+
+def test_beyond_the_step_in_which_a_moved_copy_loses_a_particle_there_is_no_answer(monkeypatch, tmp_path):
+    """But before it there is the same one."""
+    whole = certify(problem_of(plane(), 30))
+    losing(monkeypatch, 20, lambda _, values: np.abs(np.ravel(values["gravity"])[1] + 9.81) > 0.1)
+    found = certify(problem_of(plane(), 30))
+    (horizon,), (wanted,) = found.horizons, whole.horizons
+    assert found.right and found.horizon == 19 and found.consistency.last_converged == 30
+    np.testing.assert_array_equal(horizon.difference[:15], wanted.difference[:15])
+    assert horizon.sample_steps[14] <= 19 and np.isnan(horizon.difference[horizon.sample_steps > 19]).all()
+    sentence = "Beyond step 19 there is no answer for gravity: a run that the perturbation of gravity moves loses"
+    assert sentence in str(found) and "Up to step 19 of 30" in str(found) and found.estimator != "Exact()"
+    json.dumps(found.as_dict(), allow_nan=False)
+    assert gradient_check(found, tmp_path / "certificate.png").stat().st_size
+
+
+@pytest.mark.parametrize("step", [1, 8])
+def test_copies_that_are_moved_little_lose_a_particle_too(step, monkeypatch):
+    losing(monkeypatch, step, lambda _, values: "time_step" in values and values["time_step"] != 0.0021)
+    found = certify(problem_of(plane(), 12))
+    assert found.right and found.consistency.last_converged == (7 if step > 1 else None)
+    assert "7" in str(found) if step > 1 else "no difference is reliable here" in str(found)
+
+
+@pytest.mark.parametrize(("step", "reached"), [(1, 0), (9, 8)])
+def test_beside_a_corner_a_copy_may_lose_a_particle(step, reached, monkeypatch):
+    losing(monkeypatch, step, lambda _, values: np.abs(values.get("initial_velocities", 0.0)).max() > 1e-3)
+    found = corners(ON_ITS_CORNERS)
+    assert found.right and not found.consistency.right
+    assert f"Beyond step {reached} nothing is checked beside the corner: that run loses a particle." in str(found)
+    assert (found.beside is None) == (reached == 0) and (not reached or found.beside.last_converged == 8)
+
+
+def test_the_copy_in_float64_may_lose_a_particle(monkeypatch):
+    simulation = Simulation(plane())
+    problem = Problem(simulation, 12, losses.FinalPositions(simulation.positions))
+    losing(monkeypatch, 9, lambda one, values: one.simulation.precision.name == "float64")
+    found = certify(problem)
+    assert found.right and found.steps == 8 and found.horizon == 8
+    assert "Beyond step 8 there is no answer: in float64, in which gradients are certified, the run loses" in str(found)
+    losing(monkeypatch, 3, lambda *_: True)
+    with pytest.raises(DivergedError, match="diverged in step 3"):
+        certify(problem)
+
+
+def test_what_was_not_tried_is_extrapolated():
+    rows = str(certify(problem_of(plane(), 12))).splitlines()
+    called = {name: "extrapolated" in next(row for row in rows if name in row) for name in ("gravity", "time_step")}
+    assert called == {"gravity": False, "time_step": True}
 
 
 def test_growth_is_in_e_folds():

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.errors import DivergedError, MissingDerivativeError
+from cortado.errors import MissingDerivativeError
 from cortado.gradients import (
     AdjointViscosity,
     EnsembleMean,
@@ -16,6 +16,7 @@ from cortado.gradients import (
     Guided,
     RandomizedSmoothing,
 )
+from cortado.gradients.points import NO_RUN
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays
 
@@ -73,7 +74,7 @@ class Alignment:
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
     """The alignment for all these parameters together.
 
-    None where they have too many components for a smoothed gradient, where one of its runs diverges, and where the loss
+    None where they have too many components for a smoothed gradient, where it has no run, and where the loss
     does not depend on them.
     """
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
@@ -81,7 +82,7 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
     spread = {name: float(size.mean()) for name, size in sizes.items()}
     try:
         smoothed = RandomizedSmoothing(spread, SAMPLES).estimate(problem, values)
-    except DivergedError:
+    except NO_RUN:
         return None
 
     def numbers(gradient: Arrays) -> np.ndarray:
@@ -103,6 +104,6 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
         with suppress(MissingDerivativeError):  # of a solver from outside, which may have exact ones alone
             found.append(judged(f"{type(estimator).__name__}()", estimator))
     if max(one.cosine for one in found) < GOOD_COSINE:
-        with suppress(DivergedError):
+        with suppress(*NO_RUN):
             found += [judged(name, make(spread)) for name, make in AVERAGES.items()]
     return Alignment(float(np.linalg.norm(error)) / length, tuple(found), spread)

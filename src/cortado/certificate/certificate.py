@@ -1,7 +1,7 @@
 """The certificate of a problem's gradients: are they right, up to which step are they useful, what to use beyond."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from typing import Any
 
@@ -22,10 +22,12 @@ from cortado.certificate.perturbations import (
     everything,
     scales,
 )
-from cortado.certificate.text import consistency_words, gradient_table, horizon_table, parameter_table
+from cortado.certificate.shorter import first_rows, up_to
+from cortado.certificate.text import beyond_words, consistency_words, gradient_table, horizon_table, parameter_table
 from cortado.certificate.twin import in_float64
-from cortado.errors import InputError, shown
+from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointNorms
+from cortado.gradients.points import NO_RUN
 from cortado.losses import FinalPositions
 from cortado.pictures.notebook import as_text
 from cortado.problem import Problem
@@ -51,7 +53,8 @@ class Certificate:
     """[s]"""
     loss: float
     loss_changes: dict[str, float]
-    """For every parameter, by how much a meaningful perturbation of it changes the loss, by the adjoint."""
+    """For every parameter, by how much a meaningful perturbation of it would change the loss: extrapolated, the adjoint
+    times a perturbation that was not tried."""
     consistency: Consistency
     """Of the derivatives with respect to all parameters together."""
     wrong: tuple[str, ...]
@@ -67,6 +70,8 @@ class Certificate:
     beside: Consistency | None = None
     """Where the loss has a corner at these parameters, on which differences do not tell: the same check beside it, with
     particles that are moved a little."""
+    beyond: tuple[str, ...] = ()
+    """Sentences: what there is no answer to, as a copy of the run loses a particle."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -76,9 +81,10 @@ class Certificate:
     def __str__(self) -> str:
         """As tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
-        lines = [size, parameter_table(self.loss_changes, self.wrong)]
+        tried = {one.parameter for one in self.horizons if one.lasts}
+        lines = [size, parameter_table(self.loss_changes, self.wrong, tried)]
         if not self.right:
-            return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}."])
+            return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}.", *self.beyond])
         lines += [
             f"The adjoint is right: {consistency_words(self.consistency, self.beside)}.",
             f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
@@ -87,6 +93,7 @@ class Certificate:
             f"Up to step {self.horizon} of {self.steps}, {self.horizon * self.time_step:.4g} of "
             f"{self.steps * self.time_step:.4g} s, the exact gradient is useful. For {self.steps} steps use "
             f"gradients.{self.estimator}{self._spread}.",
+            *self.beyond,
         ]
         return "\n".join(lines)
 
@@ -158,7 +165,9 @@ def certify(
         seed: of the random directions.
         steps: to be left out where a problem is given, as a problem has its own number of steps.
 
-    Raises `InputError` for arguments that do not fit, `DivergedError` where the problem itself diverges.
+    Where a copy of the run loses a particle, moved or in float64, the answers are those of the steps before, and
+    `Certificate.beyond` says so. Raises `InputError` for arguments that do not fit, `DivergedError` where the problem
+    itself diverges.
     """
     require_whole("seed", seed, 0)
     if not 0.0 < as_one_number("perturbation", perturbation) < 1.0:
@@ -167,23 +176,42 @@ def certify(
     if problem.simulation.batch is not None:
         raise InputError("What is certified is a batch, but must be one scene: they all have the same derivatives.")
     problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
-    problem = in_float64(problem)
-    chosen, random = checked_parameters(problem, parameters), np.random.default_rng(seed)
+    double = in_float64(problem)
+    chosen = checked_parameters(double, parameters)
+    try:
+        return _certified(double, chosen, perturbation, seed)
+    except DivergedError as error:
+        if double is not problem:
+            problem.value(chosen)  # raises the error of the problem itself, if it has one
+        shorter = up_to(double, error.step - 1) if double is not problem else None
+        if shorter is None:
+            raise
+        found = _certified(shorter, first_rows(double, chosen, shorter.steps), perturbation, seed)
+        copied = f"in float64, in which gradients are certified, the run loses a particle in step {error.step}"
+        return replace(found, beyond=(f"Beyond step {shorter.steps} there is no answer: {copied}.", *found.beyond))
+
+
+def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
+    """Of a problem in float64; raises `DivergedError` where its run diverges."""
+    random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
     exact = problem.estimate({**chosen, **values}, observe=norms)
     along = directions(values, scales(problem, values, perturbation), random)
     consistency, wrong = _consistency(history, values, exact.gradient, along)
-    beside = None
+    beside, beyond = None, list[str]()
     if wrong and consistency.is_on_a_corner:
-        beside = _beside(history, values, along, random)
-        wrong = () if beside.right else wrong
+        beside, reached = _beside(problem, values, along, random)
+        wrong = wrong if beside is not None and not beside.right else ()
+        if reached < problem.steps:
+            beyond.append(f"Beyond step {reached} nothing is checked beside the corner: that run loses a particle.")
 
     sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
     perturbations = coherent_directions(problem, chosen, sizes, random)
     known = {**problem.simulation.parameters(), **values}
     time = float(known["time_step"]) * max(problem.steps, 1)
+    horizons = tuple(horizon(history, chosen, name, perturbations[name]) for name in asked)
     return Certificate(
         particles=problem.simulation.particles,
         steps=problem.steps,
@@ -194,9 +222,10 @@ def certify(
         wrong=wrong,
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
         growth=growth(norms.numpy(), float(known["time_step"])) / max(problem.steps, 1),
-        horizons=tuple(horizon(history, chosen, name, perturbations[name]) for name in asked),
+        horizons=horizons,
         alignment=alignment(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
         beside=None if wrong else beside,
+        beyond=(*beyond, *filter(None, map(beyond_words, horizons))),
     )
 
 
@@ -233,20 +262,30 @@ def _consistency(
     return together, tuple(name for name in along if not alone[name].right) or tuple(along)
 
 
-def _beside(history: LossHistory, values: Arrays, along: Arrays, random: np.random.Generator) -> Consistency:
-    """The check of all parameters together, with first positions and velocities moved a little at random.
+def _beside(
+    problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
+) -> tuple[Consistency | None, int]:
+    """The check of all parameters together, with first positions and velocities moved a little at random, and the
+    steps that it is of: those before the one in which the run that was moved loses a particle. None where there are
+    none.
 
     Fluid at rest is on the corner of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the
     errors of many corners may cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved
     has the same terms, and is on no corner.
     """
-    problem = history.problem
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
     shifts = directions(states, scales(problem, states, BESIDE), random)
     moved = {**values, **{name: values[name] + shift for name, shift in shifts.items()}}
-    gradient = problem.estimate(moved).gradient
-    return check_consistency(history, moved, gradient, balanced(gradient, along))
+    try:
+        gradient = problem.estimate(moved).gradient
+    except NO_RUN as error:
+        shorter = up_to(problem, error.step - 1) if isinstance(error, DivergedError) else None
+        if shorter is None:
+            return None, 0
+        moved, along = (first_rows(problem, one, shorter.steps) for one in (moved, along))
+        problem, gradient = shorter, shorter.estimate(moved).gradient
+    return check_consistency(LossHistory(problem), moved, gradient, balanced(gradient, along)), problem.steps
 
 
 def _plain(found: Any) -> Any:

@@ -24,7 +24,8 @@ class Horizon(ShortRepr):
     exact: np.ndarray
     """(sample_steps,) by forward mode."""
     difference: np.ndarray
-    """(sample_steps,) central difference over the whole perturbation, in both directions."""
+    """(sample_steps,) central difference over the whole perturbation, in both directions; NaN beyond the last step that
+    both of its runs come to."""
     strain: np.ndarray
     """(sample_steps,) how far the perturbation separates nearest neighbours, to first order [spacings]."""
 
@@ -38,6 +39,12 @@ class Horizon(ShortRepr):
         """The last sample step at which the exact derivative is useful, as it is at the one before; 0 for none."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
+        return int(self.sample_steps[there[-1]]) if there.size else 0
+
+    @property
+    def reached(self) -> int:
+        """The last sample step that has a difference; 0 for none."""
+        there = np.flatnonzero(~np.isnan(self.difference))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property

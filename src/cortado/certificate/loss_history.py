@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cortado.certificate.shorter import first_rows
 from cortado.certificate.twin import Rounded
 from cortado.errors import DivergedError
+from cortado.gradients.points import NO_RUN
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field
@@ -57,8 +59,8 @@ class LossHistory:
         self._total = np.cumsum if frames else np.asarray
 
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """(sample_steps,) central differences of step h along a direction of all or some of the parameters; NaN where a
-        run diverges."""
+        """(sample_steps,) central differences of step h along a direction of all or some of the parameters; NaN from
+        the step on in which a run diverges."""
         return self.sides(parameters, along, h, np.zeros(len(self.sample_steps)))[0]
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -69,9 +71,9 @@ class LossHistory:
             rounded = isinstance(loss, Rounded)
             differences.append(_change(loss, before, after) if rounded and h < 1.0 else _values(loss, before, after))
             sums.append(np.nan if rounded else loss.value(before) + loss.value(after))
-        unknown = np.full(len(self.sample_steps), np.nan)
-        bends = np.abs(self._total(sums or unknown) - 2.0 * losses) / h
-        return self._total(differences or unknown) / (2.0 * h), np.nan_to_num(bends)
+        unknown = [np.nan] * (len(self.sample_steps) - len(sums))
+        bends = np.abs(self._total(sums + unknown) - 2.0 * losses) / h
+        return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
         """Relative distance of the adjoints of `Rounded` losses from finite differences of their values.
@@ -92,21 +94,29 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """At every sample step its loss, and the states with parameters moved by -h and by h along the direction.
-
-        Nothing where a run diverges.
-        """
-        try:
-            behind, ahead = (
-                self.problem.states(
-                    {**parameters, **{name: parameters[name] + step * d for name, d in along.items()}}, self._losses
-                )
-                for step in (-h, h)
-            )
-        except DivergedError:
-            return
+        """At every sample step its loss, and the states with parameters moved by -h and by h along the direction, as
+        far as both runs come."""
+        behind, ahead = (
+            self._reached({**parameters, **{name: parameters[name] + step * d for name, d in along.items()}})
+            for step in (-h, h)
+        )
         for step, loss in self._losses.items():
-            yield loss, behind[step], ahead[step]
+            if step in behind and step in ahead:
+                yield loss, behind[step], ahead[step]
+
+    def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
+        """The states at those sample steps that a run comes to before it loses a particle; none where it cannot
+        begin."""
+        try:
+            return self.problem.states(parameters, self._losses)
+        except NO_RUN as error:
+            first_lost = error.step if isinstance(error, DivergedError) else 0
+        steps = [step for step in self._losses if step < first_lost]
+        if not steps or steps[-1] == 0:
+            return {}
+        problem, last = self.problem, steps[-1]
+        shorter = Problem(problem.simulation, last, self._losses[last], problem.memory_budget)
+        return shorter.states(first_rows(problem, parameters, last), steps)
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""

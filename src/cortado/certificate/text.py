@@ -1,6 +1,6 @@
 """The results of a certificate as tables and sentences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from io import StringIO
 from math import log10
 from typing import Any
@@ -13,14 +13,24 @@ WIDTH = 110
 """Characters of a table at most."""
 
 
-def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str]) -> str:
-    """By how much each parameter changes the loss, and whether its adjoint is right."""
-    verdicts = {name: "WRONG" if name in wrong else "right" for name in loss_changes}
-    rows = [
-        [name, f"{share:.3e}", verdicts[name] if share or name in wrong else "no effect on this loss"]
-        for name, share in loss_changes.items()
-    ]
-    return _table(["parameter", "a perturbation changes the loss by", "adjoint"], rows)
+def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str], tried: Collection[str]) -> str:
+    """By how much each parameter changes the loss, which is extrapolated but for those that were ``tried``, and whether
+    its adjoint is right."""
+    rows = []
+    for name, share in loss_changes.items():
+        verdict = "WRONG" if name in wrong else "right" if share else "no effect on this loss"
+        rows.append([name, f"{share:.3e}" + (", extrapolated" if share and name not in tried else ""), verdict])
+    return _table(["parameter", "slope times a perturbation", "adjoint"], rows)
+
+
+def beyond_words(horizon: Horizon) -> str | None:
+    """Up to which step there is an answer; None where it is the last one."""
+    if horizon.reached == horizon.sample_steps[-1]:
+        return None
+    moved = f"a run that the perturbation of {horizon.parameter} moves"
+    if horizon.reached == 0:
+        return f"Of {horizon.parameter} there is no horizon: {moved} cannot begin, or loses a particle at once."
+    return f"Beyond step {horizon.reached} there is no answer for {horizon.parameter}: {moved} loses a particle."
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
