@@ -54,7 +54,7 @@ def _called(function: Any) -> Iterator[Any]:
     """The Warp functions that a Python function names, and those that they name."""
     known = inspect.getclosurevars(function)
     for value in (*known.nonlocals.values(), *known.globals.values()):
-        if isinstance(value, wp.Function):
+        if isinstance(value, wp.Function) and value.func:
             yield value
             yield from _called(value.func)
 

@@ -2,19 +2,21 @@
 
 import ast
 import inspect
-import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import FunctionType, MappingProxyType, ModuleType
+from types import FunctionType, MappingProxyType
 from typing import Any
-from weakref import WeakKeyDictionary
 
-import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.errors import InputError, shown
-from cortado.sph.function_text import REAL, VECTOR, DerivativeCheck, InPrecision, check_names, check_returns
+from cortado.errors import InputError
+from cortado.sph.frozen import Frozen
+from cortado.sph.function_source import definition
+from cortado.sph.function_text import DerivativeCheck, check_names, check_returns
+from cortado.sph.in_precision import REAL, VECTOR, InPrecision
+from cortado.sph.meaning_checks import check_calls, check_helper, check_truths
+from cortado.sph.python_meaning import meanings
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,6 @@ INPUTS = {
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
 """By what sentences call a force."""
-_SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
-"""Texts of functions that came from other processes."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,15 @@ class Formula:
     """"vector" or "number": what the first two are, and what it returns."""
     parameters: tuple[str, ...]
     """Its other arguments."""
-    outside: tuple[str, ...]
-    """What the text does not say: the functions of Warp that it calls, and values."""
+    outside: str
+    """What the text does not say: the functions under ``@wp.func`` that it calls, and values, as a text."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     """What names in the text stand for."""
 
     def function(self, precision: Precision, types: tuple[Any, ...], module: Any) -> Any:
         """The Warp function of a precision, with the types of its parameters; it has the name of the user's."""
         real, vector = precision.real, precision.vector
-        scope = {**self.scope, REAL: real, VECTOR: vector}
+        scope = {**self.scope, **meanings(precision), REAL: real, VECTOR: vector}
         code = compile(self.text, f"<force {self.name}>", "exec")
         exec(code, scope)
         made: Any = scope[self.name]
@@ -71,51 +71,29 @@ class Formula:
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
 
-def plain_function(kind: str, function: Any) -> FunctionType:
-    """What a user gives as the function of a force, which may be one of Warp; raises `InputError`."""
-    plain = function.func if isinstance(function, wp.Function) else function
-    if not isinstance(plain, FunctionType):
-        raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
-    return plain
-
-
-def source_of(kind: str, function: FunctionType) -> str:
-    """The text of a function; raises `InputError`."""
-    if function in _SENT:
-        return _SENT[function]
-    try:
-        return textwrap.dedent(inspect.getsource(function))
-    except (OSError, TypeError) as error:
-        found = f"the text of {kind} function {function.__name__} is not to be found"
-        raise InputError(f"{found}, but must stand in a file or a notebook.") from error
-
-
-def keep_source(function: FunctionType, source: str) -> None:
-    """Keep the text that a function came with from another process, where it may stand in no file."""
-    _SENT[function] = source
-
-
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
     """A user's function with its text, called ``kind`` in sentences, and the values of its parameters: those given, and
     its own for what is not. Raises `InputError`."""
-    name, what = function.__name__, f"{kind} function {function.__name__}"
+    what = f"{kind} function {function.__name__}"
     inputs, values = _arguments(what, function, parameters, INPUTS[kind])
-    definition, scope = _definition(what, source), _scope(function)
-    tree = ast.Module([definition], [])
-    helpers = _called(scope)
-    for one in (tree, *(helper.adj.tree for helper in helpers)):
-        DerivativeCheck(what).visit(one)
-    scopes = scope, *(_scope(helper.func) for helper in helpers)
-    outside = (*(helper.adj.source for helper in helpers), *map(_values, scopes))
-    local = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    frozen, written = Frozen(what, function), definition(what, function, source)
+    for helper in frozen.helpers:
+        tree = helper.adj.tree
+        DerivativeCheck(what).visit(tree)
+        check_helper(what, tree.body[0])
+    DerivativeCheck(what).visit(written)
+    local = {node.id for node in ast.walk(written) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own = {*inputs, *values, *local}
-    check_returns(what, definition, INPUTS[kind].kind)
-    check_names(what, definition, own, scope)
-    rewritten = InPrecision(scope, own).visit(tree)
+    check_returns(what, written, INPUTS[kind].kind)
+    check_names(what, written, own, frozen.scope)
+    check_calls(what, written, own, frozen.scope)
+    check_truths(what, written)
+    rewritten = InPrecision(what, frozen.scope, own).visit(ast.Module([written], []))
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
-    return Formula(name, text, inputs, INPUTS[kind].kind, tuple(values), outside, MappingProxyType(scope)), values
+    scope = MappingProxyType(frozen.scope)
+    return Formula(written.name, text, inputs, INPUTS[kind].kind, tuple(values), frozen.words, scope), values
 
 
 def _arguments(
@@ -124,7 +102,7 @@ def _arguments(
     """Names of the inputs, and the parameters' values in the order of the function's arguments. The first two inputs
     may have any names; those of ``first``, and t, stand for nothing else. A third one is the time only where its name
     says so, as it may be a parameter whose value was forgotten."""
-    signature, known = inspect.signature(function).parameters, (*first.names, "t")
+    signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
             raise InputError(f"{what} has the argument {argument}, but must have arguments by position alone.")
@@ -147,40 +125,6 @@ def _arguments(
         wanted = f"two {first.kind}s first, then time or nothing, and then parameters that all have values"
         raise InputError(f"{what} has {', '.join(inputs) or 'nothing'} without a value, but must have {wanted}.")
     return inputs, values
-
-
-def _definition(what: str, source: str) -> ast.FunctionDef:
-    """The definition alone, without annotations, defaults and decorators."""
-    try:
-        found: ast.AST = ast.parse(source).body[0]
-    except SyntaxError:  # a lambda on one of several lines
-        found = ast.Pass()
-    if not isinstance(found, ast.FunctionDef):
-        raise InputError(f"{what} is no definition, but must be made by def.")
-    found.decorator_list, found.returns, found.args.defaults = [], None, []
-    for argument in found.args.args:
-        argument.annotation = None
-    return found
-
-
-def _scope(function: FunctionType) -> dict[str, Any]:
-    """What the names of a function stand for that are not its own."""
-    outside = inspect.getclosurevars(function)
-    return {**outside.globals, **outside.nonlocals}
-
-
-def _called(scope: Mapping[str, Any], found: tuple[Any, ...] = ()) -> tuple[Any, ...]:
-    """The functions of Warp's users that are named in a scope, and those that they call."""
-    for _, helper in sorted(scope.items()):
-        if isinstance(helper, wp.Function) and helper.func and helper not in found:
-            found = _called(_scope(helper.func), (*found, helper))
-    return found
-
-
-def _values(scope: Mapping[str, Any]) -> str:
-    """What is named in a scope and is no function, module or type, in words."""
-    kept = {n: v for n, v in sorted(scope.items()) if not callable(v) and not isinstance(v, (ModuleType, wp.Function))}
-    return str({name: np.asarray(value).tolist() for name, value in kept.items()})
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:

@@ -22,6 +22,17 @@ class DerivativeCheck(ast.NodeVisitor):
     def __init__(self, what: str):
         self._what = what
 
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        loops = [
+            one.target.id for one in ast.walk(node) if isinstance(one, ast.For) and isinstance(one.target, ast.Name)
+        ]
+        named = [one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
+        named += [argument.arg for argument in node.args.args]
+        if twice := [name for name in loops if named.count(name) > loops.count(name)]:
+            found = f"{self._what} gives {twice[0]}, which a loop counts with, another value too"
+            raise InputError(f"{found}, but must have another name for one of them.")
+        self.generic_visit(node)
+
     def visit_For(self, node: ast.For) -> None:
         ends = node.iter.args if isinstance(node.iter, ast.Call) and _is_range(node.iter.func) else []
         numbers = [end.value for end in ends if isinstance(end, ast.Constant) and isinstance(end.value, int)]
@@ -73,75 +84,11 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
             raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")
 
 
-class InPrecision(ast.NodeTransformer):
-    """Numbers, and types of numbers and vectors, become those of the precision; what numbers and vectors from outside
-    are is written out, so that the text says all that the function does. Indices and what counts them stay whole."""
-
-    def __init__(self, scope: Mapping[str, Any], local: set[str]):
-        self._scope, self._local, self._whole = scope, local, set[str]()
-
-    def visit_Constant(self, node: ast.Constant) -> ast.AST:
-        return self._number(node, node.value)
-
-    def visit_Name(self, node: ast.Name) -> ast.AST:
-        return self._resolved(node)
-
-    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
-        return self._resolved(node)
-
-    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        node.value = self.visit(node.value)
-        return node
-
-    def visit_Expr(self, node: ast.Expr) -> ast.AST:
-        return node if isinstance(node.value, ast.Constant) else self.generic_visit(node)
-
-    def visit_For(self, node: ast.For) -> ast.AST:
-        if isinstance(node.target, ast.Name):
-            self._whole.add(node.target.id)
-        node.body = [self.visit(line) for line in node.body]
-        return node
-
-    def visit_Call(self, node: ast.Call) -> ast.AST:
-        if isinstance(node.func, ast.Name) and node.func.id in ("int", "type"):
-            return node
-        return self.generic_visit(node)
-
-    def visit_Compare(self, node: ast.Compare) -> ast.AST:
-        return node if any(map(self._is_whole, (node.left, *node.comparators))) else self.generic_visit(node)
-
-    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
-        return node if self._is_whole(node.left) or self._is_whole(node.right) else self.generic_visit(node)
-
-    def _is_whole(self, node: ast.AST) -> bool:
-        return isinstance(node, ast.Name) and node.id in self._whole
-
-    def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """A name from outside, as a number or a type of the precision if it stands for one."""
-        try:
-            value = self._value(node)
-        except (KeyError, AttributeError):
-            return node
-        if isinstance(value, type) and value in _TYPES:
-            return ast.Name(_TYPES[value], ast.Load())
-        return self._number(node, value)
-
-    def _value(self, node: ast.expr) -> Any:
-        if isinstance(node, ast.Attribute):
-            return getattr(self._value(node.value), node.attr)
-        if not isinstance(node, ast.Name) or node.id in self._local:
-            raise KeyError
-        return float if node.id == "float" else self._scope[node.id]
-
-    @staticmethod
-    def _number(node: ast.expr, value: Any) -> ast.AST:
-        """A call that makes a number or a vector of the precision, where a value is one."""
-        if type(value) in (wp.vec3f, wp.vec3d):
-            return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            return node
-        return ast.Call(ast.Name(REAL, ast.Load()), [ast.Constant(float(value))], [])
-
-
 def _is_range(node: ast.expr) -> bool:
     return isinstance(node, ast.Name) and node.id == "range"
+
+
+def counts_of(function: ast.FunctionDef) -> list[str]:
+    """The names that its loops count with."""
+    targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
+    return [target.id for target in targets if isinstance(target, ast.Name)]

@@ -17,7 +17,8 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.scene.parameters.known import TIME
 from cortado.scene.parameters.parameter import Axis, Parameter, Source
 from cortado.scene.schedule import Course
-from cortado.sph.formula import Formula, compiled, formula, keep_source, plain_function, source_of
+from cortado.sph.formula import Formula, compiled, formula
+from cortado.sph.function_source import keep_source, plain_function, source_of
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
@@ -65,7 +66,7 @@ class OwnFunction(ABC):
         number, a vector (d,) or an `OverTime`. Their names are ``name.k`` of an argument ``k``; by default the name is
         that of the function. Raises `InputError`."""
         self._function = plain_function(self.kind, function)
-        self._source = source_of(self.kind, self._function)
+        self._source = source_of(f"{self.kind} function {self._function.__name__}", self._function)
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
         self.name = self._formula.name if name is None else name
         if not isinstance(self.name, str) or not self.name.isidentifier():
@@ -77,7 +78,7 @@ class OwnFunction(ABC):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled as what it is made from, with the text of the function."""
-        return _made_again, (type(self), self._function, self._source, self.name, self._values)
+        return _made_again, (type(self), self._function, self._source, self.name, self._values, self.fingerprint)
 
     def __repr__(self) -> str:
         values = "".join(f", {argument}={shown(value)}" for argument, value in self._values.items())
@@ -87,7 +88,7 @@ class OwnFunction(ABC):
     def fingerprint(self) -> str:
         """Of the function's text, and of those that it calls."""
         courses = [repr(value) for value in self._values.values() if isinstance(value, OverTime)]
-        words = (self.kind, self.name, self._formula.text, *self._formula.outside, *courses)
+        words = (self.kind, self.name, self._formula.text, self._formula.outside, *courses)
         return sha256("\n".join(words).encode()).hexdigest()
 
     def _value(self, argument: str, value: Any) -> Any:
@@ -175,15 +176,19 @@ class FunctionForce:
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
     """The part of a Warp module's name that tells one function from another."""
-    words = "\n".join((text.text, *text.outside, str(ranks), str(dimension)))
+    words = "\n".join((text.text, text.outside, str(ranks), str(dimension)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 
 def _made_again(
-    made: type[OwnFunction], function: Any, source: str, name: str, values: Mapping[str, Any]
+    made: type[OwnFunction], function: Any, source: str, name: str, values: Mapping[str, Any], fingerprint: str
 ) -> OwnFunction:
     keep_source(function, source)
-    return made(function, name, **values)
+    found = made(function, name, **values)
+    if found.fingerprint != fingerprint:
+        said = f"what the {made.kind} function {name} names or calls has changed since the force was made"
+        raise InputError(f"{said}, but must be the same where it goes to another process: make the force anew.")
+    return found
 
 
 def _dimension(dimension: int, phases: int) -> int:

@@ -6,8 +6,9 @@ from functools import cache
 from typing import Any
 
 from cortado.device.precision import Precision
-from cortado.sph.formula import Formula, formula, plain_function
+from cortado.sph.formula import Formula, formula
 from cortado.sph.formula_kernels import applied
+from cortado.sph.function_source import plain_function
 
 
 @dataclass(frozen=True)
