@@ -332,3 +332,85 @@ def test_an_interruption_between_two_sensors_keeps_what_was_read(cortado_command
     assert cortado_command(*run, "stopped", "--resume")[0] == 0
     texts = [(tmp_path / name / "sensors.csv").read_text() for name in ("whole", "stopped")]
     assert texts[0] == texts[1]
+
+
+ROUND_THE_EDGE = {
+    2: {
+        "gauge": WaveGauge([0.01, 0.0], radius=0.15),
+        "tilted": WaveGauge([0.49, 0.0], radius=0.15, up=[0.2, 1.0]),
+        "flow": FlowRate([0.5, 0.0], [1.0, 0.0]),
+        "slanted": FlowRate([0.5, 0.0], [2.0, 1.0], 0.3),
+        "probe": PressureProbe([0.5, 0.1]),
+        "wide": PressureProbe([0.3, 0.1], 0.8),
+        "floor": WallForce(lower=[0.4, -1.0], upper=[0.6, 0.15], about=[0.5, 0.0]),
+        "half": WallForce(lower=[0.25, -1.0]),
+        "walls": WallForce(),
+    },
+    3: {
+        "gauge": WaveGauge([0.01, 0.0, 0.3]),
+        "flow": FlowRate([0.3, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        "slanted": FlowRate([0.0, 0.0, 0.0], [1.0, 0.0, 1.0]),
+        "probe": PressureProbe([0.0, 0.1, 0.0]),
+        "floor": WallForce(lower=[0.2, -1.0, 0.2], upper=[0.4, 0.15, 0.4]),
+    },
+}
+
+
+def channel(dimension):
+    """Water 0.2 m deep that fills a period, 0.5 m long in the plane, 0.3 m along both axes in space."""
+    long = [0.5, 0.4] if dimension == 2 else [0.3, 0.4, 0.3]
+    tables = {
+        "container": {"shape": "box", "lower": [0.0] * dimension, "upper": long},
+        "fluid": [
+            {
+                "shape": "box",
+                "lower": [0.0] * dimension,
+                "upper": [long[0], 0.2, *long[2:]],
+                "velocity": [2.0, 0.0, 0.5][:dimension],
+                "phase": "water",
+            }
+        ],
+        "discretisation": {"spacing": 0.025 if dimension == 2 else 0.05},
+    }
+    tables["container"]["periodic"] = [True, False, True][:dimension]
+    made = plane if dimension == 2 else scene
+    return cortado.Simulation(made(**tables), precision="float64"), long[0]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_sensors_see_fluid_that_has_gone_around_a_period(dimension):
+    """Wherever its positions are, and also across the edge: the readings are those of the first lap."""
+    simulation, length = channel(dimension)
+    sensors, axes = ROUND_THE_EDGE[dimension], np.array([1.0, 0.0, 1.0])[:dimension]
+
+    def read(shift):
+        moved = {"initial_positions": simulation.positions + shift}
+        run = simulation.run(1, moved, sensors=sensors)
+        return {name: own.values for name, own in run.sensors.items()}
+
+    first, turns = read(0.0), np.random.default_rng(1).integers(-2, 4, (simulation.particles, 1))
+    for turn in (1.0, 3.0, -2.0, turns):
+        for name, values in read(turn * length * axes).items():
+            np.testing.assert_allclose(values, first[name], atol=1e-7 * np.abs(first[name]).max(), err_msg=name)
+    depth = simulation.lattice.volume * simulation.particles / length ** (dimension - 1)
+    assert first["gauge"][0, 0] == pytest.approx(depth, rel=0.01)
+    across = depth * (1.0 if dimension == 2 else length)
+    assert first["flow"][0, 0] == pytest.approx(2.0 * across, rel=0.01)
+    slanted = 2.0 * across if dimension == 2 else (2.0 + 0.5) * across
+    assert first["slanted"][0, 0] == pytest.approx(slanted, rel=0.02)
+
+
+@pytest.mark.parametrize(("dimension", "name"), [(2, name) for name in ROUND_THE_EDGE[2]] + [(3, "slanted")])
+def test_the_gradient_of_a_sensor_across_a_period_is_that_of_differences(dimension, name):
+    simulation, length = channel(dimension)
+    sensor, random = ROUND_THE_EDGE[dimension][name], np.random.default_rng(3)
+    dt = simulation.scene.solver.time_step
+    wanted = random.normal(size=(2, len(sensor.columns(dimension))))
+    problem = cortado.Problem(simulation, 4, Series(sensor, [0.0, 4.0 * dt], wanted, dt))
+    shift = random.integers(-2, 4, (simulation.particles, 1)) * length * np.eye(dimension)[0]
+    velocities = simulation.velocities + 0.5 * random.normal(size=simulation.velocities.shape)
+    point = {"initial_positions": simulation.positions + shift, "initial_velocities": velocities}
+    along = {"initial_velocities": random.normal(size=velocities.shape)}
+    derivative, gradient = problem.tangent(point, along), problem.value_and_gradient(point)[1]
+    assert (gradient["initial_velocities"] * along["initial_velocities"]).sum() == pytest.approx(derivative, rel=1e-10)
+    assert distance(problem.value, point, along, derivative, [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7], enough=1e-6) < 1e-6

@@ -15,6 +15,7 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.crowding import check_crowding, crowding_of
+from cortado.discretise.domain import Domain
 from cortado.discretise.packing.packing import Packing
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
@@ -49,10 +50,15 @@ class Lattice:
     """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.wall_relaxation`."""
     laplacian_correction: float
     """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
+    domain: Domain
+    """Along which axes it repeats."""
 
     @classmethod
-    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "Lattice":
-        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
+    def of(
+        cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, lower: Points, lengths: Points
+    ) -> "Lattice":
+        """Those of a kernel with a support radius [m] on a lattice with a spacing [m], and with periods that begin
+        somewhere and have lengths (d,) [m], 0 along axes without one."""
         return cls(
             support=support,
             normalisation=kernel.normalisation(dimension, support),
@@ -62,6 +68,7 @@ class Lattice:
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
             response=wall_response(kernel, spacing, support, dimension),
             laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),
+            domain=Domain.of(lower, lengths),
         )
 
 
@@ -95,7 +102,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     layers = wall_layers(kernel, spacing, support, dimension)
-    lattice = Lattice.of(kernel, spacing, support, dimension)
+    lattice = Lattice.of(kernel, spacing, support, dimension, *period(scene))
     fluid = fluid_particles(scene)
     at_rest = RestLattice(kernel, spacing, support)
     walls = walls_of(scene, layers, at_rest)

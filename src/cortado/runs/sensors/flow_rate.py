@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import ACROSS, Reading, Weights, direction, in_dimension, point, positive
+from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, point, positive
 
 
 @fixed
@@ -36,23 +36,21 @@ class FlowRate:
         return {"flow_rate": "m3/s" if dimension == 3 else "m2/s"}
 
     def value(self, at: Reading) -> NDArray[Any]:
-        _, scale, weights = self._around(at)
-        return np.array([scale * ((at["velocities"] @ self.normal) * weights.values).sum()])
+        return np.array([self._scale(at) * ((at["velocities"] @ self.normal) * self._around(at).weights).sum()])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        off, scale, weights = self._around(at)
-        slopes = weights.slopes * off / self._reach(at) ** 2
-        through = at["velocities"] @ self.normal
+        around, scale = self._around(at), bar[0] * self._scale(at)
         return {
-            "positions": (bar[0] * scale * through * slopes)[:, None] * self.normal,
-            "velocities": (bar[0] * scale * weights.values)[:, None] * self.normal,
+            "positions": around.pulled(scale * (at["velocities"] @ self.normal)) * self.normal,
+            "velocities": (scale * around.weights)[:, None] * self.normal,
         }
 
     def _reach(self, at: Reading) -> float:
         return 2.0 * at.lattice.support if self.reach is None else self.reach
 
-    def _around(self, at: Reading) -> tuple[NDArray[Any], float, Weights]:
-        """(n,) distances from the plane along its normal, what the weights are multiplied with, and these."""
-        reach = self._reach(at)
-        off = (at["positions"] - in_dimension("position", self.position, at.dimension)) @ self.normal
-        return off, at.lattice.volume * ACROSS[1] / reach, Weights.of(np.abs(off) / reach)
+    def _scale(self, at: Reading) -> float:
+        return at.lattice.volume * ACROSS[1] / self._reach(at)
+
+    def _around(self, at: Reading) -> Seen:
+        """By the distances (n, 1) from the plane along its normal."""
+        return Seen.of(at, self.position, self._reach(at), lambda way: (way @ self.normal)[:, None])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import Reading, Weights, in_dimension, point, positive
+from cortado.runs.sensors.sensor import Reading, Seen, point, positive
 
 
 @fixed
@@ -30,21 +30,19 @@ class PressureProbe:
         return {"pressure": "Pa"}
 
     def value(self, at: Reading) -> NDArray[Any]:
-        _, _, weights = self._around(at)
-        total = weights.values.sum()
-        return np.array([(at["pressure"] * weights.values).sum() / total if total else 0.0])
+        weights = self._around(at).weights
+        total = weights.sum()
+        return np.array([(at["pressure"] * weights).sum() / total if total else 0.0])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        apart, radius, weights = self._around(at)
-        total, pressure = weights.values.sum(), at["pressure"]
+        around, pressure = self._around(at), at["pressure"]
+        weights = around.weights
+        total = weights.sum()
         if not total:
-            return {"positions": np.zeros_like(apart), "pressure": np.zeros_like(pressure)}
+            return {"positions": np.zeros_like(at["positions"]), "pressure": np.zeros_like(pressure)}
         weights_bar = bar[0] * (pressure - self.value(at)[0]) / total
-        positions_bar = (weights_bar * weights.slopes / radius**2)[:, None] * apart
-        return {"positions": positions_bar, "pressure": bar[0] * weights.values / total}
+        return {"positions": around.pulled(weights_bar), "pressure": bar[0] * weights / total}
 
-    def _around(self, at: Reading) -> tuple[NDArray[Any], float, Weights]:
-        """(n, d) from the point to the particles, and their weights."""
+    def _around(self, at: Reading) -> Seen:
         radius = at.lattice.support if self.radius is None else self.radius
-        apart = at["positions"] - in_dimension("position", self.position, at.dimension)
-        return apart, radius, Weights.of(np.linalg.norm(apart, axis=1) / radius)
+        return Seen.of(at, self.position, radius, lambda way: way)

@@ -1,5 +1,6 @@
 """What a sensor is, and the smooth weights with which sensors look at particles."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -20,7 +21,7 @@ class Reading(Protocol):
 
     @property
     def lattice(self) -> Lattice:
-        """Constants of the particles at rest, such as their volume."""
+        """Constants of the particles at rest, such as their volume, and along which axes they repeat."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of the state or a quantity of its particles, float64."""
@@ -53,6 +54,33 @@ class Weights:
         """At distances (n,)."""
         rest = np.clip(1.0 - q, 0.0, None)
         return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Particles around a place, along periodic axes with all of their images that are near."""
+
+    images: list[tuple[NDArray[Any], Weights]]
+    """The ways (n, k) from the place to an image of each particle [m], and the weights of these images."""
+    reach: float
+    """From where on they weigh nothing [m]."""
+
+    @classmethod
+    def of(
+        cls, at: Reading, place: NDArray[Any], reach: float, across: Callable[[NDArray[Any]], NDArray[Any]]
+    ) -> "Seen":
+        """From a place (d,), as ``across`` shows ways (n, d): a linear function to ways (n, k)."""
+        ways = at.lattice.domain.ways(at["positions"], in_dimension("position", place, at.dimension), reach, across)
+        return cls([(way, Weights.of(np.linalg.norm(way, axis=1) / reach)) for way in ways], reach)
+
+    @property
+    def weights(self) -> NDArray[Any]:
+        """(n,) of particles, those of their images added up."""
+        return sum(weights.values for _, weights in self.images)
+
+    def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
+        """(n, k) the derivative with respect to the ways, from that with respect to the weights, (n,)."""
+        return sum((factors * weights.slopes / self.reach**2)[:, None] * way for way, weights in self.images)
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}

@@ -49,24 +49,25 @@ class WallForce:
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         (arms, force), d = self._chosen(at), at.dimension
         torque_bar = bar[d:] if d == 3 else np.array([0.0, 0.0, bar[d]])
-        inside = self._inside(at)[:, None]
+        _, inside = self._placed(at)
         return {
             "positions": np.cross(_in_space(force), torque_bar)[:, :d],
-            "wall_force": np.where(inside, bar[:d] + np.cross(torque_bar, _in_space(arms))[:, :d], 0.0),
+            "wall_force": np.where(inside[:, None], bar[:d] + np.cross(torque_bar, _in_space(arms))[:, :d], 0.0),
         }
 
     def _chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
         """(n, d) the arms of the particles, and their forces, 0 outside of the region."""
         about = np.zeros(at.dimension) if self.about is None else in_dimension("about", self.about, at.dimension)
-        return at["positions"] - about, np.where(self._inside(at)[:, None], at["wall_force"], 0.0)
+        places, inside = self._placed(at)
+        return places - about, np.where(inside[:, None], at["wall_force"], 0.0)
 
-    def _inside(self, at: Reading) -> NDArray[Any]:
-        x, inside = at["positions"], np.ones(len(at["positions"]), dtype=bool)
-        if self.lower is not None:
-            inside &= (x >= in_dimension("lower", self.lower, at.dimension)).all(axis=1)
-        if self.upper is not None:
-            inside &= (x < in_dimension("upper", self.upper, at.dimension)).all(axis=1)
-        return inside
+    def _placed(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
+        """(n, d) the images of the particles that may be in the region [m], and whether they are (n,)."""
+        lower, upper = (
+            np.full(at.dimension, end) if values is None else in_dimension(what, values, at.dimension)
+            for what, values, end in (("lower", self.lower, -np.inf), ("upper", self.upper, np.inf))
+        )
+        return at.lattice.domain.within(at["positions"], lower, upper)
 
 
 def _in_space(vectors: NDArray[Any]) -> NDArray[Any]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import ACROSS, Reading, Weights, direction, in_dimension, point, positive
+from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, point, positive
 
 
 @fixed
@@ -34,20 +34,18 @@ class WaveGauge:
         return {"height": "m"}
 
     def value(self, at: Reading) -> NDArray[Any]:
-        _, radius, weights = self._around(at)
-        return np.array([self.floor + self._scale(at, radius) * weights.values.sum()])
+        return np.array([self.floor + self._scale(at) * self._around(at).weights.sum()])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        apart, radius, weights = self._around(at)
-        return {"positions": (bar[0] * self._scale(at, radius) * weights.slopes / radius**2)[:, None] * apart}
+        return {"positions": self._around(at).pulled(bar[0] * self._scale(at))}
 
-    def _scale(self, at: Reading, radius: float) -> float:
+    def _radius(self, at: Reading) -> float:
+        return 2.0 * at.lattice.support if self.radius is None else self.radius
+
+    def _scale(self, at: Reading) -> float:
         across = at.dimension - 1
-        return at.lattice.volume * ACROSS[across] / radius**across
+        return at.lattice.volume * ACROSS[across] / self._radius(at) ** across
 
-    def _around(self, at: Reading) -> tuple[NDArray[Any], float, Weights]:
-        """(n, d) the horizontal way from the place to the particles, and their weights."""
-        radius = 2.0 * at.lattice.support if self.radius is None else self.radius
-        apart = at["positions"] - in_dimension("position", self.position, at.dimension)
-        apart = apart - (apart @ self.up)[:, None] * self.up
-        return apart, radius, Weights.of(np.linalg.norm(apart, axis=1) / radius)
+    def _around(self, at: Reading) -> Seen:
+        """By the horizontal ways (n, d)."""
+        return Seen.of(at, self.position, self._radius(at), lambda way: way - (way @ self.up)[:, None] * self.up)
