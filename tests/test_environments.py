@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 import cortado
 import cortado.environments
 from cortado import InputError, Simulation
+from cortado.discretise.domain import Domain
 from cortado.environments.actuators import Position, Velocity
 from cortado.environments.catalogue import TASKS
 from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
@@ -401,3 +402,31 @@ def test_adjoints_of_terms_are_differences(carried, name):
         product = (bars[field] * dot).reshape(2, -1).sum(axis=1)
         assert np.allclose(product, difference, rtol=1e-7, atol=1e-9), field
     assert bars["positions"].any() != (name == "distance")
+
+
+def test_terms_see_fluid_that_has_gone_around_a_period(carried):
+    """Along both axes, as if the scene of the cup had a period: across its edge, and after laps."""
+    domain = Domain((-0.1, 0.0), (0.35, 0.25))
+    fields, generator = carried.state.numpy(2), np.random.default_rng(4)
+
+    def lapped(turns):
+        state = carried.state.copy()
+        state.set({"positions": fields["positions"] + turns * np.array(domain.lengths)})
+        return replace(carried, state=state, domain=domain)
+
+    turns = generator.integers(-2, 4, fields["positions"].shape)
+    x = lapped(turns).state.numpy(2)["positions"]
+    images = [x + np.array([i, j]) * domain.lengths for i in range(-6, 7) for j in range(-6, 7)]
+    apart = np.abs(np.stack([image[:, CHOSEN, None] - x[:, None, CHOSEN] for image in images])).sum(-1).min(axis=0)
+    lower, upper = np.array([0.2, 0.2]), np.array([0.28, 0.27])
+    squares = np.stack([((y - np.clip(y, lower, upper)) ** 2).sum(axis=-1) for y in images]).min(axis=0)
+    assert np.allclose(TERMS["spread"].values(lapped(turns)), apart.mean(axis=(1, 2)) / 2.0, rtol=1e-9)
+    share = Share(OneBox(tuple(lower), tuple(upper)), 0.01)
+    assert np.allclose(share.values(lapped(turns)), (1.0 / (1.0 + squares / 1e-4)).mean(axis=1), rtol=1e-9)
+    for term in (TERMS["share"], TERMS["spread"], share, TERMS["distance"]):
+        assert np.allclose(term.values(lapped(turns)), term.values(lapped(0)), rtol=1e-9)
+        bars = [carried.state.like() for _ in range(2)]
+        for bar, laps in zip(bars, (turns, 0), strict=True):
+            term.adjoint(lapped(laps), np.ones(2), bar)
+        for name, array in bars[0].numpy(2).items():
+            assert np.allclose(array, bars[1].numpy(2)[name], rtol=1e-7, atol=1e-9), name

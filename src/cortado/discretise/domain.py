@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -28,6 +28,12 @@ class Domain:
         """From arrays (d,) [m]."""
         axes = lengths > 0.0
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
+
+    def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
+        """Its lower ends [m], its lengths [m] and one over these [1/m], as vectors of Warp."""
+        rest = (0.0,) * (3 - len(self.lengths))
+        frequency = (1.0 / length if length else 0.0 for length in self.lengths)
+        return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
 
     def wrapped(self, points: Points) -> Points:
         """The images of points (..., d) [m] that are within the period; along other axes as they are."""
@@ -65,6 +71,10 @@ class Domain:
         way = way - np.rint(way @ inverse) @ steps
         most = np.floor(reach * np.linalg.norm(inverse, axis=0) + 0.5).astype(int)
         return [way + np.array(turns) @ steps for turns in product(*(range(-k, k + 1) for k in most))]
+
+
+WITHOUT_PERIODS = Domain((), ())
+"""Nothing repeats."""
 
 
 def _independent(axes: Points, lengths: Points) -> Points:

@@ -14,7 +14,8 @@ FAR = wp.constant(1.0e30)
 
 @dataclass(frozen=True)
 class EnvironmentKernels:
-    """``per`` is the number of particles of a scene, ``factor`` (scenes,) what a derivative is multiplied by."""
+    """``per`` is the number of particles of a scene, ``factor`` (scenes,) what a derivative is multiplied by; the
+    ``period`` begins at ``origin`` [m], and is 0 along axes without one, as its ``frequency`` [1/m]."""
 
     sample: Any
     """Positions and velocities of some particles."""
@@ -23,7 +24,8 @@ class EnvironmentKernels:
     solid in the plane."""
     share_adjoint: Any
     apart: Any
-    """For each of some particles, its distances to all of them, component by component, added up."""
+    """For each of some particles, its distances to the nearest images of all of them, component by component, added
+    up."""
     apart_adjoint: Any
     missed: Any
     """Squared distance of a particle to a target of its own, times a weight; targets change from step to step."""
@@ -36,9 +38,21 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
     real, vector = precision.real, precision.vector
     module = kernel_module(f"environments_{precision.name}")
 
+    @wp.func
+    def rounded(t: vector):
+        return vector(wp.round(t[0]), wp.round(t[1]), wp.round(t[2]))
+
+    @wp.func
+    def shortest(r: vector, period: vector, frequency: vector):
+        """The way to the nearest image."""
+        return r - wp.cw_mul(rounded(wp.cw_mul(r, frequency)), period)
+
     @wp.kernel(module=module, enable_backward=False)
     def sample(
         per: int,
+        origin: vector,
+        period: vector,
+        frequency: vector,
         chosen: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -47,7 +61,8 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
     ):
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
-        seen[b, p, 0, axis] = wp.float32(x[i][axis])
+        lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
+        seen[b, p, 0, axis] = wp.float32(x[i][axis] - lap * period[axis])
         seen[b, p, 1, axis] = wp.float32(v[i][axis])
 
     @wp.func
@@ -56,20 +71,35 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         return vector(c * r[0] - s * r[1], s * r[0] + c * r[1], r[2])
 
     @wp.func
-    def outside(y: vector, b: int, lower: wp.array2d(dtype=vector), upper: wp.array2d(dtype=vector)):
-        """From the nearest point of the nearest box to y."""
-        found, least = vector(), real(FAR)
+    def outside(
+        r: vector,
+        angle: real,
+        period: vector,
+        frequency: vector,
+        b: int,
+        lower: wp.array2d(dtype=vector),
+        upper: wp.array2d(dtype=vector),
+    ):
+        """From where boxes are fixed to the image of a particle that is nearest to one, in their frame, and to it from
+        the nearest point of the nearest box."""
+        place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
+            middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
+            lap = wp.cw_mul(rounded(wp.cw_mul(r - middle, frequency)), period)
+            y = turned(r - lap, -angle)
             e = y - wp.min(wp.max(y, lower[b, k]), upper[b, k])
             if wp.dot(e, e) < least:
+                place = y
                 found = e
                 least = wp.dot(e, e)
-        return found
+        return place, found
 
     @wp.kernel(module=module, enable_backward=False)
     def share(
         per: int,
         width: real,
+        period: vector,
+        frequency: vector,
         x: wp.array(dtype=vector),
         place: wp.array(dtype=vector),
         turn: wp.array(dtype=real),
@@ -80,13 +110,16 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
     ):
         i = wp.tid()
         b = i // per
-        e = outside(turned(x[i] - place[b], -turn[b]), b, lower, upper) / width
+        _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
+        e = way / width
         value[i] = wp.float64(real(1.0) / (real(1.0) + wp.dot(e, e)))
 
     @wp.kernel(module=module, enable_backward=False)
     def share_adjoint(
         per: int,
         width: real,
+        period: vector,
+        frequency: vector,
         factor: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         place: wp.array(dtype=vector),
@@ -100,8 +133,7 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
     ):
         i = wp.tid()
         b = i // per
-        y = turned(x[i] - place[b], -turn[b])
-        e = outside(y, b, lower, upper)
+        y, e = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
         s = real(1.0) / (real(1.0) + wp.dot(e, e) / (width * width))
         g = -real(2.0) * factor[b] * s * s / (width * width) * e
         x_bar[i] += turned(g, turn[b])
@@ -111,6 +143,8 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
     @wp.kernel(module=module, enable_backward=False)
     def apart(
         per: int,
+        period: vector,
+        frequency: vector,
         chosen: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
         # out
@@ -119,13 +153,15 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
-            r = own - x[b * per + chosen[q]]
+            r = shortest(own - x[b * per + chosen[q]], period, frequency)
             total += wp.float64(wp.abs(r[0]) + wp.abs(r[1]) + wp.abs(r[2]))
         value[b, p] = total
 
     @wp.kernel(module=module, enable_backward=False)
     def apart_adjoint(
         per: int,
+        period: vector,
+        frequency: vector,
         factor: wp.array(dtype=real),
         chosen: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
@@ -136,7 +172,7 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         i = b * per + chosen[p]
         total = vector()
         for q in range(chosen.shape[0]):
-            r = x[i] - x[b * per + chosen[q]]
+            r = shortest(x[i] - x[b * per + chosen[q]], period, frequency)
             for axis in range(3):
                 if r[axis] > real(0.0):
                     total[axis] += real(1.0)

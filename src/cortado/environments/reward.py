@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.threads import WARP
+from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.environments.terms import StepEnd, Term
 from cortado.losses.batch import SnapshotBatch
 from cortado.losses.loss import Snapshot
@@ -19,6 +20,12 @@ class Reward:
 
     terms: tuple[tuple[float, Term], ...]
     constant: float = 0.0
+    domain: Domain = WITHOUT_PERIODS
+    """Along which axes the scene repeats."""
+
+    def at(self, state: State, goal: NDArray, step: NDArray) -> StepEnd:
+        """What it is a function of: the states of all scenes, with ``goal`` and ``step`` as of `StepEnd`."""
+        return StepEnd(state, goal, step, self.domain)
 
     @WARP
     def values(self, at: StepEnd) -> NDArray:
@@ -69,4 +76,4 @@ class MinusReward:
     def _at(self, end: Any) -> StepEnd:
         scenes = end.state.batch or 1
         goal = np.broadcast_to(self.goal, (scenes, self.goal.shape[1]))
-        return StepEnd(end.state, goal, np.full(scenes, self.step))
+        return self.reward.at(end.state, goal, np.full(scenes, self.step))

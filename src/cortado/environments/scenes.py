@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -14,7 +14,6 @@ from cortado.environments.actuators import split
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.sensing import checked_sensors, readings
 from cortado.environments.task import JITTER, Task
-from cortado.environments.terms import StepEnd
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
@@ -56,7 +55,8 @@ class Scenes:
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
         self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
-        self.reward, self._stepper = task.reward(self.simulation), Stepper(self.simulation, task.substeps)
+        self._domain, self._stepper = self.simulation.lattice.domain, Stepper(self.simulation, task.substeps)
+        self.reward = replace(task.reward(self.simulation), domain=self._domain)
         self._first = self.simulation.on_device()
         n, free = self.simulation.particles, self.simulation.free_particles or self.simulation.particles
         if not isinstance(seen, int) or not 0 <= seen <= n:
@@ -114,7 +114,7 @@ class Scenes:
         """Step all scenes with actions (scenes, a) from -1 to 1; returns the rewards (scenes,), and what happened to
         scenes that diverged, by their number. Such a scene has to begin anew before the next step."""
         self.advance(actions)
-        rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number))
+        rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
         for b, error in self._stepper.rollout.lost.items():
             lost[b] = f"The episode ended in its step {self.step_number[b]}: {error}"
@@ -171,7 +171,8 @@ class Scenes:
         chosen = wp.array(self._seen, dtype=wp.int32, device=x.device)
         threads, kernel = (*shape[:2], dimension), environment_kernels(self.simulation.precision).sample
         own = {"per": self.simulation.particles, "chosen": chosen, "x": x, "v": state.velocities, "seen": seen}
-        launch(kernel, threads, x.device, **own)
+        period = zip(("origin", "period", "frequency"), self._domain.vectors(x.dtype), strict=True)
+        launch(kernel, threads, x.device, **dict(period), **own)
         return seen.numpy()
 
     def _read(self, state: State) -> dict[str, NDArray]:
@@ -187,4 +188,5 @@ class Scenes:
         fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
         place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
         rate = state[angular_velocity_name(name)].numpy()[:, None]
+        place = self._domain.wrapped(place)
         return np.concatenate([place, axis + [1.0, 0.0], velocity, rate], axis=1)

@@ -10,6 +10,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import add, launch, sum_of
+from cortado.discretise.domain import WITHOUT_PERIODS, Domain
+from cortado.discretise.pairs import apart
 from cortado.environments.kernels import EnvironmentKernels, environment_kernels
 from cortado.losses.loss import precision_of
 from cortado.particles.arrays import padded, to_device
@@ -27,6 +29,8 @@ class StepEnd:
     """(scenes, g) what each scene is to reach."""
     step: NDArray
     """(scenes,) which step of its episode it is, counted from 1."""
+    domain: Domain = WITHOUT_PERIODS
+    """Along which axes the scene repeats."""
 
     @property
     def scenes(self) -> int:
@@ -37,6 +41,12 @@ class StepEnd:
     def per(self) -> int:
         """Particles of a scene."""
         return len(self.state.positions) // self.scenes
+
+    @property
+    def period(self) -> dict[str, Any]:
+        """``period`` and ``frequency``, as kernels take them."""
+        _, period, frequency = self.domain.vectors(precision_of(self.state).vector)
+        return {"period": period, "frequency": frequency}
 
 
 class Term(Protocol):
@@ -95,8 +105,9 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """The share of the fluid that is in some boxes, each particle counted by 1 / (1 + e^2 / w^2), where e is its
-    distance to the nearest box: 1 within, a half at the distance w, so that there is a gradient everywhere."""
+    """The share of the fluid that is in some boxes, each particle counted by 1 / (1 + e^2 / w^2), where e is the
+    distance of its nearest image to the nearest box: 1 within, a half at the distance w, so that there is a gradient
+    everywhere."""
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
         """``width`` w [m]; ``solid``: on whose middle boxes are placed, and with which they turn, in the plane."""
@@ -124,12 +135,13 @@ class Share(OverParticles):
             fixed = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
         else:
             fixed = at.state[position_name(self._solid)], at.state[turn_name(self._solid)]
-        found = {"per": at.per, "width": self._width, "lower": lower, "upper": upper}
+        found = {"per": at.per, "width": self._width, "lower": lower, "upper": upper, **at.period}
         return {**found, "place": fixed[0], "turn": fixed[1]}
 
 
 class Spread(OverParticles):
-    """The mean distance of all pairs of some particles, component by component, |dx| + |dy|, over ``everywhere``."""
+    """The mean distance of all pairs of some particles, component by component, |dx| + |dy|, over ``everywhere``;
+    along a periodic axis to the nearest image."""
 
     def __init__(self, chosen: NDArray, everywhere: float):
         """``chosen`` (m,) numbers of particles; ``everywhere`` [m]."""
@@ -148,11 +160,14 @@ class Spread(OverParticles):
     def _launch(self, kernel: Any, at: StepEnd, **arguments: Any) -> None:
         x = at.state.positions
         chosen = self._kept("chosen", at, lambda: wp.array(self._chosen, dtype=wp.int32, device=x.device))
-        launch(kernel, (at.scenes, len(chosen)), x.device, per=at.per, chosen=chosen, x=x, **arguments)
+        launch(kernel, (at.scenes, len(chosen)), x.device, per=at.per, chosen=chosen, x=x, **at.period, **arguments)
 
 
 class Missed(OverParticles):
-    """The squared distances of particles to targets that change from step to step, each times a weight, added up."""
+    """The squared distances of particles to targets that change from step to step, each times a weight, added up.
+
+    Targets go on beyond the end of a period, as positions do: a lap too many is a distance.
+    """
 
     def __init__(self, targets: NDArray, weights: NDArray):
         """``targets`` (steps, n, d) [m], those of step k, counted from 1, at k - 1; ``weights`` (steps, n)."""
@@ -181,13 +196,10 @@ class Distance:
     solid: str
 
     def values(self, at: StepEnd) -> NDArray:
-        return np.abs(self._miss(at))
+        return np.abs(_miss(at, self.solid))
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        _add(bar, position_name(self.solid), factor[:, None] * np.sign(self._miss(at))[:, None] * [1.0, 0.0])
-
-    def _miss(self, at: StepEnd) -> NDArray:
-        return _numbers(at.state, position_name(self.solid))[:, 0] - at.goal[:, 0]
+        _add(bar, position_name(self.solid), factor[:, None] * np.sign(_miss(at, self.solid))[:, None] * [1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -201,10 +213,10 @@ class Pose:
 
     def values(self, at: StepEnd) -> NDArray:
         turned = sum(_numbers(at.state, name)[:, axis] for axis, name in self._axes)
-        return (self._miss(at) / self.length) ** 2 - turned
+        return (_miss(at, self.solid) / self.length) ** 2 - turned
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        slopes = (2.0 / self.length**2 * factor * self._miss(at))[:, None]
+        slopes = (2.0 / self.length**2 * factor * _miss(at, self.solid))[:, None]
         _add(bar, position_name(self.solid), slopes * [1.0, 0.0])
         for axis, name in self._axes:
             _add(bar, name, -factor[:, None] * np.eye(2)[axis])
@@ -214,8 +226,10 @@ class Pose:
         """Fields of how far the ends of its axes have moved, of which these components are cos angle - 1."""
         return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
 
-    def _miss(self, at: StepEnd) -> NDArray:
-        return _numbers(at.state, position_name(self.solid))[:, 0] - at.goal[:, 0]
+
+def _miss(at: StepEnd, solid: str) -> NDArray:
+    """(scenes,) from the goal to the middle of a solid along the first axis, the shorter way around a period [m]."""
+    return apart(_numbers(at.state, position_name(solid))[:, :1] - at.goal[:, :1], at.domain.lengths[:1])[:, 0]
 
 
 def _kernels(at: StepEnd) -> EnvironmentKernels:
