@@ -14,8 +14,10 @@ from cortado import ComputationError, InputError, Trajectory
 from cortado.pictures.scale import Scale
 from cortado.runs.exports import by_vtk
 from cortado.runs.exports.export import FORMATS
+from cortado.runs.exports.exported import Exported
 from cortado.runs.exports.whole_frames import WholeFrames
 from cortado.runs.run_folder import RunFolder
+from cortado.runs.shown_run import ShownRun
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
 from full_disk import largest_file
@@ -389,3 +391,25 @@ def test_a_full_disk_is_a_sentence(to, tmp_path, monkeypatch):
     ):
         trajectory()[:1].export(tmp_path / "out", to)
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_what_has_gone_around_a_period_is_shown_within_it():
+    """Particles, the surface, solids, the room of a picture, and the camera that follows a solid."""
+    tables = {**scene().model_dump(), "picture": {"camera_path": {"kind": "follow", "solid": "my rotor"}}}
+    tables["container"] = {**tables["container"], "periodic": [True, False, False]}
+    made, along = scene_from_dict(tables), np.array([1.0, 0.0, 0.0])
+    own, turns = replace(trajectory(), scene=made), np.random.default_rng(0).integers(-2, 4, (len(lattice()), 1))
+    motion = own.solids["my rotor"]
+    moved = SolidMotions({"my rotor": SolidMotion(motion.positions - 2.0 * along, motion.rotations)})
+    lapped = replace(own, positions=own.positions + np.float32(turns * along), solids=moved)
+    frames = [list(Exported(run, made).frames()) for run in (own, lapped)]
+    for first, second in zip(*frames, strict=True):
+        np.testing.assert_allclose(second.positions, first.positions, atol=1e-6)
+        np.testing.assert_allclose(second.poses["my rotor"].position, first.poses["my rotor"].position, atol=1e-9)
+        ends = [[one.surface.points.min(axis=0), one.surface.points.max(axis=0)] for one in (first, second)]
+        np.testing.assert_allclose(ends[1], ends[0], atol=1e-3)
+    first, second = (ShownRun(made, run) for run in (own, lapped))
+    for run in (first, second):
+        vars(run)["_motions"] = run.trajectory.solids
+    np.testing.assert_allclose(second.stage.ends, first.stage.ends, atol=1e-6)
+    np.testing.assert_allclose(second._view(2, second.stage).eye, first._view(2, first.stage).eye, atol=1e-6)

@@ -25,6 +25,7 @@ from cortado.optimisation.fitting.noise import (
 )
 from cortado.optimisation.fitting.observation import Frames
 from cortado.sensors import PressureProbe, WallForce, WaveGauge
+from scenes import plane
 
 STEPS, TIME_STEP = 12, 0.005
 TRUE = 2.0
@@ -389,3 +390,15 @@ def test_a_background_that_stays_tells_how_large_the_noise_is():
     assert still == pytest.approx(0.01, rel=0.2) and moving > 2.0 * TOO_LARGE_IN_MOTION * still
     assert still_and_moving(moves[:, 30:], noise[:, 30:]) == (np.inf, 0.0)  # too few that stay
     assert still_and_moving(moves, 1e-9 * noise)[0] == pytest.approx(0.002)  # rounding of what was measured
+
+
+def test_a_tracer_at_the_edge_of_a_period_swims_with_the_fluid_on_both_sides():
+    made = plane(
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.4], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "periodic": [True, False]},
+    )
+    channel = cortado.Simulation(made)
+    for edge in (0.0, 0.7, -1.4):
+        tracks = measured.Tracks(channel, [[edge, 0.2]], TIMES, np.zeros((4, 1, 2)))
+        moved = channel.positions + 0.1 * np.outer(channel.positions[:, 0] > 0.35, [1.0, 0.0])
+        assert tracks.value(SimpleNamespace(positions=moved), {}) == pytest.approx([edge + 0.05, 0.2])

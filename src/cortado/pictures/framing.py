@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import union
 
@@ -18,12 +19,12 @@ ENOUGH = 1_000_000
 """Positions, of all particles in all frames, that tell where the fluid comes to."""
 
 
-def thinned(positions: Points | Sequence[Points]) -> list[Points]:
+def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
     """The states (m, d) [m] that say where the fluid comes to, of positions (n, d) or (frames, n, d) [m]: all of them,
-    with `ENOUGH` positions together if there are more."""
+    with `ENOUGH` positions together if there are more, as their images within the period of a domain."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
-    return [state[k % min(stride, len(state) or 1) :: stride] for k, state in enumerate(states)]
+    return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:

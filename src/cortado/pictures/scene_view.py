@@ -80,7 +80,8 @@ def _cup(container: CylinderContainer) -> Points:
 
 def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points, stride: int) -> Cloud:
     """Of every so many particles one."""
-    positions = np.stack([state.positions[::stride] for state in states]) @ turn.T
+    domain = scene.container.domain(scene.dimension)
+    positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
     particles = positions.shape[1]
     if len(scene.phase) == 1:

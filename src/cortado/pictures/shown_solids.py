@@ -57,12 +57,13 @@ class ShownSolid:
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Those of a scene, where its tables have them, with the images that are a period away and reach into the
-    container."""
-    found = []
+    """Those of a scene, where its tables have them, of those that went on beyond the end of a period the images within
+    it; and behind them the images that are a period away and reach into the container."""
+    found, domain = [], scene.container.domain(scene.dimension)
     for table in scene.solid:
         shape, middle = table.shape_about()
         position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
+        position = domain.wrapped(position)
         found.append(ShownSolid(table.name, shape, position, table.turn(scene.dimension), table.finish, is_tank))
     ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
     if ends is None or not lengths.any():

@@ -67,7 +67,8 @@ class Stage:
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
         """The stage of a scene in 3-D, the fluid of which is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` as of
         `painter`."""
-        states, picture, ends = thinned(positions), scene.picture or Picture(), scene.container.extent()
+        states, picture = thinned(positions, scene.container.domain(3)), scene.picture or Picture()
+        ends = scene.container.extent()
         scenes = [scene, *poses]
         lower, upper = fluid_extent(states, extents_of_solids(scenes) if ends is None else [ends])
         frame = upright(np.asarray(scene.forces.gravity))

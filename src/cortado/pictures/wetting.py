@@ -29,9 +29,10 @@ def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
     """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3) and mass fractions (n, phases), even
-    ones if left out."""
+    ones if left out. Along a periodic axis they are where their images within the period are."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
-    found = Particles.on(launch.device, np.subtract(positions, stage.origin), colours, media)
+    places = stage.container.domain(3).wrapped(positions)
+    found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
     launch(turn, len(found), frame=wp.mat33(*stage.frame.ravel()), places=found.places)
     return found
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
+from cortado.discretise.domain import WITHOUT_PERIODS
 from cortado.errors import InputError, shown
 from cortado.pictures.film import Film
 from cortado.pictures.notebook import as_text, with_view
@@ -71,13 +72,15 @@ class Showing:
         own = cast("Trajectory", self)
         if not len(own):
             return as_text(repr(own))
+        dimension = own.positions.shape[2]
+        domain = WITHOUT_PERIODS if own.scene is None else own.scene.container.domain(dimension)
         shown = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
         titles = [f"t = {frame.time:.4g} s" for frame in shown]
         speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
-        sets, label = [frame.positions for frame in shown], "speed [m/s]"
-        chosen, stride = thinned(len(own), own.particles, 2 * own.positions.shape[2] + 1, IN_A_NOTEBOOK)
+        sets, label = [domain.wrapped(frame.positions) for frame in shown], "speed [m/s]"
+        chosen, stride = thinned(len(own), own.particles, 2 * dimension + 1, IN_A_NOTEBOOK)
         thin = [array[chosen, ::stride] for array in (own.positions, own.velocities)]
-        cloud = Cloud("run", thin[0], np.linalg.norm(thin[1], axis=2))
+        cloud = Cloud("run", domain.wrapped(thin[0]), np.linalg.norm(thin[1], axis=2))
         view = particle_view([cloud], own.times[chosen], _spacing(own.positions[0]), stride=stride)
         return with_view(own, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 

@@ -96,5 +96,7 @@ class ShownRun:
     def _moment(self, k: int) -> Moment:
         places = {table.name: table.middle() for table in self.scene.solid}
         places |= {name: motion.positions[k] for name, motion in self._motions.items()}
+        domain = self.scene.container.domain(self.scene.dimension)
+        places = {name: domain.wrapped(place) for name, place in places.items()}
         up = upright(np.asarray(self.scene.forces.gravity))[1]
         return Moment(k / max(len(self.trajectory) - 1, 1), float(self.trajectory.times[k]), up, places)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from cortado.discretise.domain import Domain
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.primitives import Box, HalfSpace, Revolved
@@ -79,6 +80,10 @@ class Container(Table):
     def periods(self, dimension: int) -> tuple[Points, Points]:
         """Where the period begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
         return np.zeros(dimension), np.zeros(dimension)
+
+    def domain(self, dimension: int) -> Domain:
+        """The same as one object."""
+        return Domain.of(*self.periods(dimension))
 
 
 class NoContainer(Container):

@@ -54,11 +54,8 @@ class Lattice:
     """Along which axes it repeats."""
 
     @classmethod
-    def of(
-        cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, lower: Points, lengths: Points
-    ) -> "Lattice":
-        """Those of a kernel with a support radius [m] on a lattice with a spacing [m], and with periods that begin
-        somewhere and have lengths (d,) [m], 0 along axes without one."""
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, domain: Domain) -> "Lattice":
+        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
         return cls(
             support=support,
             normalisation=kernel.normalisation(dimension, support),
@@ -68,7 +65,7 @@ class Lattice:
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
             response=wall_response(kernel, spacing, support, dimension),
             laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),
-            domain=Domain.of(lower, lengths),
+            domain=domain,
         )
 
 
@@ -102,7 +99,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     layers = wall_layers(kernel, spacing, support, dimension)
-    lattice = Lattice.of(kernel, spacing, support, dimension, *period(scene))
+    lattice = Lattice.of(kernel, spacing, support, dimension, scene.container.domain(dimension))
     fluid = fluid_particles(scene)
     at_rest = RestLattice(kernel, spacing, support)
     walls = walls_of(scene, layers, at_rest)

@@ -1,7 +1,7 @@
 """A window in the browser with particles, the container around them, and what they are coloured by."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any
 
@@ -98,8 +98,9 @@ class Window:
         self._guarded.close()
 
     def show(self, shown: Shown) -> None:
-        """Draw particles instead of those before."""
-        self._shown = shown
+        """Draw particles instead of those before, along a periodic axis within the period."""
+        domain = self.scene.container.domain(self.scene.dimension)
+        self._shown = replace(shown, positions=domain.wrapped(shown.positions))
         self._draw()
 
     def place_solids(self, scene: Scene) -> None:

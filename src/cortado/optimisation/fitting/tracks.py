@@ -8,6 +8,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from cortado.arrays import as_numbers
+from cortado.discretise.pairs import wrapped
 from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.losses import Snapshot
@@ -22,7 +23,9 @@ class Tracks:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
-    with the weights of Wendland (1995) at the start, which add up to 1 within the support radius.
+    with the weights of Wendland (1995) at the start, which add up to 1 within the support radius. Along a periodic axis
+    images of particles count like themselves at the start, and paths go on beyond the end of the period: a tracer that
+    has gone around once is a period further.
     """
 
     unit = "m"
@@ -40,9 +43,13 @@ class Tracks:
             raise InputError(f"positions has shape {places.shape}, but must be (frames, {tracers}, {d}).")
         own = Measurement.of(times, places.reshape(len(places), -1), noise)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
-        x = simulation.positions
-        support = simulation.scene.discretisation.support_radius
-        near = cKDTree(begun).sparse_distance_matrix(cKDTree(x), support, output_type="coo_matrix")
+        x, domain = simulation.positions, simulation.lattice.domain
+        support, period = simulation.scene.discretisation.support_radius, np.array(domain.lengths)
+        some, others = (
+            cKDTree(wrapped(points - np.array(domain.lower), period), boxsize=period if period.any() else None)
+            for points in (begun, x)
+        )
+        near = some.sparse_distance_matrix(others, support, output_type="coo_matrix")
         w = csr_array((Weights.of(near.data / support).values, (near.row, near.col)), shape=(tracers, len(x)))
         sums = np.asarray(w.sum(axis=1)).ravel()
         if not (sums > 0.0).all():

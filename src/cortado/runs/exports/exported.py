@@ -84,7 +84,7 @@ class ExportedFrame:
     time: float
     """[s]"""
     positions: Points
-    """(n, 3) of the particles [m]"""
+    """(n, 3) of the particles [m], along a periodic axis within the period"""
     velocities: Points
     """(n, 3) [m/s]"""
     colours: Points
@@ -134,7 +134,8 @@ class Exported:
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
         """A state near one that was recorded, with the solids where they are in a frame of their motion."""
-        positions, velocities = in_space(frame.positions), in_space(frame.velocities)
+        within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions)
+        positions, velocities = in_space(within), in_space(frame.velocities)
         colours = colours_of(self.scene, frame.mass_fractions, len(positions))
         if self._scale is not None and self._values is not None:
             colours = self._scale.colours(self._values[recorded])
