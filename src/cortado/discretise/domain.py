@@ -52,7 +52,7 @@ class Domain:
         lower, upper = np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
         images = np.where(lengths > 0.0, images, points)
-        return images, ((images >= lower) & (images < upper)).all(axis=1)
+        return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
         """The ways (n, k) from a place (d,) to all images of points (n, d) within a reach [m], as ``seen`` shows them:

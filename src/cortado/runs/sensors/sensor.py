@@ -76,11 +76,12 @@ class Seen:
     @property
     def weights(self) -> NDArray[Any]:
         """(n,) of particles, those of their images added up."""
-        return sum(weights.values for _, weights in self.images)
+        return np.asarray(sum(weights.values for _, weights in self.images))
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
         """(n, k) the derivative with respect to the ways, from that with respect to the weights, (n,)."""
-        return sum((factors * weights.slopes / self.reach**2)[:, None] * way for way, weights in self.images)
+        each = ((factors * weights.slopes / self.reach**2)[:, None] * way for way, weights in self.images)
+        return np.asarray(sum(each))
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
