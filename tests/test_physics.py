@@ -94,6 +94,19 @@ def test_lists_that_are_too_short_grow_and_nothing_changes():
     assert loss == again and gradient["gravity"].tobytes() == same["gravity"].tobytes()
 
 
+def test_lists_that_become_too_short_in_the_midst_of_a_run_grow_and_nothing_changes():
+    """The steps that they were too short for had overwritten the state that they began with."""
+    simulation = Simulation(splash(), precision="float64")
+    whole, search = simulation.run(192, record_every=64), simulation.solver.search
+    search.forget_needed()
+    simulation.run(64)  # as many as the host looks at together; the fluid falls
+    room = search.needed
+    simulation.solver.resize(room)
+    again = simulation.run(192, record_every=64)
+    assert search.capacity > room + 4
+    np.testing.assert_array_equal(again.positions, whole.positions)
+
+
 def test_the_greatest_density_error_can_be_bounded_too():
     loose = Simulation(splash(minimum_iterations=2, maximum_iterations=60, density_tolerance=0.01))
     loose_rollout = loose.rollout(150)

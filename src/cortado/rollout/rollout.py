@@ -168,17 +168,18 @@ class Rollout:
         try:
             while step < self.steps and not ended:
                 last = min(step + min(len(self._chunk), self.step_sizes.longest_chunk), self.steps)
-                chunk = self._advance(state, step, last)
-                if self.solver.make_room():
+                self._buffer.assign(state)  # which may be one of the states that steps overwrite
+                chunk = self._advance(step, last)
+                while self.solver.make_room():
                     self._forget_stale_graphs()
                     self.solver.reset(step)
-                    continue
+                    chunk = self._advance(step, last)
                 end, ended = self.step_sizes.read(step, last)
                 chunk = chunk[: end - step]
                 lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
                 for b in lost.keys() - self.lost.keys():
                     state_then = chunk[lost[b].step - step]
-                    self.lost[b] = diverged(self.solver, b, lost[b], state, state_then, self.advice(b))
+                    self.lost[b] = diverged(self.solver, b, lost[b], self._buffer, state_then, self.advice(b))
                 stops = bool(lost) and self.solver.layout.batch is None
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
@@ -197,11 +198,11 @@ class Rollout:
             self._kept = self.evaluation
         return state
 
-    def _advance(self, state: State, first: int, last: int) -> list[State]:
-        """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
+    def _advance(self, first: int, last: int) -> list[State]:
+        """Take the steps from one to another, from the state in the buffer, and return the states after them, which the
+        next chunk overwrites."""
         self.solver.step_number.fill_(first)
         self.step_sizes.seek(first)
-        self._buffer.assign(state)
         length = last - first
         if is_new := length not in self._chunks:
             self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
