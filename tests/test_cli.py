@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
+from html import unescape
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -352,6 +354,28 @@ def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_c
     report = Path("found/report.html").read_text()
     assert ("The loss hardly fell. Over 100 steps" in report) is told
     assert ("The loss hardly fell: try an optimise.learning_rate that is 10 times as large" in report) is not told
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "told"),
+    [
+        ({"misled": True}, [], "The gradient disagrees with what steps of the search did. Over 20 steps the exact"),
+        ({"misled": True}, ["optimise.gradient.name=adjoint_viscosity"], "search did: set optimise.optimiser = "),
+        ({"stays": True}, [], "If the search is in a wrong valley, try another start, fewer steps, or set optimise."),
+        ({}, [], None),
+    ],
+)
+def test_a_search_that_cannot_be_trusted_says_what_to_try(cortado_command, monkeypatch, change, settings, told):
+    optimise = cortado.cli.commands.optimise.optimise
+    monkeypatch.setattr("cortado.cli.commands.optimise.optimise", lambda *a, **o: replace(optimise(*a, **o), **change))
+    options = [word for one in (*settings, "problem.steps=20") for word in ("--set", one)]
+    _, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *options)
+    report, found = Path("found/report.html").read_text(), json.loads(Path("found/result.json").read_text())
+    assert {name: found[name] for name in ("misled", "stays")} == {"misled": False, "stays": False, **change}
+    if told:
+        assert told in out and told in unescape(report) and 'optimise.optimiser = "line_search"' in out
+    else:
+        assert "line_search" not in out
 
 
 @pytest.mark.usefixtures("rendered")

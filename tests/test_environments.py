@@ -1,5 +1,7 @@
 """Environments of Gymnasium: its own checks, seeds, batches, rewards with derivatives, and bad uses in sentences."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import gymnasium
@@ -336,6 +338,18 @@ def test_pictures(environments):
     picture = env.render()
     env.render_mode = None
     assert picture.shape == (200, 320, 3) and picture.dtype == np.uint8 and picture.std() > 10.0
+
+
+def test_environments_stay_in_their_process_and_say_so_but_the_search_of_a_twin_is_pickled(environments):
+    env, vector = environments("Carry"), cortado.environments.make_vec("Carry", 2)
+    env.reset(seed=3)
+    for one, way in ((env, "gymnasium.make"), (env.unwrapped, "gymnasium.make"), (vector, "make_vec")):
+        for again in (pickle.dumps, copy.deepcopy):
+            with pytest.raises(InputError, match=rf"Env can be neither pickled nor copied, but {way} makes the same"):
+                again(one)
+    twin = env.unwrapped.twin(2)
+    search, point = pickle.loads(pickle.dumps(twin)).search, twin.named(np.zeros(twin.shape))
+    assert search.value(point) == twin.search.value(point)
 
 
 def test_gymnasium_is_optional():

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ import pytest
 import cortado
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
 from cortado.gradients import EnsembleMean, Estimate
+from cortado.losses import FinalPositions
 from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
+from cortado.problem import Problem
 from cortado.runs.run_folder import REPLAY_LOG
+from cortado.simulation import Simulation
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 from scenes import plane
 
@@ -162,6 +166,83 @@ def test_learning_rate_by_parameter():
     result = optimise(problem, start, GradientDescent({"fast": 0.5, "slow": 0.1}), 1)
     assert result.last_parameters["slow"] == pytest.approx(0.9)
     np.testing.assert_allclose(result.last_parameters["fast"], [0.5, 0.5])
+
+
+# Whether gradients keep what they promise
+
+
+MANY = (Adam(0.1), GradientDescent(0.1), LBFGS(scale=0.1), LineSearch(scale=0.5))
+
+
+class Promising(Quadratic):
+    """A bowl whose gradient is right times a factor that depends on where it is."""
+
+    def __init__(self, factor):
+        super().__init__({"x": np.array([1.0, -2.0])})
+        self.factor = factor
+
+    def value_and_gradient(self, parameters, gradient=None):
+        loss, found = super().value_and_gradient(parameters)
+        return loss, {"x": self.factor(parameters["x"]) * found["x"]}
+
+
+@pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize(
+    "factor", [lambda x: 1e4 * (2.0 + np.sin(1e5 * x.sum())), lambda x: -1.0], ids=["beyond its horizon", "wrong sign"]
+)
+def test_a_gradient_that_disagrees_with_what_steps_do_is_said(optimiser, factor):
+    if isinstance(optimiser, GradientDescent):
+        optimiser = GradientDescent(1e-3 if factor(np.zeros(2)) < 0.0 else 1e-5)
+    found = optimise(Promising(factor), {"x": np.zeros(2)}, optimiser, 12)
+    assert found.misled and not found.converged
+    assert "The gradient disagrees with what steps did" in found.message and "another start" in found.message
+    assert "converged after" not in found.message and "Try Adam" not in found.message
+    assert found.message in unescape(found._repr_html_())
+
+
+@pytest.mark.parametrize("optimiser", [*MANY, GradientDescent(1.9), LineSearch(scale=5.0)])
+@pytest.mark.parametrize("factor", [1e-9, 1.0, 1e9])
+def test_gradients_that_are_right_are_not_doubted(optimiser, factor):
+    if isinstance(optimiser, GradientDescent):
+        optimiser = GradientDescent(optimiser.learning_rate / factor)
+    found = optimise(Quadratic({"x": np.array([1.0, -2.0])}, factor), {"x": np.zeros(2)}, optimiser, 40)
+    assert not found.misled and "disagrees" not in found.message
+    if not isinstance(optimiser, GradientDescent):
+        assert not rosenbrock(optimiser, 60).misled
+
+
+def test_a_search_beyond_its_horizon_names_the_certificate_and_the_pair():
+    simulation = Simulation(plane(forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"}))
+    goal = simulation.run(250, {"gravity": [1.0, -9.0]}).positions[-1].astype(float)
+    start = {"gravity": np.array([-1.0, -9.81])}
+    found = optimise(Problem(simulation, 250, FinalPositions(goal)), start, LBFGS(scale=0.5), 2)
+    assert found.misled and not found.converged
+    for name in ("certify", "AdjointViscosity() and the optimiser LineSearch"):
+        assert name in found.message
+    near = optimise(Problem(simulation, 20, FinalPositions(simulation.positions)), start, "lbfgs", 4)
+    assert not near.misled and "certify" not in near.message
+
+
+@pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
+def test_a_loss_that_stays_may_be_in_a_wrong_valley(optimiser):
+    def valleys(parameters):
+        x = parameters["x"]
+        return (x**2 - 1.0) ** 2 + 0.2 * (x + 1.0), {"x": 4.0 * x * (x**2 - 1.0) + 0.2}
+
+    wrong, right = (optimise(valleys, {"x": x}, optimiser, 60) for x in (1.4, -1.5))
+    assert wrong.stays and "maybe in a wrong valley. Try another start" in wrong.message
+    assert ("LineSearch" in wrong.message) is not isinstance(optimiser, LineSearch)
+    assert not right.stays and "valley" not in right.message
+
+
+def test_lbfgs_converges_only_where_its_gradient_is_small():
+    def stairs(parameters):
+        return float(np.round(parameters["x"])) + 1.0, {"x": 1.0}
+
+    found = optimise(stairs, {"x": 0.2}, LBFGS(scale=1e-3), 20)
+    assert not found.converged and "the gradient is 1 of the first one" in found.message
+    small = optimise(Quadratic({"x": 2.0}), {"x": 1.0}, LBFGS(), 20)
+    assert "of the first one" in small.message and "LineSearch" not in small.message
 
 
 def test_the_best_is_not_the_last():

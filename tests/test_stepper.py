@@ -1,5 +1,6 @@
 """Steps as a function of a state: chained, they have the bits of one run."""
 
+import copy
 import pickle
 from dataclasses import replace
 from types import SimpleNamespace
@@ -340,6 +341,21 @@ def test_vjp_jvp_and_differences_agree_for_every_field_of_a_state(name):
     along = simulation.jvp(state, parameters, {}, {"time_step": 1.0}, steps=steps)
     forward = sum((np.asarray(end_bar[n]) * along[n]).sum() for n in along)
     assert forward == pytest.approx(float(parameter_bars["time_step"]), rel=1e-9)
+
+
+COPIES = [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))]
+
+
+@pytest.mark.parametrize("again", COPIES, ids=["copy", "deepcopy", "pickle"])
+def test_a_stepper_is_copied_as_what_it_is_made_from_and_what_is_on_the_device_says_that_it_stays(again):
+    simulation = Simulation(plane())
+    stepper, problem = simulation.stepper(2), Problem(simulation, 2, Weighted())
+    end, residual = stepper.step(simulation.state())
+    assert_same_state(again(stepper).step(again(simulation.state()))[0], end)
+    held = [residual, stepper.rollout, simulation.solver, simulation.initial, problem.forward_pass({})]
+    for one in [*held, *([] if again is copy.copy else [problem.end({})])]:
+        with pytest.raises(InputError, match=r"^An? \w+ can be neither pickled nor copied, but .*\.$"):
+            again(one)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
+from cortado.device.staying import Staying
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
@@ -21,11 +22,12 @@ from cortado.scene.parameters.values import Arrays
 
 
 @dataclass(frozen=True)
-class ProblemForwardPass:
+class ProblemForwardPass(Staying):
     """A forward run of a problem with its loss, and the ways back through it."""
 
     loss: Any
     """Of a batch (batch,)."""
+    instead = "but the problem can, and the parameters, with which it is run again"
     _residual: Residual
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]

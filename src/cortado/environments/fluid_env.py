@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import SEEN, Scenes
@@ -19,10 +20,11 @@ Observation = NDArray[np.float32]
 Info = dict[str, Any]
 
 
-class FluidEnv(gymnasium.Env[Observation, NDArray]):
+class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
     """One scene. `gymnasium.make("cortado/Carry-v0")` makes it; see `docs/environments.md`."""
 
     metadata = METADATA
+    instead = "but gymnasium.make makes the same one elsewhere, and reset with the same seed begins the same episode"
 
     def __init__(
         self,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_table, whole_number
+from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.fluid_env import Info, Observation
 from cortado.environments.gym import AutoresetMode, VectorEnv, batch_space, np_random
@@ -18,8 +19,10 @@ from cortado.errors import InputError, shown
 from cortado.runs.sensors.sensor import Sensor
 
 
-class FluidVectorEnv(VectorEnv):
+class FluidVectorEnv(Staying, VectorEnv):
     """Scenes of one task as a batch (`docs/batches.md`): each has the bits of the single environment with its seed."""
+
+    instead = "but make_vec makes the same one elsewhere, and reset with the same seed begins the same episodes"
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.gradients.left_out import Tally
 from cortado.gradients.points import FalliblePoint, evaluated
 from cortado.optimisation.differentiable import Optimisable, loss_and_gradient
+from cortado.optimisation.promises import Promises
 from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
 from cortado.optimisation.result import Parameters, Record
 
@@ -39,6 +40,8 @@ class Evaluator:
     """Made by the optimiser so far."""
     refused: int = 0
     """Evaluations so far of which there is no run, after which the search went on."""
+    promises: Promises = field(default_factory=Promises)
+    """Of the gradients so far, and whether the loss kept them."""
     logged: int = 0
     """Entries of the log that this run has come to: evaluations, and losses that were tried."""
 
@@ -92,6 +95,7 @@ class Evaluator:
             left_out=self.left_out,
         )
         self.history.append(record)
+        self.promises.note(evaluation)
         if self.on_iteration is not None:
             self.on_iteration(record)
         return evaluation.loss, evaluation.gradient.copy()

@@ -18,6 +18,10 @@ class FixedParameters:
         self._problem, self._fixed = problem, fixed
         self.simulation = _Simulation(problem, fixed["initial_positions"])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return FixedParameters, (self._problem, self._fixed)
+
     @property
     def fingerprint(self) -> str:
         """A text that identifies the problem; it does not tell the fixed values apart."""
@@ -51,5 +55,9 @@ class _Simulation:
     batch = None
 
     def __init__(self, problem: Problem, initial_positions: Any):
+        self._problem = problem
         self.scene, self.positions = problem.simulation.scene, initial_positions
         self.precision, self.known = problem.simulation.precision, problem.simulation.known
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Simulation, (self._problem, self.positions)

@@ -101,7 +101,8 @@ def optimise(
             updated=evaluator.count_update,
         )
         outcome = algorithm.minimise(search)
-    best = min(evaluator.history, key=lambda record: record.loss)
+    best, is_run = min(evaluator.history, key=lambda record: record.loss), hasattr(problem, "simulation")
+    doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run)
     return Result(
         parameters=_copied(best.parameters),
         loss=best.loss,
@@ -111,9 +112,11 @@ def optimise(
         evaluations=len(evaluator.history),
         refused=evaluator.refused,
         left_out=evaluator.left_out,
-        message=outcome.message + _without_runs_in_words(evaluator.refused, evaluator.left_out),
-        converged=outcome.converged,
-        problem=problem if hasattr(problem, "simulation") else None,
+        message=outcome.message + doubt.words + _without_runs_in_words(evaluator.refused, evaluator.left_out),
+        converged=outcome.converged and not doubt.misled,
+        misled=doubt.misled,
+        stays=doubt.stays,
+        problem=problem if is_run else None,
     )
 
 

@@ -26,6 +26,8 @@ from cortado.optimisation.search import (
     require_positive,
 )
 
+SMALL = 0.01
+"""Of the first gradient: where L-BFGS ends with more, it is at no optimum."""
 MOST_MEMORY = 1_000
 """Past updates that L-BFGS keeps; more are taken for a mistake, as some ten of them do."""
 
@@ -209,7 +211,9 @@ class LBFGS:
                 "maxfun": int(np.iinfo(np.int32).max),
             },
         )
-        return Outcome(physical(found.x), found.status == 0, _LBFGS_MESSAGES[found.status].format(found.nit))
+        left = _greatest_projected(search, physical(found.x), found.jac, np.ones_like(scale))
+        ended = _lbfgs_in_words(found.status, found.nit, left)
+        return Outcome(physical(found.x), found.status == 0 and left < SMALL, ended)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,12 +230,19 @@ class _Trial:
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
-_LBFGS_MESSAGES = {
-    0: "L-BFGS converged after {} iterations: the gradient is small or the loss has stopped falling.",
-    1: "L-BFGS made all its {} iterations without converging; more may lower the loss further.",
-    2: "L-BFGS stopped after {} iterations, because no step along its direction lowers the loss: either it "
-    "is at an optimum to rounding, or the loss is too rough for its gradient; then try Adam from here.",
-}
+def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
+    """How it ended, by scipy's status, and by the part of the first gradient that is left."""
+    share = f"the gradient is {left:.2g} of the first one"
+    if status == 1:
+        return f"L-BFGS made all its {iterations} iterations without converging: {share}. More may lower the loss."
+    if left < SMALL:
+        how = "converged" if status == 0 else "stopped at an optimum to rounding"
+        return f"L-BFGS {how} after {iterations} iterations: {share}."
+    why = "the loss has stopped falling" if status == 0 else "no step along its direction lowers the loss"
+    return (
+        f"L-BFGS stopped after {iterations} iterations, as {why}, but {share}: the loss is too rough for it, so try "
+        "LineSearch from here."
+    )
 
 
 def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:

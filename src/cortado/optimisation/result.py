@@ -54,12 +54,17 @@ class Result:
     message: str
     """How it ended, a sentence."""
     converged: bool
-    """Whether the optimiser's own test was met; Adam and gradient descent have none."""
+    """Whether the optimiser's own test was met, and the gradient agreed with what steps did; only L-BFGS has a test."""
     refused: int = 0
     """Evaluations of which there is no run, as it diverged or a parameter was out of its range, so that the steps to
     them were refused; they are not in the history."""
     left_out: int = 0
     """Runs that averages over ensembles left out, for the same reasons; of those that were not replayed."""
+    misled: bool = False
+    """Whether the gradient disagreed with what steps did, as beyond the horizon of `cortado.certify`, by which the
+    search cannot be trusted; `message` says what to try."""
+    stays: bool = False
+    """Whether the loss stayed at a good part of the first one, as in a wrong valley."""
     problem: Any = field(default=None, repr=False)
     """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
     and in a result that was pickled."""
@@ -77,4 +82,4 @@ class Result:
         from cortado.optimisation.result_page import result_page
 
         losses = [record.loss for record in self.history]
-        return result_page(self, self.problem, self.history[0].parameters, self.parameters, losses)
+        return result_page(self, self.message, self.problem, self.history[0].parameters, self.parameters, losses)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ MOST_NUMBERS = 6
 HEAD = ("parameter", "unit", "first guess", "found")
 
 
-def result_page(found: object, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any) -> str:
-    """HTML of the result of a search from a start to the best parameters, with all its losses. Of a `Problem`, or of
-    one in other coordinates, two runs are made to see their ends; there is no picture of runs that diverge."""
+def result_page(
+    found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
+) -> str:
+    """HTML of the result of a search from a start to the best parameters, with how it ended and all its losses. Of a
+    `Problem`, or of one in other coordinates, two runs are made to see their ends; there is no picture of runs that
+    diverge."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
@@ -31,7 +35,7 @@ def result_page(found: object, problem: Any, start: Mapping[str, Any], best: Map
     if is_ours:
         with suppress(CortadoError):  # the first guess may be a run that diverges
             parts.insert(0, picture(found, lambda path: _draw_ends(problem, [start, best], path)))
-    return as_words(found) + "".join(parts)
+    return as_words(found) + f"<p>{escape(message)}</p>" + "".join(parts)
 
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:

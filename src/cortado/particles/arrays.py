@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.device.staying import Staying
 from cortado.scene.parameters.known import argument
 
 
@@ -28,7 +29,7 @@ def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
     return view
 
 
-class Arrays:
+class Arrays(Staying):
     """Warp arrays by name."""
 
     def __init__(self, arrays: Mapping[str, wp.array]):

@@ -16,6 +16,7 @@ import numpy as np
 from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph, add
 from cortado.device.memory import require, step_parts, within
+from cortado.device.staying import Staying
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
@@ -56,8 +57,10 @@ class BackwardStep(Protocol):
         """Adjoints of the parameters, of all steps since `begin`."""
 
 
-class Rollout:
+class Rollout(Staying):
     """A number of steps of a solver from a first state, which can be repeated and differentiated."""
+
+    instead = "but the simulation that it is of can"
 
     @WARP
     def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.memory import require
+from cortado.device.staying import Staying
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError, shown, warn
 from cortado.particles.state import Parameters, State
@@ -33,7 +34,7 @@ class Steppable(Simulated, Protocol):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StepResidual:
+class StepResidual(Staying):
     """What `Stepper.step` leaves for `Stepper.vjp` and `Stepper.jvp`, whole: other steps may come in between."""
 
     evaluation: Residual
@@ -43,6 +44,7 @@ class StepResidual:
     """Those of them that are on the device."""
     place: HostStates
     """Where its states are, and the derivatives with respect to them."""
+    instead = "but the state before its steps and the parameters can, from which they are taken again"
 
     def __repr__(self) -> str:
         return (
@@ -62,6 +64,10 @@ class Stepper:
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
         """What takes the steps, with the parameters of the last ones."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return type(self), (self._simulation, self.rollout.steps)
 
     @property
     def turn(self) -> Turn:

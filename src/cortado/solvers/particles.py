@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
+from cortado.device.staying import Staying
 from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
 from cortado.errors import MissingDerivativeError
@@ -70,7 +71,7 @@ class ParticleSystem:
     """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
 
 
-class ParticleSolver:
+class ParticleSolver(Staying):
     """The steps of one set of particles on one device; their arrays are reused by every step.
 
     The methods that `Solver` has are explained there. A solver of this kind has `step`, `replay` and `write_state`

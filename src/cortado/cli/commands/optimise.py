@@ -10,7 +10,7 @@ import numpy as np
 from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.found import found_lines, found_rows, worst_in_words
 from cortado.cli.commands.optimise_report import asked, for_machines, sections
-from cortado.cli.commands.verdict import Verdict, found_in_words, judge
+from cortado.cli.commands.verdict import MOST_ERROR, Verdict, found_in_words, judge
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.folder_lock import locked
@@ -193,21 +193,29 @@ def _resumed(last: Record, iterations: int) -> str:
 
 
 def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
-    """What to try where a search came to next to nothing, and which of its bounds it ended on."""
+    """What to try where a search came to next to nothing, was misled, or may be in a wrong valley, and which of its
+    bounds it ended on."""
     met = [name for name, pair in made.bounds.items() if _on_bound(result.parameters[name], *pair)]
     found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
     task, steps = made.task, made.task.problem.steps
-    if verdict.reduction >= LITTLE:
-        return found
-    if steps < LONG or task.optimise.gradient.name != "exact":
+    hardly, is_exact = verdict.reduction < LITTLE, task.optimise.gradient.name == "exact"
+    search = 'optimise.optimiser = "line_search"'
+    if is_exact and (result.misled or (hardly and steps >= LONG)):
+        why = "The gradient disagrees with what steps of the search did." if result.misled else "The loss hardly fell."
+        return [
+            *found,
+            f"{why} Over {steps} steps the exact gradient may mean nothing: cortado gradients check says up to which "
+            f'step it is of use. Beyond it set optimise.gradient.name = "adjoint_viscosity" and {search}.',
+        ]
+    if result.misled:
+        return [*found, f"The gradient disagrees with what steps of the search did: set {search}, or begin elsewhere."]
+    if hardly:
         other = "small" if result.refused else "large, or as small"
         return [*found, f"The loss hardly fell: try an optimise.learning_rate that is 10 times as {other}."]
-    return [
-        *found,
-        f"The loss hardly fell. Over {steps} steps the exact gradient may mean nothing: cortado gradients check says "
-        'up to which step it is of use. Beyond it set optimise.gradient.name = "adjoint_viscosity" and '
-        'optimise.optimiser = "line_search".',
-    ]
+    if result.stays or max(verdict.errors.values(), default=0.0) > MOST_ERROR:
+        more = ", fewer steps" + (" or more frames" if made.renderer else "")
+        return [*found, f"If the search is in a wrong valley, try another start{more}, or set {search}."]
+    return found
 
 
 def _on_bound(value: Any, lower: Any, upper: Any) -> bool:

@@ -98,6 +98,8 @@ def for_machines(
         "knots": {name: one.for_machines() for name, one in knots.items()},
         "converged": result.converged,
         "message": result.message,
+        "misled": result.misled,
+        "stays": result.stays,
         "failures": verdict.failures,
     }
     return found if verdict.psnr is None else {**found, "psnr": verdict.psnr}
