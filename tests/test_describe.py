@@ -10,11 +10,13 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
+from cortado.cli.commands.describe import _masses
 from cortado.cli.commands.drawing_time import seconds_of_picture
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.cli.commands.run_length import RunLength
 from cortado.cli.commands.run_summary import Energy, RunSummary
 from cortado.discretise.calibration import SLACK
+from cortado.discretise.smoothing import KERNELS
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
@@ -49,6 +51,21 @@ def test_it_says_what_the_scene_has(capsys):
         and found["measured_steps"] >= 4
     )
     assert 0 < found["memory_bytes"] < found["gradient_memory_bytes"]
+
+
+def test_a_cubic_metre_of_water_is_a_tonne():
+    """With every kernel and support."""
+    for kernel in KERNELS:
+        for support in (1.2, 3.0):
+            cubes = [
+                "fluid.0.upper=[1,1]",
+                "fluid.0.lower=[0,0]",
+                "container.upper=[1,1]",
+                "container.lower=[0,0]",
+            ]
+            cut = ["discretisation.spacing=0.2", f"discretisation.kernel={kernel}", f"discretisation.support={support}"]
+            found = _masses(cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])))
+            assert sum(found.values()) == pytest.approx(1000.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +193,7 @@ def test_energies_are_those_of_the_particles(make):
     rollout = simulation.rollout(3)
     summary = RunSummary.of(simulation, rollout, rollout.forward(keep=False), 0.3)
     trajectory, scene = simulation.run(3), simulation.scene
-    masses = simulation.lattice.volume * trajectory.constants["reference_density"]
+    masses = simulation.lattice.cell * trajectory.constants["reference_density"]
     kinetic = 0.5 * (masses * (trajectory.velocities[-1] ** 2).sum(axis=1)).sum()
     assert summary.last.kinetic == pytest.approx(kinetic, rel=1e-12) and summary.first.kinetic < summary.last.kinetic
     lower, gravity = np.array(scene.container.extent()[0]), np.array(scene.forces.gravity)

@@ -145,7 +145,7 @@ def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
     positions = simulation.positions
     found = contained_liquid(stage_of(simulation.scene, positions), positions, np.ones_like(positions))
     mesh = mesh_of(found)
-    assert mesh.is_watertight and mesh.volume == pytest.approx(len(positions) * simulation.lattice.volume, rel=0.03)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(len(positions) * simulation.lattice.cell, rel=0.03)
     size = SPACING * np.array(shape)
     if container == "cylinder":
         np.testing.assert_allclose(np.linalg.norm(found.points[:, ::2], axis=1).max(), 0.5 * size[0], rtol=1e-5)

@@ -1,6 +1,7 @@
 """Sensors against what is known, and their derivatives."""
 
 import csv
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -8,10 +9,13 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
+from cortado.discretise.domain import Domain
+from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.series import SensorMatch
 from cortado.runs.sensors.sensor import value_of
+from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from finite_differences import distance
 from scenes import jet, plane, scene
@@ -123,6 +127,41 @@ def test_still_water_pushes_walls_and_probes_as_it_must():
     assert mean("probe", "pressure") == pytest.approx(1000.0 * 9.81 * 0.3, rel=0.03)
     assert mean("gauge", "height") == pytest.approx(0.5, rel=0.02)
     assert abs(mean("flow", "flow_rate")) < 1e-3
+
+
+@dataclass(frozen=True)
+class Basin:
+    """Half a metre of water that moves as a whole, as sensors see it."""
+
+    kernel: str
+    support: float
+    dimension: int
+    spacing: float = 0.05
+
+    @property
+    def lattice(self):
+        still = Domain((0.0,) * self.dimension, (0.0,) * self.dimension)
+        return Lattice.of(KERNELS[self.kernel], self.spacing, self.support * self.spacing, self.dimension, still)
+
+    def __getitem__(self, name):
+        counts = [40, 10, 40][: self.dimension]
+        x = self.spacing * (np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1) + 0.5)
+        x = x.reshape(-1, self.dimension)
+        moving = np.zeros_like(x)
+        moving[:, 0] = 2.0
+        return {"positions": x, "velocities": moving}[name]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("support", [1.2, 2.0, 3.0])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("place", [1.0, 1.013])
+def test_a_basin_is_as_deep_as_it_is_with_every_kernel(kernel, support, dimension, place):
+    basin, middle = Basin(kernel, support, dimension), [place, 0.2, 0.987][:dimension]
+    assert value_of(WaveGauge(middle), basin)[0] == pytest.approx(0.5, rel=1e-3)
+    across = 1.0 if dimension == 2 else 2.0
+    flow = value_of(FlowRate(middle, np.eye(dimension)[0]), basin)[0]
+    assert flow == pytest.approx(2.0 * 0.5 * across, rel=1e-3)
 
 
 def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():

@@ -73,7 +73,7 @@ class Renderer:
         Along an axis with a period (``periods`` (d,) [m], 0 without one) fluid is seen wherever an image of it is
         between ``lower`` and ``upper``.
 
-        ``volume`` is the rest volume of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
+        ``volume`` is that of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
         support radius. ``colours`` (phases, 3) are those of the phases where a picture is asked for without any.
         """
         start_warp()

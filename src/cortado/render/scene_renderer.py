@@ -59,7 +59,7 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
         upper,
         smoothing=simulation.smoothing,
         support=scene.discretisation.support_radius,
-        volume=simulation.lattice.volume,
+        volume=simulation.lattice.cell,
         particles=simulation.particles,
         phases=len(scene.phase),
         precision=simulation.precision,

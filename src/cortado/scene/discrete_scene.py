@@ -41,9 +41,9 @@ class Lattice:
     self_weight: float
     """W(0) [1 / m^d]."""
     volume: float
-    """Rest volume V_0 of a particle [m^d], with which the sums of the lattice give the rest density."""
+    """V_0 [m^d], with which the sums of the kernel over the lattice give the rest density; of sums of kernels alone."""
     cell: float
-    """Volume of a cell of the lattice [m^d]: the mass of a particle is the rest density times it."""
+    """Volume of a particle [m^d], a cell of the lattice: its mass is the rest density times it."""
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float

@@ -43,7 +43,7 @@ class WaveGaugeTable(SensorTable):
     floor: Length = 0.0
     """Where the fluid stands on [m], against gravity."""
     radius: Reach = None
-    """Radius of the column [m]; two support radii if left out."""
+    """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
 
 
 class FlowRateTable(SensorTable):
@@ -56,7 +56,8 @@ class FlowRateTable(SensorTable):
     normal: Vector[Annotated[float, quantity()]]
     """(d,) the direction in which the flow is positive."""
     reach: Reach = None
-    """Half of the thickness of the layer that counts [m]; two support radii if left out."""
+    """Half of the thickness of the layer that counts [m]; two support radii, but at least five spacings, if left
+    out."""
 
 
 class WallForceTable(SensorTable):

@@ -145,7 +145,7 @@ def _viscosity(scene: Scene) -> str:
 
 def _masses(simulation: Simulation) -> dict[str, float]:
     """By phase [kg]; in 2-D of a layer one metre thick."""
-    volumes = simulation.lattice.volume * simulation.mass_fractions.sum(axis=0)
+    volumes = simulation.lattice.cell * simulation.mass_fractions.sum(axis=0)
     phases = simulation.scene.phase
     return {phase.name: float(phase.rest_density * volume) for phase, volume in zip(phases, volumes, strict=True)}
 

@@ -35,7 +35,7 @@ class Energy:
     def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
         """Of a state, in the gravity of a step, counted from 0."""
         fields = state.numpy(simulation.dimension, only=["positions", "velocities", "reference_density"])
-        masses = simulation.lattice.volume * fields["reference_density"].astype(np.float64)
+        masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
         positions, velocities = (fields[name].astype(np.float64) for name in ("positions", "velocities"))
         gravity = rollout.parameters["gravity"].numpy()[0, step, : simulation.dimension].astype(np.float64)
         ends = simulation.scene.container.extent()

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, point, positive
+from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, point, positive, reach_of
 
 
 @fixed
@@ -16,12 +16,12 @@ class FlowRate:
 
     Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
 
-    where r_i is a particle's distance from the plane and V its volume at rest.
+    where r_i is a particle's distance from the plane and V its volume, spacing^d.
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):
         """``position`` (d,) of a point of the plane [m]; ``normal`` (d,); ``reach`` of the layer on both sides [m], two
-        support radii of the scene's smoothing kernel if left out."""
+        support radii of the scene's smoothing kernel, but at least five spacings, if left out."""
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
             raise InputError(
@@ -45,12 +45,9 @@ class FlowRate:
             "velocities": (scale * around.weights)[:, None] * self.normal,
         }
 
-    def _reach(self, at: Reading) -> float:
-        return 2.0 * at.lattice.support if self.reach is None else self.reach
-
     def _scale(self, at: Reading) -> float:
-        return at.lattice.volume * ACROSS[1] / self._reach(at)
+        return at.lattice.cell * ACROSS[1] / reach_of(self.reach, at)
 
     def _around(self, at: Reading) -> Seen:
         """By the distances (n, 1) from the plane along its normal."""
-        return Seen.of(at, self.position, self._reach(at), lambda way: (way @ self.normal)[:, None])
+        return Seen.of(at, self.position, reach_of(self.reach, at), lambda way: (way @ self.normal)[:, None])
