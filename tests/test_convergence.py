@@ -10,12 +10,31 @@ from bad_tasks import TINY_SCENE
 from cortado.optimisation.sweep.richardson import Extrapolation
 
 
-@pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("sizes", [[0.8, 0.4, 0.2, 0.1], [0.3, 0.2, 0.1], [0.1, 0.09, 0.07]])
 @pytest.mark.parametrize("scale", [1.0, -30.0])
 def test_a_power_of_the_size_is_found(order, sizes, scale):
     found = Extrapolation.of(sizes, [7.0 + scale * h**order for h in sizes])
     assert found.order == pytest.approx(order, rel=1e-6) and found.limit == pytest.approx(7.0, rel=1e-7)
+    if 0.5 < order < 2.0:
+        assert not found.flag and found.error == pytest.approx(1.25 * abs(scale) * sizes[-1] ** order)
+
+
+@pytest.mark.parametrize(("order", "taken"), [(4.0, 2.0), (0.1, 0.5)])
+def test_an_order_that_no_method_has_is_not_believed(order, taken):
+    """Of sizes that are halved twice: f_2 - f_1 is known, and the error is 3 times what the order taken says."""
+    sizes = [0.4, 0.2, 0.1]
+    found = Extrapolation.of(sizes, [7.0 + h**order for h in sizes])
+    away = (0.2**order - 0.1**order) / (2.0**taken - 1.0)
+    assert found.order == pytest.approx(order) and found.flag == f"the order is taken as {taken:g}"
+    assert found.error == pytest.approx(3.0 * away) and found.limit == pytest.approx(7.0 + 0.1**order - away)
+
+
+def test_the_example_of_celik_and_others():
+    """Their table 1, the second column: the length of reattachment, a recirculation on three grids."""
+    found = Extrapolation.of([1 / 4500**0.5, 1 / 8000**0.5, 1 / 18000**0.5], [5.863, 5.972, 6.063])
+    assert found.order == pytest.approx(1.53, abs=0.01) and found.limit == pytest.approx(6.1685, abs=2e-3)
+    assert found.error / 6.063 == pytest.approx(0.022, abs=5e-4) and not found.flag
 
 
 @pytest.mark.parametrize(
@@ -31,7 +50,9 @@ def test_a_power_of_the_size_is_found(order, sizes, scale):
 )
 def test_numbers_without_an_order_say_so(values, words):
     found = Extrapolation.of([0.4, 0.2, 0.1], values)
-    assert found.order is None and found.why == words
+    assert found.order is None and found.flag == words
+    differ = np.ptp(values)
+    assert found.error is None if np.isnan(differ) else found.error == pytest.approx(3.0 * differ)
 
 
 @pytest.fixture
@@ -55,8 +76,31 @@ def test_a_table_of_time_steps(cortado_command):
     table = json.loads(cortado_command("convergence", "runs/sweep", "--json")[1])
     assert table["solver.time_step"] == [0.002, 0.001, 0.0005]
     (height,) = [row for row in table["rows"] if row["name"] == "centre of mass, y"]
-    assert height["unit"] == "m" and 0.5 < height["order"] < 3.0
+    assert height["unit"] == "m" and 0.5 < height["order"] < 3.0 and height["error"] > 0.0
     assert f"{height['limit']:.6g}" in out
+
+
+@pytest.mark.usefixtures("scene")
+def test_a_number_of_ones_own_is_in_the_table(cortado_command, tmp_path):
+    (tmp_path / "own.py").write_text(
+        "def lowest(trajectory):\n    return trajectory.positions[-1, :, 1].min()\n\n\n"
+        "def bad(trajectory):\n    return trajectory.nothing\n\n\ndef rows(trajectory):\n    return [1.0, 2.0]\n"
+    )
+    (tmp_path / "broken.py").write_text("def lowest(:\n")
+    assert cortado_command("sweep", "scene.toml", "--set", "solver.time_step=0.002,0.001,0.0005", "--steps", 4)[0] == 0
+    code, out, err = cortado_command("convergence", "runs/sweep", "--quantity", "own.py:lowest")
+    assert (code, err) == (0, "") and any(line.startswith("lowest ") for line in out.splitlines())
+    for given, words in (
+        ("own.py", "must be FILE.py:FUNCTION"),
+        ("own.py:highest", "has no function highest"),
+        ("own.py:bad", "failed: AttributeError"),
+        ("own.py:rows", "must return a number"),
+        ("broken.py:lowest", "cannot be read: SyntaxError"),
+        ("none.py:lowest", "cannot be read: FileNotFoundError"),
+    ):
+        code, out, err = cortado_command("convergence", "runs/sweep", "--quantity", given)
+        assert (code, out) == (2, "") and words in err
+        assert_one_sentence(err.removesuffix("\n"))
 
 
 @pytest.mark.usefixtures("scene")

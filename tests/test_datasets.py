@@ -267,7 +267,7 @@ def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(
     ("change", "words"),
     [
         (("--out", "data.h5"), "--out is data.h5, but must be a folder"),
-        (("--runs", 2), "--runs is 2, but must be from 3 to 100,000"),
+        (("--runs", 2), "--runs is 2, but must be from 3 to 100,000: one to train and one to validate"),
         (("--set", "dataset.write_every=4"), "dataset.write_every is 4, but must be a divisor of steps, which is 6"),
         (
             ("--set", 'dataset.vary={"solver.time_step"=[0.001,0.002]}', "--set", "dataset.logarithmic=[]"),
@@ -289,9 +289,14 @@ def test_wrong_calls_are_sentences(file, change, words, cortado_command, quick):
 
 def test_a_folder_of_something_else_is_kept(file, tmp_path, cortado_command, quick):
     assert cortado_command("dataset", file, "--runs", 5, "--out", "data")[0] == 0
-    for change in (("--runs", 6), ("--runs", 5, "--set", "dataset.seed=1"), ("--runs", 5, "--precision", "float64")):
+    for change, words in (
+        (("--runs", 6), "(runs is 5, not 6); choose another --out, as a data set does not grow"),
+        (("--runs", 5, "--set", "dataset.seed=1"), "(dataset.seed is 0, not 1)"),
+        (("--runs", 5, "--precision", "float64"), "(precision is 'float32', not 'float64')"),
+        (("--runs", 5, "--set", "phase.0.rest_density=900.0"), "(scene.phase.0.rest_density is "),
+    ):
         code, _, err = cortado_command("dataset", file, *change, "--out", "data")
-        assert code == 2 and "holds a data set of another scene, table, number of runs, precision or version of" in err
+        assert code == 2 and f"data holds another data set {words}" in err
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").touch()
     code, _, err = cortado_command("dataset", file, "--out", "mine")

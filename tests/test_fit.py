@@ -199,6 +199,63 @@ def test_the_jacobian_is_the_limit_of_differences(experiment):
     assert all(np.array_equal(predicted[name], one) for name, one in experiment.predicted(at).items())
 
 
+def test_viscosity_acts_as_in_a_run_with_the_value_that_is_tried():
+    """A viscosity of 200 Pa s asks for implicit viscosity, one of 0.2 Pa s does not, whatever the scene has."""
+    times = TIME_STEP * np.arange(1.0, 5.0)
+    height = measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, np.ones((4, 1)), 2)
+    thick, thin = (
+        measured.Experiment(
+            cortado.Simulation(SCENE.replaced(f"phase.0.viscosity={own}"), precision="float64"), {"gauge": height}
+        )
+        for own in (200.0, 0.2)
+    )
+    for tried in (0.2, 200.0):
+        both = [one.predicted({"viscosity": tried})["gauge"] for one in (thick, thin)]
+        assert np.array_equal(*both)
+        slopes = [one.linearised({"viscosity": tried}, [{"viscosity": 1.0}])[1]["gauge"] for one in (thick, thin)]
+        assert np.array_equal(*slopes)
+        run = measured.Experiment(thick.simulation.replaced(f"phase.0.viscosity={tried}"), {"gauge": height})
+        assert np.array_equal(run.predicted({})["gauge"], both[0])
+
+
+@pytest.fixture(scope="module")
+def clocked(simulation):
+    """Tracers and a gauge whose clocks are calibrated, without noise."""
+    times, first = TIME_STEP * np.linspace(2.3, STEPS - 0.6, 9), simulation.positions[::5]
+    clock = {"calibrate": ["start"]}
+    empty = np.zeros((9, 1))
+    found = measured.Experiment(
+        simulation,
+        {
+            "tracers": measured.Tracks(simulation, first, times, np.zeros((9, *first.shape)), **clock),
+            "gauge": measured.SensorSeries(WaveGauge([0.1, 0.0], radius=0.08), times, empty, 2, **clock),
+        },
+    )
+    return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
+
+
+def test_the_derivative_along_a_clock_is_that_of_time(clocked):
+    at = {"viscosity": np.array(TRUE), "tracers.start": np.array(0.0013), "gauge.start": np.array(-0.0007)}
+    along = [{"tracers.start": np.array(1.0)}, {"gauge.start": np.array(1.0), "viscosity": np.array(0.3)}]
+    _, slopes = clocked.linearised(at, along)
+    for k, direction in enumerate(along):
+        ends = [
+            clocked.predicted({n: v + way * 1e-5 * direction.get(n, 0.0) for n, v in at.items()}) for way in (1.0, -1.0)
+        ]
+        for name, slope in slopes.items():
+            difference = (ends[0][name] - ends[1][name]) / 2e-5
+            assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
+
+
+@pytest.mark.parametrize("late", [0.011, -0.008])
+def test_a_fit_finds_by_how_much_a_clock_is_late(clocked, late):
+    """Also beyond the end of the run that was asked for, and before its start."""
+    true = {"viscosity": TRUE, "tracers.start": late, "gauge.start": 0.0}
+    found = cortado.fit(clocked.measured_again(clocked.predicted(true)), {"viscosity": 1.0}, starts=1)
+    assert found.values["tracers.start"] == pytest.approx(late, rel=1e-3) and " s" in str(found)
+    assert found.values["viscosity"] == pytest.approx(TRUE, rel=1e-3)
+
+
 def test_the_tangent_of_a_picture_is_the_transpose_of_its_adjoint(experiment):
     video = experiment.observations["camera"]
     end, random = experiment.problem.end({"viscosity": TRUE}), np.random.default_rng(0)
@@ -350,6 +407,11 @@ TIMES = [0.0, 0.01, 0.02, 0.03]
         (
             lambda s: measured.Video(s.renderer(resolution=(8, 8)), TIMES, np.zeros((4, 8, 8, 3)), calibrate=["up"]),
             "calib",
+        ),
+        (lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES, np.zeros((4, 1, 2)), calibrate=["rotation"]), "of start"),
+        (
+            lambda s: measured.Tracks(s, [[0.1, 0.1]], TIMES[::-1], np.zeros((4, 1, 2))),
+            "times has 0.02 s after 0.03 s, but must rise",
         ),
         (lambda s: measured.Experiment(s, {}), "observations is empty"),
         (lambda s: cortado.fit([], {"viscosity": 1.0}), "experiments is empty"),

@@ -3,19 +3,22 @@
 import errno
 import json
 import os
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bad_scenes import assert_one_sentence
-from cortado.errors import CortadoError, InputError
+from cortado.errors import CortadoError, CortadoWarning, InputError
 from cortado.files.csv_columns import read_columns
+from cortado.files.video import write_video
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.video_frames import read_frames
 
+RED, GREEN, BLUE, WHITE = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -105,6 +108,67 @@ def test_frames_of_a_folder_are_read(tmp_path):
         read_frames(tmp_path, (24, 16))
     with pytest.raises(InputError, match="must lie within the frames"):
         read_frames(tmp_path, (24, 16), crop=(0, 0, 49, 10), frame_rate=50.0)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((1, 0, 0, 1), [[RED, GREEN], [BLUE, WHITE]]),
+        ((0, 1, -1, 0), [[BLUE, RED], [WHITE, GREEN]]),
+        ((-1, 0, 0, -1), [[WHITE, BLUE], [GREEN, RED]]),
+        ((0, -1, 1, 0), [[GREEN, WHITE], [RED, BLUE]]),
+        ((-1, 0, 0, 1), [[GREEN, RED], [WHITE, BLUE]]),
+    ],
+)
+def test_a_video_is_upright_as_players_show_it(tmp_path, matrix, shown):
+    """As telephones turn what they film: a matrix in the box tkhd of ISO/IEC 14496-12."""
+    path, picture = tmp_path / "a.mp4", np.repeat(np.repeat([[RED, GREEN], [BLUE, WHITE]], 16, 0), 24, 1)
+    data = bytearray(write_video(path, [picture] * 2).read_bytes())
+    begin = data.index(b"tkhd") + 44
+    (a, b, c, d), one = matrix, 1 << 16
+    data[begin : begin + 36] = struct.pack(">9i", a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    frames = read_frames(path, (24, 36) if b else (36, 24))[1]
+    rows, columns = frames.shape[1:3]
+    corners = frames[0][np.ix_([rows // 4, 3 * rows // 4], [columns // 4, 3 * columns // 4])]
+    assert corners == pytest.approx(np.array(shown, dtype=float), abs=0.1)
+
+
+def test_what_proportions_leave_out_is_said(tmp_path):
+    for k in range(4):
+        write_picture(tmp_path / f"{k}.png", np.full((20, 25, 3), 0.5))
+    with pytest.warns(CortadoWarning, match=r"frames of .* have 25 x 20 pixels, but 16 x 16 .* 80% of it") as caught:
+        read_frames(tmp_path, (16, 16), frame_rate=10.0)
+    assert len(caught) == 1
+
+
+TRACKS = "time,tracer,x,y\n0,1,0.1,0.1\n0,2,0.1,0.2\n0.04,1,0.1,0.1\n0.04,2,0.1,0.2\n"
+SERIES = "time,height\n0.0,1\n0.04,2\n0.02,1\n0.06,1\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "words"),
+    [
+        ("tracks", TRACKS + "0.04,2,0.3,0.2\n", "2 lines for tracer 2 at 0.04 s"),
+        ("tracks", TRACKS + "0.08,,0.3,0.2\n", "line 6 has the tracer nan, but must have a number"),
+        ("tracks", TRACKS + "nan,1,0.3,0.2\n", "line 6 has the time nan, but must have a number"),
+        ("tracks", TRACKS.replace("tracer", "x", 1), "has 2 columns 'x'"),
+        ("sensor", SERIES, "has the time 0.02 s after 0.04 s"),
+        ("sensor", SERIES.replace("0.02", "0.04"), "has the time 0.04 s after 0.04 s"),
+        ("sensor", SERIES.replace("time", "height"), "has 2 columns 'height'"),
+        ("sensor", SERIES.replace("0.02", ""), "line 4 has the time nan"),
+    ],
+)
+def test_a_table_that_says_two_things_is_a_sentence(task, kind, text, words):
+    (task.parent / "table.csv").write_text(text)
+    given = 'kind = "tracks"' if kind == "tracks" else 'kind = "sensor"\nsensor = "left"'
+    scene, _ = task.read_text().split("[[problem.measured]]", 1)
+    measured = f'[[problem.measured]]\nname = "mine"\n{given}\nfile = "table.csv"\n\n'
+    task.write_text(f"{scene}{measured}[fit]\nstart.viscosity = 1.0\n")
+    with pytest.raises(InputError) as error:
+        load_fit(task).experiments[0].experiment("cpu", "float32")
+    assert_one_sentence(str(error.value))
+    assert words in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_what_would_be_written_wrong_is_refused(tmp_path, name, image, wanted):
 
 def test_a_picture_that_is_cropped_says_so(tmp_path):
     path = write_picture(tmp_path / "wide.png", np.zeros((54, 96, 3)))
-    with pytest.warns(CortadoWarning, match="96 x 54 pixels, but 8 x 8 are wanted: only its middle is taken, 56%"):
+    with pytest.warns(CortadoWarning, match="96 x 54 pixels, but 8 x 8 are wanted: only the middle is taken, 56%"):
         read_picture(path, 8)
 
 

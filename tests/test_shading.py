@@ -406,13 +406,17 @@ def test_the_frames_that_a_film_says_are_enough(span):
     assert frames == pytest.approx(few.enough * span + 1.0, abs=0.6)
 
 
+REAL_TIME = "picture.film_speed=1 is real time"
+
+
 def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
     times = np.linspace(0.0, 2.0, 401)
     some = Pace.of(times, 101)
     assert len(some.frames) == 101 and some.frames[:3] == (0, 4, 8) and some.frames[-1] == 400
-    assert str(some) == "101 frames, 4.0 s, at 0.5 x; 300 of the 401 that were recorded are left out"
+    assert str(some) == "101 frames, 4.0 s, at 0.5 x; 300 of the 401 that were recorded are left out; " + REAL_TIME
     asked = Pace.of(times, speed=1.0)
     assert len(asked.frames) == 51 and asked.times[-1] == 2.0 and "350 of the 401" in str(asked)
+    assert REAL_TIME not in str(asked) and REAL_TIME not in str(Pace.of(times, speed=0.5))
     with pytest.warns(CortadoWarning, match=r"the film has 7 frames of the 90 that picture.film_frames asks for"):
         assert len(pace_of(np.arange(7.0), Picture(film_frames=90)).frames) == 7
     assert str(Pace.unknown(50)) == "50 frames, 4.0 s, step by step"

@@ -48,8 +48,8 @@ LINKS = {
     ),
     "calibrate": (
         "list",
-        'What of the camera is searched: "translation", "rotation", "field_of_view" or, in the plane, '
-        '"width", and the fluid\'s "extinction".',
+        'What is searched beside the parameters: "start", the key `start`; of a camera "translation", "rotation", '
+        '"field_of_view" or, in the plane, "width", and the fluid\'s "extinction".',
     ),
     "gradient": ("[table](#which-gradient-optimisegradient)", "The gradient that the search follows."),
     "check": ("[table](#what-has-to-be-reached-optimisecheck)", "What the estimate has to reach."),

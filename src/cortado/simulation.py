@@ -278,6 +278,11 @@ class Simulation(Stepping, Measuring, Picturing):
         """A single one of the same scene, on the same device, in a precision."""
         return Simulation(*self._made_of(precision, None))
 
+    def replaced(self, *overrides: str) -> "Simulation":
+        """One of a scene with other values, on the same device: see `Scene.replaced`."""
+        _, *others = self._made_of(self.precision.name, self.batch)
+        return Simulation(self.scene.replaced(*overrides), *others)
+
     def room(self, steps: int, checkpoints: float) -> int:
         """How many runs of so many steps are worth one launch, and fit half of the memory that is free, with at most so
         many bytes of ``checkpoints`` in all."""

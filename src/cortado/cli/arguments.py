@@ -53,7 +53,8 @@ class FrameOptions:
     record_every: int | None = None
     """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""
     fps: float | None = None
-    """Frames of the trajectory in a second that is simulated, in the place of --record-every."""
+    """Frames of the trajectory in a second that is simulated, in the place of --record-every. How fast a film shows
+    them says picture.film_speed: slower than life where a run is short."""
 
     def check(self) -> None:
         """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""

@@ -52,16 +52,18 @@ def sweep(
 
 def convergence(
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
+    quantities: Annotated[UseAppendAction[tuple[str, ...]], arg(name="quantity", metavar="FILE.py:FUNCTION")] = (),
     json: Json = False,
 ) -> Work:
-    """Tell how fast a scene converges: of runs with different spacings or time steps the order, and the limit.
+    """Tell how fast a scene converges: of runs with different spacings or time steps the order, limit and error.
 
     Args:
         runs: Folders of at least three runs until the same time, or of a sweep of them.
+        quantities: A number of your own besides: a function of a cortado.Trajectory; may be given again.
     """
     from cortado.cli.commands.convergence import convergence_table
 
-    return partial(convergence_table, runs, json)
+    return partial(convergence_table, runs, as_text(quantities), json)
 
 
 def dataset(

@@ -23,7 +23,10 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     names = [name.strip() for name in lines[0]] if lines else []
     if len(names) == 1 and ";" in names[0]:
         raise InputError(f"{path} has semicolons between its columns, but must have commas, and points in numbers.")
-    if len(lines) < 2 or not all(names) or len(set(names)) < len(names):
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path} has {names.count(name)} columns {name!r}, but must have each of them once.")
+    if len(lines) < 2 or not all(names):
         raise InputError(f"{path} must have a line of different names, such as time,force_x, and lines of numbers.")
     rows = []
     for number, line in enumerate(lines[1:], 2):

@@ -44,8 +44,8 @@ MOST_PIXELS = 2**26
 MOST_PIXELS_KEPT = 2**24
 """Of one that is not."""
 PIXELS_AT_ONCE = 2**20
-MOST_CROPPED = 0.8
-"""Of a picture: where less of it is taken, a warning says so."""
+ROUNDING = 0.01
+"""Of a picture: where more of it is left out than by rounding its sides, a warning says so."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
 """Linear light of every value in a file."""
 
@@ -101,7 +101,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
     picture = open_picture(path, MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS)
     if shape is None:
         return _whole(picture)
-    _warn_of_cropping(path, picture.size, shape)
+    warn_of_cropping(f"The picture {path} has", picture.size, shape)
     return resized(picture, shape)
 
 
@@ -133,13 +133,14 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
         raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
 
 
-def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``."""
+def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
+    """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``; the sentence
+    begins with what was ``found``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
-    if share < MOST_CROPPED:
-        found = f"The picture {path} has {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
-        warn(f"{found}: only its middle is taken, {share:.0%} of it.")
+    if share < 1.0 - ROUNDING:
+        found = f"{found} {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
+        warn(f"{found}: only the middle is taken, {share:.0%} of it.")
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:

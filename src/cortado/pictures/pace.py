@@ -39,6 +39,8 @@ class Pace:
     """How many frames there are."""
     enough: float = 0.0
     """[1/s] frames in a second of the run with which the film would show `USUAL` ones; 0 where times are not known"""
+    is_asked: bool = False
+    """Whether somebody chose the speed."""
     of_search: bool = False
     """Whether the frames are those of a search, which [picture] says the number of, and not those of a run."""
 
@@ -49,14 +51,14 @@ class Pace:
         second, and any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or longer
         than `LONGEST`."""
         span = float(times[-1] - times[0])
-        full = speed or _easy_speed(span)
+        full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:
             speed = _speed(span, min(count or len(times), len(times)), full if count is None else 0.0)
         most = min(count or round(USUAL * span / speed) + 1, len(times))
         enough = USUAL / full
         chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, most)).astype(int)).tolist()
         shown = tuple((times[k] - times[0]) / speed for k in chosen)
-        return cls(tuple(chosen), shown, speed, len(times), enough)
+        return cls(tuple(chosen), shown, speed, len(times), enough, is_asked)
 
     @classmethod
     def unknown(cls, count: int) -> "Pace":
@@ -96,7 +98,7 @@ class Pace:
         if self.speed is not None and 1 < len(self.frames) == self.recorded and self._lacks:
             kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: {self._more} "
             kept += f"records {USUAL:g} for each second of a film of {self.enough * self._span / USUAL:.2g} s"
-        return kept
+        return kept if self.is_asked or self.speed in (None, 1.0) else f"{kept}; picture.film_speed=1 is real time"
 
     @property
     def _span(self) -> float:

@@ -135,15 +135,17 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
     return {**of_gravity, **optional}
 
 
-def is_implicit(scene: SceneTables) -> bool:
-    """Whether the viscous force is a stress that acts as velocities are at the end of a step."""
+def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
+    """Whether the viscous force is a stress that acts as velocities are at the end of a step, in a scene in which these
+    ``values`` of parameters replace its own."""
+    values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
     if scene.forces.viscous_solve == "implicit":
         return True
-    size = scene.solver.time_step
-    longest = min(_other_limits(scene, {}).values()) if size == "auto" else size
-    return longest > viscous_limit(scene, {})
+    size = values.get("time_step", scene.solver.time_step)
+    longest = min(_other_limits(scene, values).values()) if isinstance(size, str) else float(size)
+    return longest > viscous_limit(scene, values)
 
 
 def _gravity(scene: SceneTables) -> Points:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cortado.cli.commands.compare import SAME_TIME
 from cortado.cli.commands.named_runs import named_runs
+from cortado.cli.commands.own_quantity import OwnQuantity
 from cortado.errors import InputError, warn
 from cortado.optimisation.sweep.richardson import Extrapolation
 from cortado.runs.differences import differences
@@ -42,12 +43,13 @@ class Resolved:
     """The unit and the value of each, by name."""
 
     @classmethod
-    def read(cls, folder: RunFolder) -> "Resolved":
-        """Raises `InputError` for a run that has not ended well."""
+    def read(cls, folder: RunFolder, quantities: Sequence[OwnQuantity]) -> "Resolved":
+        """With ``quantities`` of the user's own. Raises `InputError` for a run that has not ended well."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
-        last = Trajectory.load(folder.trajectory)[-1:]
+        trajectory = Trajectory.load(folder.trajectory)
+        last = trajectory[-1:]
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
         scene, masses = read_json(folder.scene), last.constants["reference_density"].astype(np.float64)
         centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
@@ -57,6 +59,7 @@ class Resolved:
             for column, found in columns.items():
                 unit = readings[name].units[column]
                 numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
+        numbers |= {one.name: ("", one(trajectory)) for one in quantities}
         precision = read_json(folder.environment).get("settings", {}).get("precision", "")
         mass = float(masses.sum()) * float(scene["discretisation"]["spacing"]) ** last.dimension
         return cls(folder.path, scene, precision, float(last.times[0]), mass, numbers)
@@ -70,9 +73,10 @@ class Resolved:
         return float(value)
 
 
-def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
+def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
     """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
-    runs = [Resolved.read(folder) for folder in named_runs(folders)]
+    own = [OwnQuantity.named(one) for one in quantities]
+    runs = [Resolved.read(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST:
         raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST}.")
     key = _varied(runs)
@@ -91,8 +95,7 @@ def convergence_table(folders: Sequence[Path], as_json: bool) -> str:
     for name, (unit, _) in runs[0].numbers.items():
         values = [run.numbers[name][1] for run in runs]
         found = Extrapolation.of(sizes, values)
-        error = None if found.limit is None else abs(values[-1] - found.limit)
-        rows.append({"name": name, "unit": unit, "values": values, **vars(found), "error_of_finest": error})
+        rows.append({"name": name, "unit": unit, "values": values, **vars(found)})
     others = [
         other for other in (SPACING, TIME_STEP) if other != key and runs[0].scene["solver"]["time_step"] != "auto"
     ]
@@ -136,19 +139,20 @@ def _varied(runs: Sequence[Resolved]) -> str:
 def _as_text(table: dict[str, Any]) -> str:
     """A line for each number, the finest run on the right."""
     key = table["by"]
-    lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error of the finest"]]
+    lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error", ""]]
     sizes = (key, *(other for other in UNITS if other != key and other in table))
-    lines += [[f"{name} [{UNITS[name]}]", *(f"{size:g}" for size in table[name]), "", "", ""] for name in sizes]
+    lines += [[f"{name} [{UNITS[name]}]", *(f"{size:g}" for size in table[name]), "", "", "", ""] for name in sizes]
     for row in table["rows"]:
-        limit, error = row["limit"], row["error_of_finest"]
-        share = f" ({100.0 * error / abs(limit):.2g} %)" if limit else ""
+        limit, error, finest = row["limit"], row["error"], row["values"][-1]
+        share = f" ({100.0 * error / abs(finest):.2g} %)" if error is not None and finest else ""
         lines.append(
             [
-                f"{row['name']} [{row['unit']}]",
+                f"{row['name']} [{row['unit']}]" if row["unit"] else row["name"],
                 *(f"{value:.6g}" for value in row["values"]),
-                row["why"] if row["order"] is None else f"{row['order']:.2f}",
+                "" if row["order"] is None else f"{row['order']:.2f}",
                 "" if limit is None else f"{limit:.6g}",
                 "" if error is None else f"{error:.2g}{share}",
+                row["flag"],
             ]
         )
     return "\n".join([f"{len(table['runs'])} runs until {table['end_s']:g} s, by {key}", *_aligned(lines)])

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.cli.commands.executor import HERE, Where
-from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, warn
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, shown, warn
 from cortado.files.atomic import UNFINISHED, sentences, write_atomically
 from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import keeping
@@ -18,6 +18,7 @@ from cortado.optimisation.datasets.layout import METADATA, Parts, assemble, meta
 from cortado.optimisation.datasets.one_run import one_run
 from cortado.optimisation.datasets.sample import Sample
 from cortado.optimisation.datasets.table import DatasetTable, DatasetTables
+from cortado.runs.differences import differences
 from cortado.runs.run_files import read_json
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene
@@ -165,7 +166,11 @@ def _table(file: Path, overrides: list[str]) -> DatasetTable:
 def _checked_runs(runs: int, table: DatasetTable) -> int:
     least = 1 + (table.valid > 0.0) + (table.test > 0.0)
     if not least <= runs <= MOST_RUNS or not table.split(runs)["train"]:
-        raise InputError(f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}, with some to train.")
+        parts = ["train", *(["validate"] if table.valid else []), *(["test"] if table.test else [])]
+        purposes = " and ".join(f"one to {part}" for part in parts)
+        found = f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}: {purposes} at least"
+        advice = "; dataset.valid = 0 and dataset.test = 0 leave the others out" if least > 1 else ""
+        raise InputError(f"{found}{advice}.")
     return runs
 
 
@@ -199,11 +204,14 @@ def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
     something else."""
     note = out / ASKED
     if note.exists():
-        if read_json(note) != asked:
-            raise InputError(
-                f"{out} holds a data set of another scene, table, number of runs, precision or version of Cortado; "
-                "choose another --out."
+        if other := differences(read_json(note), json.loads(json.dumps(asked))):
+            unlike = "; ".join(f"{key} is {shown(there)}, not {shown(now)}" for key, (there, now) in other.items())
+            grows = (
+                ", as a data set does not grow: how many runs there are says which are for tests"
+                if "runs" in other
+                else ""
             )
+            raise InputError(f"{out} holds another data set ({unlike}); choose another --out{grows}.")
         return (out / METADATA).exists()
     with sentences(out):
         others = [one.name for one in out.iterdir() if one.name != LOCK]

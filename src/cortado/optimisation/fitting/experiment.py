@@ -1,21 +1,28 @@
 """An experiment: a simulation of it, and what was measured."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_steps, require_table
-from cortado.errors import InputError, shown
+from cortado.arrays import as_numbers, check_steps, require_table
+from cortado.errors import CortadoWarning, InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.losses import FinalPositions, Snapshot
-from cortado.optimisation.fitting.observation import Again, Direction, Frames, Observation
+from cortado.optimisation.fitting.observation import CLOCK, Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.restart import RestartState
+from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
+
+OF_THE_SCHEME = ("viscosity", "rest_density", "time_step")
+"""Parameters that say whether viscosity acts as velocities are at the start of a step or at its end."""
+ROOM = 16
+"""Steps by which a run grows at once where a clock is late."""
 
 
 @fixed
@@ -50,8 +57,9 @@ class Experiment:
         steps = int(np.ceil(last / step - 1e-6)) if steps is None else check_steps(steps)
         self.simulation, self.observations = simulation, FixedDict(observations)
         self.problem = Problem(simulation, steps, FinalPositions(simulation.positions), state=state)
-        self._frames = {name: Frames.of(one.times, step, steps) for name, one in observations.items()}
-        self._steps = sorted(set().union(*(frames.needed for frames in self._frames.values())))
+        for one in observations.values():
+            Frames.of(one.times, step, steps)  # raises for times beyond the run
+        self._time_step, self._problems = step, {(is_implicit(simulation.scene), steps): self.problem}
 
     def __repr__(self) -> str:
         return f"Experiment({self.simulation!r}, {', '.join(self.observations)})"
@@ -68,6 +76,16 @@ class Experiment:
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
+    @property
+    def clocks(self) -> dict[str, tuple[float, float]]:
+        """By the name of each clock that is calibrated its bounds [s]: half the length of the record to both sides."""
+        found = {}
+        for name, one in self.observations.items():
+            if CLOCK in one.start:
+                start, half = float(one.start[CLOCK]), 0.5 * float(one.times[-1] - one.times[0])
+                found[f"{name}.{CLOCK}"] = (start - half, start + half)
+        return found
+
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
         """The same experiment, in the same arrays, with other numbers measured, (frames, m) by name."""
         found = object.__new__(Experiment)
@@ -77,31 +95,79 @@ class Experiment:
 
     def predicted(self, parameters: Values) -> dict[str, np.ndarray]:
         """By the name of each observation, what the simulation says of it, (frames, m)."""
-        return self._read(self.problem.states(self._shared(parameters), self._steps), parameters)
+        frames, values = self._frames(parameters), self._shared(parameters)
+        wanted = self._wanted(frames)
+        return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
 
     def linearised(
         self, parameters: Values, directions: Sequence[Values]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """The same, and its derivatives along directions, (frames, m, directions), by forward mode."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
-        ends, dots = self._along(values, [moved for moved in moves if moved])
+        frames = self._frames(parameters)
+        wanted = self._wanted(frames)
+        problem = self._problem(values, wanted)
+        ends, dots = self._along(problem, wanted, values, [moved for moved in moves if moved])
         still, found = self._still(ends), dict[str, Any]()
         along = [(one, moved, next(dots) if moved else still) for one, moved in zip(directions, moves, strict=True)]
         for name, one in self.observations.items():
             own, slopes = self._own(name, parameters), {}
-            for step in self._frames[name].needed:
+            for step in frames[name].needed:
                 each = [
-                    Direction(dots[step], moved, self._own(name, direction), self._quantities(ends[step], *rest))
+                    Direction(
+                        dots[step], moved, self._own(name, direction), self._quantities(problem, ends[step], *rest)
+                    )
                     for direction, moved, dots in along
                     for rest in [(dots[step], values, moved)]
                 ]
                 slopes[step] = one.tangents(ends[step], own, each)
-            found[name] = self._frames[name].between(slopes)
-        return self._read(ends, parameters), found
+            found[name] = frames[name].between(slopes)
+            if CLOCK in one.start:
+                read = {step: one.value(ends[step], own) for step in frames[name].around}
+                late = np.array([float(direction.get(f"{name}.{CLOCK}", 0.0)) for direction in directions])
+                found[name] = found[name] + frames[name].rates(read, self._time_step)[..., None] * late
+        return self._read(ends, frames, parameters), found
 
-    def _along(self, values: Values, moves: Sequence[Values]) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
+    def _frames(self, parameters: Values) -> dict[str, Frames]:
+        """Where the frames of each observation are, by its clock; what is before the run is as its first state."""
+        found = {}
+        for name, one in self.observations.items():
+            late = (
+                float(parameters.get(f"{name}.{CLOCK}", one.start[CLOCK]) - one.start[CLOCK])
+                if CLOCK in one.start
+                else 0.0
+            )
+            times = np.maximum(one.times + late, 0.0)
+            found[name] = Frames.of(times, self._time_step, int(np.ceil(times[-1] / self._time_step)))
+        return found
+
+    def _wanted(self, frames: Mapping[str, Frames]) -> list[int]:
+        """The states that are read, by the number of steps before them."""
+        clocks = (own.around for name, own in frames.items() if CLOCK in self.observations[name].start)
+        return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
+
+    def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
+        """A problem of these steps at least, whose viscosity acts as it does in a run of a scene with these values."""
+        scene, steps = self.simulation.scene, self.problem.steps
+        if wanted[-1] > steps:
+            steps += -(-(wanted[-1] - steps) // ROOM) * ROOM
+        given = {name: as_numbers(name, values[name]) for name in OF_THE_SCHEME if name in values}
+        fits = all(array.size in (1, len(scene.phase)) for array in given.values())
+        key = is_implicit(scene, given if fits else {}), steps
+        if key not in self._problems:
+            own, simulation = self.problem, self.simulation
+            if key[0] != is_implicit(scene):
+                with warnings.catch_warnings():  # of the scene's own viscosity, with which nothing is run
+                    warnings.simplefilter("ignore", CortadoWarning)
+                    simulation = simulation.replaced(f"forces.viscous_solve={'implicit' if key[0] else 'explicit'}")
+            self._problems[key] = Problem(simulation, steps, own.loss, state=own.state)
+        return self._problems[key]
+
+    def _along(
+        self, problem: Problem, steps: Sequence[int], values: Values, moves: Sequence[Values]
+    ) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
         """States by the number of steps before them, and along each of some directions their tangents, by fields."""
-        wanted, dimension, dots = set(self._steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
+        wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
         def observer(kept: dict[int, Arrays]) -> Observer:
             def observe(step: int, dot: State) -> None:
@@ -111,28 +177,32 @@ class Experiment:
             return observe
 
         each = zip(moves, map(observer, dots), strict=True)
-        return self.problem.several_tangents(values, each, self._steps), iter(dots)
+        return problem.several_tangents(values, each, steps), iter(dots)
 
     def _still(self, ends: Mapping[int, Snapshot]) -> dict[int, Arrays]:
         """Tangents of states where only an observation's own parameters change, such as those of a camera."""
         return {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
 
-    def _quantities(self, at: Snapshot, dot: Arrays, values: Values, moved: Values) -> Callable[..., Arrays]:
+    def _quantities(
+        self, problem: Problem, at: Snapshot, dot: Arrays, values: Values, moved: Values
+    ) -> Callable[..., Arrays]:
         """What gives tangents of quantities of a state along its own tangent."""
 
         def tangents(names: Iterable[str]) -> Arrays:
             if not moved:
                 return {name: np.zeros_like(at[name]) for name in names}
-            return self.problem.along(at, names, dot, values, moved)
+            return problem.along(at, names, dot, values, moved)
 
         return tangents
 
-    def _read(self, ends: Mapping[int, Snapshot], parameters: Values) -> dict[str, np.ndarray]:
+    def _read(
+        self, ends: Mapping[int, Snapshot], frames: Mapping[str, Frames], parameters: Values
+    ) -> dict[str, np.ndarray]:
         found = {}
         for name, one in self.observations.items():
             own = self._own(name, parameters)
-            read = {step: one.value(ends[step], own) for step in self._frames[name].needed}
-            found[name] = self._frames[name].between(read)
+            read = {step: one.value(ends[step], own) for step in frames[name].needed}
+            found[name] = frames[name].between(read)
             if found[name].shape != one.measured.shape:
                 raise InputError(
                     f"{name} measured {one.measured.shape} numbers, but the simulation has {found[name].shape}."

@@ -77,7 +77,8 @@ def fit(
         raise InputError("start is empty, but must have a parameter to fit.")
     positive = [n for n in given if (n in known and known[n].range in POSITIVE) or n.endswith(".extinction")]
     unseen = {name: mask for one in each for name, mask in one.unseen.items()}
-    coordinates = Coordinates.of(given, positive, bounds, unseen)
+    clocks = {name: ends for one in each for name, ends in one.clocks.items()}
+    coordinates = Coordinates.of(given, positive, {**clocks, **({} if bounds is None else bounds)}, unseen)
     problem = LeastSquares(each, coordinates, on_trial)
     found = _from(problem, coordinates.start, iterations)
     if starts == 1 or (starts is None and not found.in_doubt):

@@ -23,6 +23,7 @@ OF_VIEWS = {
     "field_of_view": "degrees",
     "width": "m",
     "extinction": "1/m",
+    "start": "s",
 }
 
 

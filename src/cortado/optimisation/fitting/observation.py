@@ -11,6 +11,8 @@ from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
 from cortado.scene.parameters.values import Arrays
 
+CLOCK = "start"
+"""The parameter of an observation that says when its frames are."""
 LEAST_FRAMES = 4
 """Of an observation: the scatter from frame to frame is what error bars are made of."""
 
@@ -43,7 +45,8 @@ class Observation(Protocol):
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Its own parameters, such as those of a camera, as the fit starts."""
+        """Its own parameters, such as those of a camera, as the fit starts. One that is called "start" is a clock [s]:
+        frames are later by as much as it grows, which an `Experiment` sees to."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         """(m,) what a state predicts, given values of its own parameters."""
@@ -94,6 +97,15 @@ class Frames:
         """The states that are read."""
         return {int(k) for k in self.steps} | {int(k) + 1 for k in self.steps[self.shares > 0.0]}
 
+    @property
+    def around(self) -> set[int]:
+        """The states that `rates` reads."""
+        return {int(k) + more for k in self.steps for more in (0, 1)}
+
+    def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
+        """(frames, ...) of what was read of the states, by how much it changes in a second."""
+        return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
+
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
         """(frames, ...) of what was read of the states."""
         last = max(read)
@@ -101,6 +113,18 @@ class Frames:
         before = np.array([read[int(k)] for k in self.steps])
         shares = self.shares.reshape(-1, *[1] * (before.ndim - 1))
         return (1.0 - shares) * before + shares * np.array(after)
+
+
+def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
+    """The parameter of a clock that is calibrated, which shows ``start`` [s] of the run where it should show 0."""
+    return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
+
+
+def only_a_clock(calibrate: Sequence[str]) -> None:
+    """Raises `InputError` for anything else."""
+    for name in calibrate:
+        if name != CLOCK:
+            raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
 
 
 @dataclass(frozen=True)
@@ -115,11 +139,15 @@ class Measurement:
     def of(cls, times: Any, measured: Any, noise: Any) -> "Measurement":
         """Raises `InputError` for what cannot be fitted."""
         moments, values = read_only("times", times), read_only("measured", measured)
-        if moments.ndim != 1 or len(moments) < LEAST_FRAMES or not (np.diff(moments) > 0.0).all():
+        if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
+            found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
             raise InputError(
-                f"times must be a list of at least {LEAST_FRAMES} rising numbers, as error bars come from the scatter "
-                "from frame to frame."
+                f"times {found}, but must be a list of at least {LEAST_FRAMES} rising numbers, as error bars come from "
+                "the scatter from frame to frame."
             )
+        if (falls := np.flatnonzero(np.diff(moments) <= 0.0)).size:
+            before, after = moments[falls[0] : falls[0] + 2]
+            raise InputError(f"times has {after:g} s after {before:g} s, but must rise from frame to frame.")
         if not np.isfinite(moments).all() or moments[0] < 0.0:
             raise InputError(f"times begin with {moments[0]:g} s, but must be finite and not before the run.")
         if values.ndim != 2 or len(values) != len(moments):

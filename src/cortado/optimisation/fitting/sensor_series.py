@@ -9,15 +9,13 @@ from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.losses import Snapshot
-from cortado.optimisation.fitting.observation import Direction, Measurement
+from cortado.optimisation.fitting.observation import Direction, Measurement, clock_of, only_a_clock
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 
 
 @fixed
 class SensorSeries:
     """What a sensor measured over time."""
-
-    start: Mapping[str, np.ndarray] = {}
 
     def __init__(
         self,
@@ -27,11 +25,14 @@ class SensorSeries:
         dimension: int,
         columns: Sequence[str] | None = None,
         noise: float | None = None,
+        calibrate: Sequence[str] = (),
+        clock: float = 0.0,
     ):
         """``sensor`` of `cortado.sensors`; ``times`` (frames,) [s] after the start of the run; ``values`` (frames,) or
         (frames, k) in the sensor's units, NaN for what does not count; ``dimension`` of the scene; ``columns``, the
         names of the k numbers of the sensor that were measured, all of them if left out; ``noise``, their standard
-        deviation, if it is known."""
+        deviation, if it is known; ``clock`` [s], what is added to the times, which ``calibrate=["start"]`` searches."""
+        only_a_clock(calibrate)
         self.sensor = checked_sensor(sensor)
         known = dict(sensor.columns(dimension))
         names = list(known) if columns is None else list(columns)
@@ -44,7 +45,8 @@ class SensorSeries:
             raise InputError(f"values has shape {array.shape}, but must have columns for {', '.join(names)}.")
         if len({known[name] for name in names}) > 1:
             raise InputError(f"columns are {', '.join(names)}, but must be of one unit: give each unit a series.")
-        own = Measurement.of(times, array, noise)
+        self.start = clock_of(calibrate, clock)
+        own = Measurement.of(np.asarray(times) + clock, array, noise)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
         self.unit, self.columns = known[names[0]], tuple(names)
         self._picked = np.array([list(known).index(name) for name in names])

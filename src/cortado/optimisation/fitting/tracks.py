@@ -12,7 +12,7 @@ from cortado.discretise.pairs import wrapped
 from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.losses import Snapshot
-from cortado.optimisation.fitting.observation import Direction, Measurement
+from cortado.optimisation.fitting.observation import Direction, Measurement, clock_of, only_a_clock
 from cortado.runs.sensors.sensor import Weights
 from cortado.simulation import Simulation
 
@@ -29,19 +29,30 @@ class Tracks:
     """
 
     unit = "m"
-    start: Mapping[str, np.ndarray] = {}
 
-    def __init__(self, simulation: Simulation, first: Any, times: Any, positions: Any, noise: float | None = None):
+    def __init__(
+        self,
+        simulation: Simulation,
+        first: Any,
+        times: Any,
+        positions: Any,
+        noise: float | None = None,
+        calibrate: Sequence[str] = (),
+        clock: float = 0.0,
+    ):
         """``first`` (tracers, d) places at the start of the run [m]; ``times`` (frames,) [s] after it; ``positions``
         (frames, tracers, d) [m], NaN where a tracer was not seen; ``noise``, standard deviation of a coordinate [m], if
-        it is known. Raises `InputError` for a tracer that has no fluid around it."""
+        it is known; ``clock`` [s], what is added to the times, which ``calibrate=["start"]`` searches. Raises
+        `InputError` for a tracer that has no fluid around it."""
+        only_a_clock(calibrate)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)
         if not tracers or d != simulation.dimension:
             raise InputError(f"first has shape {begun.shape}, but must be (tracers, {simulation.dimension}).")
         if places.shape[1:] != begun.shape:
             raise InputError(f"positions has shape {places.shape}, but must be (frames, {tracers}, {d}).")
-        own = Measurement.of(times, places.reshape(len(places), -1), noise)
+        self.start = clock_of(calibrate, clock)
+        own = Measurement.of(np.asarray(times) + clock, places.reshape(len(places), -1), noise)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
         x, domain = simulation.positions, simulation.lattice.domain
         support, period = simulation.scene.discretisation.support_radius, np.array(domain.lengths)

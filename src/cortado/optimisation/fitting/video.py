@@ -10,7 +10,7 @@ from cortado.device.threads import WARP
 from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.losses import Snapshot
-from cortado.optimisation.fitting.observation import Direction, Measurement
+from cortado.optimisation.fitting.observation import CLOCK, Direction, Measurement, clock_of
 from cortado.render import Renderer
 from cortado.render.calibration import Calibration
 
@@ -29,12 +29,14 @@ class Video:
         mask: Any = None,
         noise: float | None = None,
         calibrate: tuple[str, ...] | list[str] = (),
+        clock: float = 0.0,
     ):
         """``renderer`` such as `Simulation.renderer` makes, with the camera where it was aimed; ``times`` (frames,)
         [s] after the start of the run; ``frames`` (frames, rows, columns, 3) linear light from 0 to 1, as
         `cortado.pictures.read_picture` reads it; ``mask`` (rows, columns), true where pixels count; ``noise``, standard
         deviation of a number of a frame, if it is known; ``calibrate``, what of the view is searched beside the
-        parameters: "translation", "rotation", "field_of_view" or "width", "extinction".
+        parameters: "translation", "rotation", "field_of_view" or "width", "extinction", and "start", the ``clock`` [s]
+        that is added to the times.
         """
         require_methods("renderer", renderer, ("render", "tangent", "seen_by"), "a renderer such as of a Simulation")
         pictures = as_numbers("frames", frames)
@@ -45,15 +47,16 @@ class Video:
         if inside.shape != (rows, columns) or not inside.any():
             raise InputError(f"mask has shape {inside.shape}, but must be {(rows, columns)} and true somewhere.")
         self.renderer, self.mask = renderer, inside
-        own = Measurement.of(times, pictures[:, inside].reshape(len(pictures), -1), noise)
+        own = Measurement.of(np.asarray(times) + clock, pictures[:, inside].reshape(len(pictures), -1), noise)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
-        self.calibration = Calibration(renderer.view, tuple(calibrate))
+        self.calibration = Calibration(renderer.view, tuple(name for name in calibrate if name != CLOCK))
+        self._clock = clock_of(calibrate, clock)
         self._seen: dict[str, tuple[bytes, Renderer]] = {}
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """The camera as it was aimed, as far as it is calibrated."""
-        return self.calibration.start
+        """The camera as it was aimed, and its clock, as far as they are calibrated."""
+        return {**self.calibration.start, **self._clock}
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:

@@ -12,7 +12,7 @@ from cortado.optimisation.fitting.sensor_series import SensorSeries
 from cortado.optimisation.fitting.tracks import Tracks
 from cortado.optimisation.fitting.video import Video
 from cortado.optimisation.inverse.measured_tables import MeasuredTable, SensorSeriesTable, TracksTable, VideoTable
-from cortado.pictures.image_files import open_picture, resized
+from cortado.pictures.image_files import open_picture, resized, warn_of_cropping
 from cortado.pictures.video_frames import read_frames
 from cortado.runs.sensors.of_scene import sensors_of
 from cortado.simulation import Simulation
@@ -38,9 +38,9 @@ def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> O
     if table.mask is not None:
         picture = open_picture(folder / table.mask)
         cropped = picture if table.crop is None else picture.crop(table.crop)
+        warn_of_cropping(f"The mask {folder / table.mask} has", cropped.size, (columns, rows))
         mask = resized(cropped, (columns, rows)).mean(axis=2) > LIGHT
-    moments = (times + table.start)[chosen]
-    return Video(renderer, moments, frames[chosen], mask, table.noise, table.calibrate)
+    return Video(renderer, times[chosen], frames[chosen], mask, table.noise, table.calibrate, table.start)
 
 
 @observation.register
@@ -50,15 +50,20 @@ def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: floa
         raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
     sensor, path = sensors[table.sensor], folder / table.file
     data = _with(read_columns(path), ("time",), path)
+    falls = np.flatnonzero(np.diff(data["time"]) <= 0.0)
+    if len(falls):
+        before, after = data["time"][falls[0] : falls[0] + 2]
+        raise InputError(f"{path} has the time {after:g} s after {before:g} s, but times must rise from line to line.")
     known = sensor.columns(simulation.dimension)
     names = [name for name in data if name != "time"]
     for name in names:
         if name not in known:
             raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
-    times = data["time"] + table.start
-    chosen = _within(times, last)
+    times = data["time"]
+    chosen = _within(times + table.start, last)
     values = np.stack([data[name] for name in names], axis=1) if names else np.zeros((len(times), 0))
-    return SensorSeries(sensor, times[chosen], values[chosen], simulation.dimension, names, table.noise)
+    clock = table.calibrate, table.start
+    return SensorSeries(sensor, times[chosen], values[chosen], simulation.dimension, names, table.noise, *clock)
 
 
 @observation.register
@@ -67,6 +72,11 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
     data = _with(read_columns(path), ("time", "tracer", *axes), path)
     times, when = np.unique(data["time"] + table.start, return_inverse=True)
     tracers, who = np.unique(data["tracer"], return_inverse=True)
+    once, often = np.unique(np.stack([when, who]), axis=1, return_counts=True)
+    if (often > 1).any():
+        k, tracer = once[:, int(np.argmax(often > 1))]
+        found = f"{often.max()} lines for tracer {tracers[tracer]:g} at {times[k] - table.start:g} s"
+        raise InputError(f"{path} has {found}, but must have one: number the tracers each for itself.")
     places = np.full((len(times), len(tracers), len(axes)), np.nan)
     places[when, who] = np.stack([data[axis] for axis in axes], axis=1)
     begin = int(np.argmin(np.abs(times)))
@@ -75,7 +85,8 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
         lacking = f" of tracer {missing[0]:g}" if len(missing) else ""
         raise InputError(f"{path} lacks the place{lacking} at the start of the run, time {-table.start:g} s.")
     chosen = _within(times, last) & (times > 0.0)
-    return Tracks(simulation, places[begin], times[chosen], places[chosen], table.noise)
+    clock = table.calibrate, table.start
+    return Tracks(simulation, places[begin], times[chosen] - table.start, places[chosen], table.noise, *clock)
 
 
 def _within(times: np.ndarray, last: float) -> np.ndarray:
@@ -87,6 +98,7 @@ def _with(data: dict[str, np.ndarray], wanted: tuple[str, ...], path: Path) -> d
     for name in wanted:
         if name not in data:
             raise InputError(f"{path} has the columns {', '.join(data)}, but must have {name}.")
-        if name == "time" and np.isnan(data[name]).any():
-            raise InputError(f"{path} has lines without a time.")
+        if name in ("time", "tracer") and not np.isfinite(data[name]).all():
+            line = int(np.argmin(np.isfinite(data[name]))) + 2
+            raise InputError(f"{path}: line {line} has the {name} {data[name][line - 2]:g}, but must have a number.")
     return data

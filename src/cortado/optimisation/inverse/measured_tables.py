@@ -9,6 +9,7 @@ from cortado.scene.tables import Table
 
 Pixel = Annotated[int, count(0, 100_000)]
 Seconds = Annotated[float, quantity("s")]
+Clock = tuple[Literal["start"], ...]
 
 
 class MeasuredTable(Table):
@@ -35,8 +36,9 @@ class VideoTable(MeasuredTable):
     """The part of each frame that counts, in its pixels; all of it if left out."""
     mask: Text | None = None
     """A picture of the frames' size, beside the task's own file, black where pixels do not count."""
-    calibrate: tuple[Literal["translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
-    """What of the camera, and the fluid's extinction, is searched beside the parameters."""
+    calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
+    """What of the camera, the fluid's extinction, and the clock is searched beside the parameters; "start" is the key
+    start."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
     """Standard deviation of the linear light of a pixel; the residuals tell if left out."""
 
@@ -48,6 +50,8 @@ class SensorSeriesTable(MeasuredTable):
     """A series, compared with a [[sensor]] of the scene; heights of a surface are those of a "wave_gauge"."""
     sensor: Text
     """The name of the [[sensor]]."""
+    calibrate: Clock = ()
+    """["start"] to search the key start beside the parameters."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
     """Standard deviation of a number, in its unit; the residuals tell if left out."""
 
@@ -58,6 +62,8 @@ class TracksTable(MeasuredTable):
 
     kind: Literal["tracks"]
     """Tracers, which swim with the fluid around them."""
+    calibrate: Clock = ()
+    """["start"] to search the key start beside the parameters."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Standard deviation of a coordinate [m]; the residuals tell if left out."""
 
