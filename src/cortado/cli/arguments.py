@@ -53,8 +53,7 @@ class FrameOptions:
     record_every: int | None = None
     """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""
     fps: float | None = None
-    """Frames of the trajectory in a second that is simulated, in the place of --record-every. How fast a film shows
-    them says picture.film_speed: slower than life where a run is short."""
+    """Frames of the trajectory in a second that is simulated, not of a film; in the place of --record-every."""
 
     def check(self) -> None:
         """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""

@@ -40,7 +40,7 @@ def read_frames(
     is_folder = Path(path).is_dir()
     if is_folder and frame_rate is None:
         raise InputError(f"{path} is a folder of frames, but frame_rate is missing: give the frames in a second.")
-    times, frames = [], []
+    times, frames = list[float](), list[np.ndarray]()
     for number, (time, picture) in enumerate(_pictures(Path(path)) if is_folder else _decoded(path)):
         if number % every == 0:
             cropped = _cropped(path, picture, crop)
