@@ -135,6 +135,14 @@ def test_phases_and_an_emitter_are_told(capsys):
     assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
 
 
+def test_an_emitter_has_fluid_for_the_run_or_runs_dry(capsys):
+    asked = ["describe", str(Path(cortado.__file__).parent / "cli/templates/jet.toml"), "--time", "2"]
+    main([*asked, "--set", "emitter.duration=1.5"])
+    assert "runs dry at 1.5" in (told := capsys.readouterr().out) and "before the end of the run at 2 s" in told
+    main(asked)
+    assert "has fluid for 2.6" in capsys.readouterr().out
+
+
 def test_a_schedule_is_told(capsys):
     main(["describe", "scene.toml", "--set", "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"])
     assert "gravity changes until 0.2 s, and is constant from then on" in capsys.readouterr().out

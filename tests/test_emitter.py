@@ -216,6 +216,65 @@ def test_float32_is_near_float64():
         assert np.linalg.norm(gradient[key] - exact[key]) < 2e-3 * np.linalg.norm(exact[key]), key
 
 
+def supplied(**emitter):
+    """A slower jet with two layers in line, which are out after 0.15 s, or with other keys."""
+    return jet(emitter={**jet().emitter.model_dump(exclude={"duration"}), "length": 0.1, "flow_rate": 0.1, **emitter})
+
+
+def test_a_reserve_joins_the_column_for_as_long_as_the_run_goes():
+    dry, time = supplied(), 0.252
+    made = dry.lasting(time)
+    assert made.lasting(2.0) is made and dry.lasting(0.15) is dry
+    sample, spacing = made.emitter.sample(0.05), 0.05
+    came = made.emitter.flow_rate * time / spacing**2
+    with pytest.warns(CortadoWarning, match=r"runs dry at 0.15 s of a run to 0.252 s, .*: scene.lasting\(0.252\) has"):
+        Simulation(dry, precision="float64").run(time=time)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulation = Simulation(made, precision="float64")
+        trajectory = simulation.run(time=time)
+    gone = sample.upstream <= float(trajectory.others["emitted"][-1, 0]) * (1.0 + 1e-9)
+    assert came - sample.layer <= gone.sum() <= came and len(gone) >= came + 2 * sample.layer
+    led = trajectory.positions[:, nozzle_of(simulation).first :]
+    line = sample.upstream - sample.speed * trajectory.times[:, None]
+    place = np.add(made.emitter.outlet, sample.offsets) - line[..., None] * np.array(made.emitter.direction)
+    place += (line > sample.column)[..., None] * nozzle_of(simulation).reserve
+    np.testing.assert_allclose(led[line > 1e-9], place[line > 1e-9], rtol=0, atol=1e-12)
+    waiting = led[line > sample.column + 1e-9]
+    assert (np.abs(waiting - 0.5 * np.array(made.container.upper)) > 0.5 * np.array(made.container.upper)).all()
+
+
+def test_gradients_go_through_a_reserve():
+    made = supplied(duration=0.4, flow_rate=0.3)
+    simulation = Simulation(made, precision="float64")
+    problem = Problem(simulation, STEPS, Motion(simulation))
+    point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
+    directions = {key: direction_of(key, value) for key, value in point.items()}
+    _, gradient = problem.value_and_gradient(point)
+    adjoint = sum((gradient[key] * direction).sum() for key, direction in directions.items())
+    tangent = problem.tangent(point, directions)
+    assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
+
+
+def test_a_run_says_when_its_emitter_runs_dry():
+    """One with a duration, and one along a period, which leaves no place for a reserve."""
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "periodic": [True, False]}
+    slot = {**supplied().emitter.model_dump(), "direction": [1.0, 0.0]}
+    for made, name in ((supplied(duration=0.2), "duration"), (jet(emitter=slot, fluid=[], container=room), "length")):
+        assert made.lasting(1.0) is made
+        with pytest.warns(CortadoWarning, match=f"runs dry at .*: a longer emitter.{name} gives it more"):
+            Simulation(made).run(time=0.252)
+
+
+def test_a_run_goes_on_with_the_reserve_of_the_run_before():
+    made = supplied().lasting(0.2)
+    simulation = Simulation(made)
+    whole, half = simulation.run(STEPS), simulation.run(STEPS // 2)
+    again = Simulation(supplied().going_on(half.last_state))
+    rest = again.run(STEPS - STEPS // 2, state=half.last_state)
+    assert rest.positions[-1].tobytes() == whole.positions[-1].tobytes()
+
+
 MISTAKES = {
     "parameter nozzle_path has shape (3,), but must be (2,) or (30, 2) in m": {"nozzle_path": [0.1, 0.2, 0.3]},
     "parameter nozzle_path has shape (4, 2), but must be": {"nozzle_path": np.zeros((4, 2))},

@@ -213,6 +213,22 @@ def test_actuators_are_their_matrices():
 # ---- episodes that end -----------------------------------------------------------------------------------------------
 
 
+def test_an_episode_has_as_many_steps_as_it_is_made_with():
+    """Also more than its task has; one that is made without Gymnasium has those."""
+    horizon = TASKS["Splash"].horizon
+    for env, wanted in (
+        (gymnasium.make("cortado/Splash-v0", max_episode_steps=horizon + 2), horizon + 2),
+        (cortado.environments.FluidEnv("Splash"), horizon),
+    ):
+        env.reset(seed=1)
+        ends = [env.step(np.zeros(env.action_space.shape))[3] for _ in range(wanted)]
+        assert ends == [False] * (wanted - 1) + [True]
+    envs = cortado.environments.make_vec("Splash", 1, max_episode_steps=horizon + 2)
+    envs.reset(seed=1)
+    ends = [bool(envs.step(np.zeros((1, *env.action_space.shape)))[3][0]) for _ in range(horizon + 2)]
+    assert ends == [False] * (horizon + 1) + [True]
+
+
 def test_autoreset_in_the_next_step():
     envs = gymnasium.make_vec("cortado/Carry-v0", 2, vectorization_mode="vector_entry_point", max_episode_steps=2)
     assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
@@ -290,7 +306,9 @@ def test_in_a_batch_the_others_go_on():
 )
 def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
     env = environments("Carry").unwrapped
-    env.reset(seed=1)
+    with pytest.raises(InputError, match="options has 'goal', but must be left out, as all is drawn from the seed"):
+        env.reset(options={"goal": 0.3})
+    env.reset(seed=1, options={})
     with pytest.raises(InputError, match=sentence):
         env.step(action)
 
@@ -319,6 +337,8 @@ def test_steps_before_the_first_episode_and_other_bad_calls(environments):
     for bad in (np.array([True]), np.zeros(2, dtype=bool), [True, False]):
         with pytest.raises(InputError, match="reset_mask"):
             envs.reset(options={"reset_mask": bad})
+    with pytest.raises(InputError, match="options has 'goal', but must have reset_mask alone"):
+        envs.reset(options={"goal": 0.3})
     with pytest.raises(InputError, match="seed has 3 numbers"):
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(InputError, match="must come after reset"):

@@ -250,6 +250,14 @@ def test_a_plan_shows_where_an_emitter_shoots_and_how_large_a_scene_is(make):
     assert (box.max(axis=2) < 0.4).any()  # words below
 
 
+def test_a_plan_without_a_container_shows_all_of_the_arrow():
+    table = jet().emitter.model_dump()
+    made = jet(emitter=table, fluid=[], container={"shape": "none"}, picture={"width": 320, "height": 180})
+    image = plan(made, np.zeros((0, 2)), np.zeros((0, 3)))
+    rows = np.flatnonzero((np.abs(image - MOVING).max(axis=2) < 0.2).any(axis=1))
+    assert np.ptp(rows) > 0.5 * 180 and rows[-1] < 179  # the opening is wider than it is high
+
+
 def test_a_fluid_at_rest_does_not_flicker():
     made = scene(picture={"width": 320, "height": 180})
     simulation, noise = cortado.Simulation(made), np.random.default_rng(0)

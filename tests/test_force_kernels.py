@@ -212,9 +212,12 @@ class Emitter(Operation):
         random, first, self.kernels = np.random.default_rng(23), 2 * N // 3, emitter_kernels(FLOAT64, False)
         direction = np.array([0.6, 0.8, 0.0])
         offsets = cloud.vectors(24, N - first)[:, : cloud.dimension]
-        nozzle = Nozzle(first, np.linspace(0.1, 1.0, N - first), offsets, direction[: cloud.dimension], 0.3)
+        reserve = np.array([3.0, -2.0, 1.0])
+        own = direction[: cloud.dimension], 0.3, 0.5, reserve[: cloud.dimension]
+        nozzle = Nozzle(first, np.linspace(0.1, 1.0, N - first), offsets, *own)
         made = nozzle_type(FLOAT64)()
         made.first, made.area, made.direction = first, nozzle.area, FLOAT64.vector(*direction)
+        made.column, made.reserve = nozzle.column, FLOAT64.vector(*reserve)
         made.upstream = wp.array(nozzle.upstream, dtype=wp.float64, device=CPU)
         made.offsets = test_kernels.array(np.pad(offsets, ((0, 0), (0, 3 - cloud.dimension))))
         self.known = {"nozzle": made, "step": np.array([2], dtype=np.int32)}

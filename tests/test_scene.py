@@ -176,6 +176,20 @@ def test_a_sentence_says_what_was_found_and_wanted():
     assert found == ("scene.toml", "phase[0].rest_density", -1000.0, "greater than 0 kg/m3")
 
 
+@pytest.mark.parametrize("spacing, told", [(10.0, True), (0.01, False)])
+def test_fluid_in_millimetres_is_asked_about(spacing, told):
+    def box(cells):
+        return {"shape": "box", "lower": [0.0] * 3, "upper": [cells * spacing] * 3}
+
+    tables = {"discretisation": {"spacing": spacing}, "fluid": [{**box(45), "phase": "water"}], "container": box(50)}
+    phase = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Scene(dimension=3, phase=[phase], solver={"time_step": "auto"}, **tables)
+    sentence = "the fluid weighs about 9.1e+10 kg: are its lengths in millimetres? A scene has metres."
+    assert (sentence in [str(one.message) for one in caught]) is told
+
+
 def test_a_misspelt_key_is_told_the_right_one():
     data = good_data()
     data["solver"]["timestep"] = 0.1
@@ -183,6 +197,8 @@ def test_a_misspelt_key_is_told_the_right_one():
         scene_from_dict(data, "scene.toml")
     wanted = "scene.toml: solver.timestep is not a key of [solver]; did you mean time_step?"
     assert str(caught.value) == wanted
+    with pytest.raises(SceneError, match=r"phase\[0\].density is not a key .* did you mean rest_density\?$"):
+        Scene(**plane(phase=[{"name": "water", "density": 1000.0, "viscosity": 0.1}]))
 
 
 @pytest.mark.parametrize(

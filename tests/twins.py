@@ -69,7 +69,8 @@ def tension_twin(simulation):
 def emitter_twin(simulation, path):
     """The slow twin of its emitter, whose opening goes along a path (steps, d); None without."""
     nozzle = nozzle_of(simulation)
-    return nozzle and reference.Emitter(nozzle.upstream, nozzle.offsets, nozzle.direction, nozzle.area, path)
+    names = ("upstream", "offsets", "direction", "area", "column", "reserve")
+    return nozzle and reference.Emitter(*(getattr(nozzle, name) for name in names), path)
 
 
 def nozzle_of(simulation):

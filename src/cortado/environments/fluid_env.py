@@ -10,7 +10,14 @@ from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import SEEN, Scenes
-from cortado.environments.spaces import METADATA, checked_actions, checked_render_mode, pictures, spaces
+from cortado.environments.spaces import (
+    METADATA,
+    checked_actions,
+    checked_render_mode,
+    pictures,
+    require_options,
+    spaces,
+)
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError
@@ -52,9 +59,11 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         return self.scenes.layout
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
-        """Begin an episode; the same seed has the same bits."""
+        """Begin an episode; the same seed has the same bits. Raises `InputError` for ``options``, of which there are
+        none."""
         if self._closed:
             raise InputError("reset is called after close(), but must come before it.")
+        require_options(options)
         super().reset(seed=seed)
         self.scenes.begin({0: self.scenes.drawn(self.np_random)})
         self._over = ""
@@ -62,7 +71,8 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), {}
 
     def step(self, action: NDArray) -> tuple[Observation, float, bool, bool, Info]:
-        """An action beyond -1 to 1 is cut off there. Where the simulation diverges, the episode is terminated,
+        """An action beyond -1 to 1 is cut off there. An episode is truncated after as many steps as its task has, or as
+        `gymnasium.make` was given as ``max_episode_steps``. Where the simulation diverges, the episode is terminated,
         ``info["diverged"]`` says how in a sentence, and the observation is the last one before.
 
         Raises `InputError` for an action of another shape or that is not finite, and where no episode is going on."""
@@ -72,7 +82,7 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         rewards, lost = self.scenes.step(actions[None])
         if not lost:
             self._observation = self.scenes.observed()[0]
-        truncated = not lost and bool(self.scenes.step_number[0] >= self.scenes.task.horizon)
+        truncated = not lost and self.spec is None and bool(self.scenes.step_number[0] >= self.scenes.task.horizon)
         self._over = "after the end of an episode" if lost or truncated else ""
         info = {"diverged": lost[0]} if lost else {}
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info

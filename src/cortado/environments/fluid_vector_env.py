@@ -6,13 +6,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import require_table, whole_number
+from cortado.arrays import whole_number
 from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.fluid_env import Info, Observation
 from cortado.environments.gym import AutoresetMode, VectorEnv, batch_space, np_random
 from cortado.environments.scenes import SEEN, Scenes, Start
-from cortado.environments.spaces import METADATA, checked_actions, checked_render_mode, pictures, spaces
+from cortado.environments.spaces import (
+    METADATA,
+    checked_actions,
+    checked_render_mode,
+    pictures,
+    require_options,
+    spaces,
+)
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, shown
@@ -38,8 +45,8 @@ class FluidVectorEnv(Staying, VectorEnv):
         max_episode_steps: int | None = None,
     ):
         """``num_envs``: scenes in the batch; ``autoreset_mode`` as that of `gymnasium.vector.SyncVectorEnv`;
-        ``max_episode_steps``: after how many steps an episode is truncated, at most the horizon of the task. Others as
-        of `FluidEnv`."""
+        ``max_episode_steps``: after how many steps an episode is truncated, by default the horizon of the task. Others
+        as of `FluidEnv`."""
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
         try:
             self._mode = AutoresetMode(autoreset_mode)
@@ -52,9 +59,8 @@ class FluidVectorEnv(Staying, VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
-        horizon = self.scenes.task.horizon
-        most = horizon if max_episode_steps is None else whole_number("max_episode_steps", max_episode_steps, 1)
-        self._horizon = min(most, horizon)
+        most = self.scenes.task.horizon if max_episode_steps is None else max_episode_steps
+        self._horizon = whole_number("max_episode_steps", most, 1)
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._over = np.ones(num_envs, dtype=bool)
         """(num_envs,) whose episodes are over."""
@@ -70,7 +76,7 @@ class FluidVectorEnv(Staying, VectorEnv):
     ) -> tuple[Observation, Info]:
         """Begin episodes: all of them, or those of ``options={"reset_mask": (num_envs,) bool}``. A number as ``seed``
         gives environment b the seed + b."""
-        require_table("options", options or {}, "{'reset_mask': array of bool}")
+        require_options(options, "reset_mask")
         if self.closed:
             raise InputError("reset is called after close(), but must come before it.")
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))

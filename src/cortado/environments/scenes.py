@@ -119,7 +119,7 @@ class Scenes:
         for b, error in self._stepper.rollout.lost.items():
             lost[b] = f"The episode ended in its step {self.step_number[b]}: {error}"
             # As if every step that is left had the least reward: to end early is never worth it.
-            rewards[b] = self.task.lowest * (self.task.horizon - self.step_number[b] + 1)
+            rewards[b] = self.task.lowest * max(self.task.horizon - self.step_number[b] + 1, 1)
         self._lost = set(lost)
         return rewards, lost
 

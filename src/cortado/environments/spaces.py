@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_numbers, require_table
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import Scenes
 from cortado.errors import InputError, shown
@@ -40,6 +40,15 @@ def checked_render_mode(mode: str | None) -> str | None:
     if mode not in (None, *METADATA["render_modes"]):
         raise InputError(f'render_mode is {shown(mode)}, but must be None or "rgb_array".')
     return mode
+
+
+def require_options(options: Any, *known: str) -> None:
+    """Raises `InputError` for options of a reset that are no table, or that have others than the known ones."""
+    require_table("options", options or {}, "{'reset_mask': array of bool}")
+    for name in options or {}:
+        if name not in known:
+            wanted = f"have {', '.join(known)} alone" if known else "be left out, as all is drawn from the seed"
+            raise InputError(f"options has {shown(name)}, but must {wanted}.")
 
 
 def pictures(scenes: Scenes) -> list[NDArray[np.uint8]]:

@@ -28,15 +28,13 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
     if scene.emitter is not None:
         opening = scene.emitter.opening(spacing)
         paths += [opening] if scene.dimension == 2 else []
+        paths.append(_arrow(scene, np.concatenate([positions, opening])))
         shown = opening if scene.dimension == 3 or not len(positions) else opening[:0]
         positions = np.concatenate([positions, shown])
         colours = np.concatenate([colours, np.tile(MOVING, (len(shown), 1))])
     draws = painter(scene, np.concatenate([positions, *paths]), device, _poses(scene))
     image, stage = draws.image(positions, colours), draws.stage
     ends = scene.container.extent() or (positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing)
-    size = float(np.max(ends[1] - ends[0]))
-    if scene.emitter is not None:
-        paths.append(_arrow(np.array(scene.emitter.outlet), np.array(scene.emitter.direction), ARROW * size))
     thin = max(round(look.height / 240), 1)
     edges = _edges(stage, *ends)
     image = lined(image, [stage.on_screen(path) for path in paths], MOVING, thin)
@@ -61,8 +59,13 @@ def _poses(scene: Scene) -> list[Scene]:
     return found
 
 
-def _arrow(start: Points, direction: Points, length: float) -> Points:
-    """(5, d) [m] a line and its head, in one stroke."""
+def _arrow(scene: Scene, positions: Points) -> Points:
+    """(5, d) [m] a line and its head, in one stroke, out of the opening of an emitter; at least as long as the opening
+    is wide. Without a container what is shown is at positions (n, d) [m]."""
+    assert scene.emitter is not None
+    start, direction = np.array(scene.emitter.outlet), np.array(scene.emitter.direction)
+    size = np.ptp(scene.container.extent() or positions, axis=0).max()
+    length = max(ARROW * float(size), 2.0 * scene.emitter.radius)
     tip = start + length * direction
     aside = np.eye(len(start))[int(np.abs(direction).argmin())]
     aside = aside - (aside @ direction) * direction

@@ -6,6 +6,7 @@ import numpy as np
 
 from cortado.errors import DivergedError
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.supply import dry_sentence
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import Solve
 from cortado.words import counted
@@ -22,6 +23,8 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
         yield f"{found} iterations: try a smaller time step."
     if early := early_sentence(rollout):
         yield early
+    if scene.solver.chooses and (dry := dry_sentence(scene, rollout)):
+        yield dry
     if rollout.lost:
         yield lost_sentence(rollout.lost, rollout.solver.layout.members)
 

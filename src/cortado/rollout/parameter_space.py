@@ -16,6 +16,7 @@ from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import greatest_step
+from cortado.rollout.supply import dry_sentence
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.restart import Clock, Origin, RestartState
@@ -142,6 +143,8 @@ class ParameterSpace:
 
         rollout.advice = advice
         rollout.parameters.set(stacked(chosen))
+        if not simulation.scene.solver.chooses:
+            self._warn(dry_sentence(simulation.scene, rollout))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:
             raise InputError(

@@ -156,7 +156,7 @@ def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
 
 
 def _check_length(emitter: EmitterTable, spacing: float) -> None:
-    if emitter.layers(spacing) == 0.0:
+    if emitter.length is not None and emitter.layers(spacing) == 0.0:
         wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
         raise field_error(("emitter", "length"), emitter.length, wanted)
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import field_validator
@@ -28,6 +28,12 @@ class EmitterSample:
     """[m/s]"""
     layer: int
     """Particles in a layer; m is a multiple of it."""
+    column: float
+    """Length of the column that waits in line [m]; what is further upstream is in reserve."""
+
+
+COLUMN = 6.0
+"""Length of the column where none is given, in spacings: fluid at the opening has others behind it, and they too."""
 
 
 class EmitterTable(FluidBody):
@@ -39,10 +45,13 @@ class EmitterTable(FluidBody):
     """(d,) Direction of the flow; its length does not matter."""
     radius: Annotated[float, quantity("m", gt=0.0)]
     """Of the opening [m]."""
-    length: Annotated[float, quantity("m", gt=0.0)]
-    """Of the column that waits upstream of the opening [m]."""
+    length: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Of the column that waits upstream of the opening [m]; six spacings if left out."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
     """Volume, in 2-D area, that comes out in a second [m3/s (m2/s in 2-D)]."""
+    duration: Annotated[float, quantity("s", gt=0.0)] | None = None
+    """For how long fluid comes out [s], of particles in reserve that join the end of the column. If left out, commands
+    such as `cortado run` have enough for the run, and `Simulation` has what is in the column: see `Scene.lasting`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """How far a particle is from its place in the lattice of its layer at most, along each axis of the opening and in
     spacings, at random but the same in every run. With the solver "projection" it is 0.05 if it is not given: a stream
@@ -58,8 +67,28 @@ class EmitterTable(FluidBody):
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
     def layers(self, spacing: float) -> float:
-        """How many layers have their middle within the length, a whole number that may be larger than any array."""
-        return float(max(math.ceil(self.length / spacing - 0.5 - ROUND_OFF), 0))
+        """How many layers the column has, with their middle within its length, or all if they are fewer: a whole number
+        that may be larger than any array."""
+        length = COLUMN * spacing if self.length is None else self.length
+        within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
+        return within if self.duration is None else min(within, self.supply(spacing))
+
+    def supply(self, spacing: float) -> float:
+        """How many layers there are, with those in reserve."""
+        if self.duration is None:
+            return self.layers(spacing)
+        return float(max(math.ceil(self.duration * self.speed(spacing) / spacing - ROUND_OFF), 1))
+
+    def dry_after(self, spacing: float) -> float:
+        """When all is out [s]."""
+        return self.supply(spacing) * spacing / self.speed(spacing)
+
+    def lasting(self, time: float, spacing: float) -> Self:
+        """This table with a duration, if it has none and the column is out before a time [s]: the column is whole
+        then."""
+        if self.duration is not None or self.dry_after(spacing) >= time:
+            return self
+        return self.model_copy(update={"duration": time + self.dry_after(spacing)})
 
     def speed(self, spacing: float) -> float:
         """[m/s]; with it the volume of the particles that come out is that of the flow rate."""
@@ -70,9 +99,9 @@ class EmitterTable(FluidBody):
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
-        """The particles on a lattice of the spacing [m]."""
+        """The particles on a lattice of the spacing [m], those in reserve in line behind the column."""
         cross_section = self._cross_section(spacing)
-        layers, speed = int(self.layers(spacing)), self.speed(spacing)
+        layers, speed = int(self.supply(spacing)), self.speed(spacing)
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
         moves = np.random.default_rng(0).uniform(-self.jitter, self.jitter, (len(upstream), len(self.outlet) - 1))
         offsets = np.tile(cross_section, (layers, 1)) + spacing * moves @ across(self.direction)
@@ -83,11 +112,12 @@ class EmitterTable(FluidBody):
             velocities=np.tile(speed * np.array(self.direction), (len(upstream), 1)),
             speed=speed,
             layer=len(cross_section),
+            column=self.layers(spacing) * spacing,
         )
 
     def count(self, spacing: float) -> float:
         cells = disc_cells(self.radius, spacing, len(self.outlet) - 1)
-        return float(np.prod(cells)) * self.layers(spacing)
+        return float(np.prod(cells)) * self.supply(spacing)
 
     def extent(self, spacing: float) -> tuple[Points, Points]:
         opening, direction = self.opening(spacing), np.array(self.direction)
@@ -97,7 +127,9 @@ class EmitterTable(FluidBody):
         return lower - np.maximum(first, last), upper - np.minimum(first, last)
 
     def particles(self, spacing: float) -> Points:
-        return self.sample(spacing).positions
+        """(n, d) [m] those of the column."""
+        sample = self.sample(spacing)
+        return sample.positions[sample.upstream < sample.column]
 
     def _cross_section(self, spacing: float) -> Points:
         """(n, d) offsets of the particles of a layer from the axis [m]."""

@@ -68,6 +68,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
     emitted = None
     if scene.emitter is not None:
         emitted = scene.emitter.sample(spacing)
+        emitted.positions[emitted.upstream > emitted.column] += reserve_offset(scene)
         positions.append(emitted.positions)
         velocities.append(emitted.velocities)
         phases.append(names.index(scene.emitter.phase))
@@ -83,6 +84,18 @@ def fluid_particles(scene: Scene) -> FluidSample:
         is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),
         emitter=emitted,
     )
+
+
+def reserve_offset(scene: Scene) -> Points:
+    """(d,) [m] how far from their place in line particles wait that are in reserve: along every axis without a period
+    beyond all else, upstream of the opening."""
+    assert scene.emitter is not None
+    spacing, direction = scene.discretisation.spacing, np.array(scene.emitter.direction)
+    boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
+    ends = np.array([[scene.emitter.outlet] * 2, scene.container.extent() or [scene.emitter.outlet] * 2, *boxes])
+    size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
+    aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
+    return 2.0 * (size + scene.discretisation.support_radius) * aside
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:

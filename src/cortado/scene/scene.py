@@ -9,18 +9,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 from pydantic import model_validator
 
+from cortado.arrays import as_one_number
+from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
+from cortado.scene.restart import RestartState
 from cortado.scene.sentences import sentences
-from cortado.scene.stability import broken_limit
+from cortado.scene.stability import broken_limit, longest_step
 from cortado.scene.toml import put_in, read_toml
 from cortado.scene.viscous_forms import wall_sentence
 
 LIGHTEST = 50.0
 """Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
+HEAVIEST = {2: 3e5, 3: 3e6}
+"""By the dimension, the mass of fluid above which a scene warns [kg]: that of water 30 m x 10 m, and 10 m deep."""
 
 
 class Scene(SceneTables):
@@ -33,6 +39,8 @@ class Scene(SceneTables):
             if phase.rest_density < LIGHTEST:
                 found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
                 warn(f"{found}, less than any liquid has: is it in g/cm3?")
+        if wrong := _millimetres(self):
+            warn(wrong)
         time_step = self.solver.time_step
         if time_step == "auto":
             check_bounded(self)
@@ -51,6 +59,40 @@ class Scene(SceneTables):
         """
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
+    def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
+        """The same scene with an emitter that has in reserve what a run for a time [s], or of so many ``steps``, takes.
+
+        It is the scene as it is where that has no emitter, or one with a duration, where the column suffices, and where
+        fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more particles
+        than memory holds.
+        """
+        emitter, spacing = self.emitter, self.discretisation.spacing
+        lengths = self.container.periods(self.dimension)[1]
+        if steps is not None:
+            time = steps * longest_step(self)
+        if emitter is None or time is None or np.any((lengths > 0.0) & (np.array(emitter.direction) != 0.0)):
+            return self
+        if not as_one_number("time", time) < np.inf:
+            raise InputError(f"time is {time:g}, but must be a number of seconds greater than 0.")
+        lasting = emitter.lasting(time, spacing)
+        if lasting is emitter:
+            return self
+        require(sampling_parts(lasting.count(spacing), 0.0), "take less time, or give emitter.duration")
+        return self.model_copy(update={"emitter": lasting})
+
+    def going_on(self, state: RestartState) -> "Scene":
+        """The same scene with an emitter that has as many particles as the run that a state is of."""
+        emitter, origin, spacing = self.emitter, state.origin, self.discretisation.spacing
+        if emitter is None or origin is None or emitter.duration is not None:
+            return self
+        layers = origin.waiting / emitter.sample(spacing).layer
+        duration = layers * spacing / emitter.speed(spacing)
+        return (
+            self
+            if layers <= emitter.layers(spacing)
+            else self.model_copy(update={"emitter": emitter.model_copy(update={"duration": duration})})
+        )
+
     def to_json(self) -> str:
         """The scene with all defaults filled in but colours, which materials may have, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
@@ -67,6 +109,8 @@ class Scene(SceneTables):
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = {name for name in ("shifting", "velocities_follow") if not getattr(self.solver, name, True)}
         aside["solver"] = unused | off
+        if self.emitter and self.emitter.duration is None:
+            aside["emitter"] = {*aside.get("emitter", ()), "duration"}
         aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}
         aside["container"] = {"material", "colour"}
         return json.dumps(self.model_dump(mode="json", exclude=aside, context="colours"), indent=2)
@@ -84,6 +128,18 @@ class Scene(SceneTables):
         if given and isinstance(data, dict):
             data = put_in(_given(data), overrides, file)
         return scene_from_dict(data)
+
+
+def _millimetres(scene: SceneTables) -> str | None:
+    """What to say of fluid that weighs so much that its lengths may be in millimetres; None where it does not, or where
+    gravity is not the Earth's in metres."""
+    densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
+    cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
+    mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
+    if mass < HEAVIEST[scene.dimension] or not 0.1 < strength / 9.81 < 10.0:
+        return None
+    layer = " in a layer of 1 m" if scene.dimension == 2 else ""
+    return f"the fluid weighs about {mass:.2g} kg{layer}: are its lengths in millimetres? A scene has metres."
 
 
 def _given(value: Any) -> Any:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validato
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from cortado.errors import InputError
+from cortado.errors import InputError, Words
 from cortado.scene.docstrings import field_docstrings
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
 from cortado.scene.sentences import UNKNOWN, absent, sentences
@@ -83,7 +83,9 @@ def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCus
 
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
-    close = get_close_matches(key, known, n=1)
+    longer = [name for name in known if key in name.split("_")]
+    close = longer or get_close_matches(key, known, n=1)
     others = f"{missing}." if (missing := absent(key)) else f"its keys are {', '.join(known)}."
     advice = f"did you mean {close[0]}?" if close else others
-    return field_error((key,), UNKNOWN, f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
+    found = Words("short for another") if longer else UNKNOWN
+    return field_error((key,), found, f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")

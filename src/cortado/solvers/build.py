@@ -21,6 +21,7 @@ from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.motions import moving, solid_frames, wall_numbers
 from cortado.scene.parameters.registry import PARAMETERS
+from cortado.scene.sampling import reserve_offset
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 from cortado.solvers.contacts import Contacts, Touching
@@ -211,6 +212,8 @@ def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
         offsets=sample.offsets,
         direction=np.array(scene.emitter.direction),
         area=scene.emitter.flow_rate / sample.speed,
+        column=sample.column,
+        reserve=reserve_offset(scene),
     )
 
 

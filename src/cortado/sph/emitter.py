@@ -33,6 +33,10 @@ class Nozzle:
     """(d,) of the flow, a unit vector"""
     area: float
     """Of the opening [m2], in 2-D [m]."""
+    column: float
+    """Particles further upstream are in reserve [m]."""
+    reserve: np.ndarray
+    """(d,) how far these are from their place in line [m]"""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
@@ -54,7 +58,9 @@ class Emitter(Part):
         constants.first, constants.area = nozzle.first, nozzle.area
         constants.upstream = wp.array(nozzle.upstream, dtype=precision.real, device=device)
         constants.offsets = to_device(nozzle.offsets, precision, device)
-        constants.direction = precision.vector(*np.pad(nozzle.direction, (0, 3 - len(nozzle.direction))))
+        constants.column, padding = nozzle.column, (0, 3 - len(nozzle.direction))
+        constants.direction = precision.vector(*np.pad(nozzle.direction, padding))
+        constants.reserve = precision.vector(*np.pad(nozzle.reserve, padding))
         self.constants = {"nozzle": constants, **layout.state(self.fields, requires_grad).named()}
         """Of the nozzle, and of a step once it has begun, for kernels."""
 

@@ -6,7 +6,8 @@ s = u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
 q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate and A its area.
-Position and velocity do not jump when a particle becomes free.
+Position and velocity do not jump when a particle becomes free. Particles in reserve, further upstream than the column
+is long, are elsewhere, by a constant vector, until they join its end.
 """
 
 from dataclasses import dataclass
@@ -47,6 +48,10 @@ def nozzle_type(precision: Precision) -> Any:
         """o [m]"""
         direction: vector
         """e"""
+        column: real
+        """Particles further upstream are in reserve [m]."""
+        reserve: vector
+        """How far these are from their place in line [m]."""
         area: real
         """A [m^(d - 1)]"""
 
@@ -112,7 +117,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         s = remaining(p, nozzle, emitted[b])
         q = nozzle_path[b, step[b]]
         if s > real(0.0):
-            x[i] = q + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
+            place = q + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
+            x[i] = wp.where(s > nozzle.column, place + nozzle.reserve, place)
             v[i] = (q - outlet[b]) / time_step[b] + (flow_rate[b] / nozzle.area) * nozzle.direction
         else:
             x[i] = x_free[i]

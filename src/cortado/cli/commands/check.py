@@ -31,8 +31,9 @@ def check_scene(
     """The certificate as text; raises `ComputationError` when an adjoint is wrong."""
     if loss not in LOSSES:
         raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
-    simulation = Simulation(load_scene(scene_file, overrides), device, "float64")
-    problem = Problem(simulation, check_steps(steps), _loss(loss, simulation))
+    scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
+    simulation = Simulation(scene, device, "float64")
+    problem = Problem(simulation, steps, _loss(loss, simulation))
     if out is not None:
         _make(out)
     certificate = certify(problem, parameters, perturbation, seed)

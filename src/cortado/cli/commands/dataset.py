@@ -46,7 +46,9 @@ class Member:
 
     def scene(self, number: int) -> Scene:
         """That of a run."""
-        return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides])
+        return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
+            steps=self.table.steps
+        )
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
         """Compute a run and write it; returns whether there is one, and what it was warned of."""

@@ -78,7 +78,7 @@ def describe_scene(
     """As text, or as JSON; a picture of the first state is written where one is asked for."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
-    simulation = Simulation(load_scene(scene_file, overrides), device, precision)
+    simulation = Simulation(load_scene(scene_file, overrides).lasting(time, steps), device, precision)
     length = RunLength.of(simulation, steps, time, frames)
     found = _described(simulation, length)
     if length.film is not None:
@@ -102,8 +102,9 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
         "particles": simulation.particles,
         "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
         "particles_in_emitter": simulation.particles - simulation.free_particles,
+        "emitter_runs_dry_at_s": _dry_at(scene),
         "wall_particles": len(simulation.walls),
-        "fluid_size_m": (np.ptp(simulation.positions, axis=0) + scene.discretisation.spacing).tolist(),
+        "fluid_size_m": _fluid_size(simulation),
         "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
         "mass_of_phase_kg": _masses(simulation),
         "gravity_m_s2": list(scene.forces.gravity),
@@ -118,6 +119,18 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     }
     steps = length.steps
     return {**found, **length.for_machines(), **_memory(simulation, steps), **_expected(simulation, steps)}
+
+
+def _fluid_size(simulation: Simulation) -> list[float]:
+    """(d,) [m] with what waits in line in an emitter, and without its reserve."""
+    emitter, spacing = simulation.scene.emitter, simulation.scene.discretisation.spacing
+    shown = simulation.free_particles + (0 if emitter is None else len(emitter.particles(spacing)))
+    return (np.ptp(simulation.positions[:shown], axis=0) + spacing).tolist()
+
+
+def _dry_at(scene: Scene) -> float | None:
+    """When all of the emitter is out [s]; None without one."""
+    return None if scene.emitter is None else scene.emitter.dry_after(scene.discretisation.spacing)
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
@@ -202,6 +215,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
             else f"{found['time_step_s']:g} s; {allowed}",
         ),
         ("viscosity", found["viscosity"]),
+        *_emitter(found, length),
         (
             "memory",
             f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
@@ -228,6 +242,16 @@ def _size(found: dict[str, Any]) -> str:
     container = f", in a container of {held} m" if held else ""
     gravity = vector(found["gravity_m_s2"])
     return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
+
+
+def _emitter(found: dict[str, Any], length: RunLength) -> list[tuple[str, str]]:
+    """When all of it is out, and whether that is before the end of the run."""
+    dry = found["emitter_runs_dry_at_s"]
+    if dry is None:
+        return []
+    if length.time is None or dry >= length.time * (1.0 - SAME):
+        return [("emitter", f"has fluid for {dry:.4g} s")]
+    return [("emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s")]
 
 
 def _time(found: dict[str, Any], length: RunLength) -> str:

@@ -73,9 +73,10 @@ def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, A
 
 def run_scene(scene_file: Path, asked: RunRequest) -> str:
     """Run a scene, write its folder, and return a sentence that says where the results are."""
-    scene = load_scene(scene_file, asked.overrides)
-    simulation = Simulation(scene, asked.device, asked.precision)
     state = None if asked.state is None else _last_state(asked.state)
+    scene = load_scene(scene_file, asked.overrides)
+    scene = scene.lasting(asked.time, asked.steps) if state is None else scene.going_on(state)
+    simulation = Simulation(scene, asked.device, asked.precision)
     rollout = simulation.rollout(asked.steps, state=state, time=asked.time)
     numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(asked.frames.expected(rollout), numbers, simulation.precision.bytes)

@@ -15,6 +15,7 @@ from cortado.pictures.pace import Pace
 from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.outcome import not_converged_sentence
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.supply import dry_sentence
 from cortado.runs.colouring import coloured_by
 from cortado.runs.report import Figures, Section, write_report
 from cortado.runs.run_figures import density_errors, readings
@@ -115,7 +116,9 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
     substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
     where = f"{simulation.precision.name} on {simulation.device}"
     question = f"How does the fluid move? The scene: {scene_in_words(scene, simulation.particles)}"
-    return [question, f"{length}, in {where}.{wall}{substeps}"]
+    dry = dry_sentence(scene, rollout)
+    told = [f"{dry[0].upper()}{dry[1:]}"] if dry else []
+    return [question, f"{length}, in {where}.{wall}{substeps}", *told]
 
 
 def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:

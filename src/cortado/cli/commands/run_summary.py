@@ -20,7 +20,7 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Of all particles [J], in 2-D of a layer one metre thick."""
+    """Of all particles but those that wait in an emitter [J], in 2-D of a layer one metre thick."""
 
     kinetic: float
     potential: float
@@ -34,7 +34,8 @@ class Energy:
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
         """Of a state, in the gravity of a step, counted from 0."""
-        fields = state.numpy(simulation.dimension, only=["positions", "velocities", "reference_density"])
+        names, out = ("positions", "velocities", "reference_density"), _out(simulation, state)
+        fields = {name: array[out] for name, array in state.numpy(simulation.dimension, only=names).items()}
         masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
         positions, velocities = (fields[name].astype(np.float64) for name in ("positions", "velocities"))
         gravity = rollout.parameters["gravity"].numpy()[0, step, : simulation.dimension].astype(np.float64)

@@ -5,6 +5,7 @@ of the milk that has been poured from where it is under the hidden path at the s
 radius of the cup.
 """
 
+import warnings
 from functools import cache
 from typing import Any
 
@@ -15,6 +16,7 @@ from cortado.environments.actuators import Actuator, Position
 from cortado.environments.reward import Reward
 from cortado.environments.task import COFFEE, MILK, Task
 from cortado.environments.terms import Missed
+from cortado.errors import CortadoWarning
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
@@ -74,7 +76,9 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
-    run = simulation.run(steps, {nozzle.parameter: path}, record_every=task.substeps)
+    with warnings.catch_warnings():  # of the milk, which is out before the end
+        warnings.simplefilter("ignore", CortadoWarning)
+        run = simulation.run(steps, {nozzle.parameter: path}, record_every=task.substeps)
     emitter = simulation.scene.emitter
     assert emitter is not None
     sample, first = emitter.sample(task.spacing), simulation.free_particles

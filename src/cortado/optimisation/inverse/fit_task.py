@@ -96,4 +96,4 @@ def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[Measured
         raise error.in_file(file) from None
     except InputError as error:
         raise SceneError(file, "", sentence=f"cannot be a task: {error}") from None
-    return MeasuredScene(file, scene, tables.problem), tables
+    return MeasuredScene(file, scene.lasting(steps=tables.problem.steps), tables.problem), tables

@@ -64,6 +64,7 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
                 None, "problem.measured", Words("given"), "left out: measured data is fitted by cortado fit"
             )
         true, steps = problem.target or {}, problem.steps
+        scene = scene.lasting(steps=steps)
         for name in optimise.start:
             if problem.picture is None and name not in true:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
