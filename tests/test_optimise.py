@@ -219,7 +219,10 @@ def test_a_search_beyond_its_horizon_names_the_certificate_and_the_pair():
     assert found.misled and not found.converged
     for name in ("certify", "AdjointViscosity() and the optimiser LineSearch"):
         assert name in found.message
-    near = optimise(Problem(simulation, 20, FinalPositions(simulation.positions)), start, "lbfgs", 4)
+    short = Problem(simulation, 20, FinalPositions(simulation.positions))
+    still = optimise(short, start, Adam(1e-9), 8)
+    assert still.stays and not still.misled and "AdjointViscosity() with the optimiser LineSearch" in still.message
+    near = optimise(short, start, "lbfgs", 4)
     assert not near.misled and "certify" not in near.message
 
 

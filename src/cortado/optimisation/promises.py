@@ -12,7 +12,9 @@ WRONG = 10.0
 """A step contradicts its gradients if it changed the loss by less than the smaller promise of both its ends over this,
 or by more than the greater one times this."""
 FELT = 0.01
-"""Of the range of all losses: smaller promises tell nothing, as they may be round-off."""
+"""Of the range of all losses: smaller promises tell little."""
+ROUND_OFF = 1e-5
+"""Of the greatest loss: smaller promises tell nothing, as losses of runs in float32 are not as precise."""
 MISLED = 0.25
 """Share of the steps that tell, of which at least `FEW` have to contradict: in searches of 30 to 400 steps of a splash
 it was 0 within the horizon, and 0.3 to 0.9 beyond it."""
@@ -52,7 +54,8 @@ class Promises:
         """How many steps contradict their gradients, and how many tell."""
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
-        tells = (np.sign(first) == np.sign(last)) & (most > FELT * (max(self.losses) - min(self.losses)))
+        felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
+        tells = (np.sign(first) == np.sign(last)) & (most > felt)
         along = np.sign(first) * change
         broken = (along < least / WRONG) | (along > most * WRONG)
         return int(np.count_nonzero(tells & broken)), int(np.count_nonzero(tells))
@@ -87,6 +90,10 @@ class Promises:
             said = f" The loss has stayed at {min(self.losses) / self.losses[0]:.0%} of the first one, maybe in a wrong"
             said += " valley."
             to_try += ["fewer steps"] if is_run else []
+            if is_run and is_exact:
+                pair = "the gradient AdjointViscosity() with the optimiser LineSearch"
+                said += f" Try {', or '.join(to_try)}; or {pair}, where certify says that the exact one is of no use."
+                return Doubt(misled, stays, said)
         else:
             return Doubt(misled, stays, "")
         to_try += [] if by_direction else ["the optimiser LineSearch, which steps over dents"]
