@@ -148,6 +148,33 @@ def test_where_there_can_be_no_law_it_is_a_sentence():
         Rheology(turned)
 
 
+@pytest.mark.parametrize("kind", ["bingham", "herschel_bulkley"])
+def test_a_film_that_does_not_yield_creeps_as_slowly_as_is_said(kind):
+    """98 Pa at the wall of 150 Pa, however thin it is once it flows: the closed form of `cortado.scene.creep`."""
+    depth, deep, slope = 0.1, 8, 0.1
+    spacing, size, sides = depth / deep, math.hypot(1.0, slope), {"periodic": [True, False], "slip": "no"}
+    index = {"flow_index": 0.6} if kind == "herschel_bulkley" else {}
+    phase = {"rest_density": 1000.0, "viscosity": 0.01, "rheology": {"kind": kind, "yield_stress": 150.0, **index}}
+    with pytest.warns(cortado.CortadoWarning, match=r"below 150 Pa, it creeps, at up to 0.0025 m/s: its depth, 0.1 m"):
+        made = plane(
+            discretisation={"spacing": spacing},
+            phase=[{"name": "mud", **phase}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, depth], "phase": "mud"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, 1.5 * depth], **sides},
+            forces={"gravity": [9.81 * slope / size, -9.81 / size], "viscosity": "stress"},
+            solver={"time_step": 0.002},
+        )
+    end = Simulation(made, precision="float64").run(200)
+    heights, speeds = end.positions[-1][:, 1] / depth, end.velocities[-1][:, 0]
+    r = 1000.0 * 9.81 * slope / size * depth / 150.0
+    left = 1.0 - r * (1.0 - heights)  # of the yield stress, beyond the stress at each height
+    wanted = depth / 40.0 * (heights + (left * np.log(left) - (1.0 - r) * math.log(1.0 - r)) / -r)
+    inside = heights > 1.0 / deep  # particles at the wall are slower still
+    np.testing.assert_allclose(speeds[inside], wanted[inside], rtol=0.02)
+    assert (speeds < 1.02 * wanted).all() and speeds.max() < depth / 40.0
+    assert end.diagnostics["viscous_iterations"].max() < 200
+
+
 @pytest.mark.parametrize("named", [None, {"kind": "bingham", **KINDS["bingham"]}])
 def test_two_laws_are_one_too_many(named):
     laws = [Rheology(cross, time=0.4, index=0.8), Rheology(cross, "other", time=0.1, index=0.5)]

@@ -7,6 +7,11 @@ from pydantic import Field
 from cortado.scene.fields import quantity
 from cortado.scene.tables import Table
 
+SHORTEST = 40.0
+"""Regularisation [s] that a fluid with a yield stress has at least, if it is not given: what does not yield creeps at
+2.5 % of its depth in a second at most. Beside a longer one the edge of a plug is less sharp than 40 particles across
+resolve: its speed between plates is off by 0.8 % with 40 s, by 2.7 % with 100 s."""
+
 
 class RheologyTable(Table):
     """A law of viscosity; its numbers are parameters, such as ``carreau.flow_index``."""
@@ -66,13 +71,13 @@ class Yielding(RheologyTable):
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Below it the fluid hardly flows [Pa]."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """m of Papanastasiou (1987) [s]: the viscosity at rest is finite, yield_stress m more; 100 viscosity / yield_stress
-    if left out."""
+    """m of Papanastasiou (1987) [s]: at rest the viscosity is finite, yield_stress m more, so that fluid which does not
+    yield creeps, at its depth / m at most; the longer of 40 s and 100 viscosity / yield_stress if left out."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
         growth = self.regularisation
         if growth is None:
-            growth = 100.0 * viscosity / self.yield_stress if self.yield_stress * viscosity > 0.0 else 1.0
+            growth = max(100.0 * viscosity / self.yield_stress if self.yield_stress > 0.0 else 0.0, SHORTEST)
         return {**super().numbers(viscosity), "regularisation": growth}
 
     def thickest(self, viscosity: float) -> float:

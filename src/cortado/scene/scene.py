@@ -16,6 +16,7 @@ from cortado.arrays import as_one_number
 from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
+from cortado.scene.creep import creep_sentence
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
 from cortado.scene.sentences import sentences
@@ -47,8 +48,8 @@ class Scene(SceneTables):
         elif broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
             warn(f"{found}, which comes from {broken[0]}.")
-        if wrong := wall_sentence(self):
-            warn(wrong)
+        for sentence in filter(None, (wall_sentence(self), creep_sentence(self))):
+            warn(sentence)
         return self
 
     def replaced(self, *overrides: str) -> "Scene":

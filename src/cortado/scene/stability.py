@@ -194,14 +194,19 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
     if not scene.forces.pressure or not acts.any() or not scene.fluid:
         return limits
     cut = scene.discretisation
-    extents = np.array([fluid.extent(cut.spacing) for fluid in scene.fluid])
-    covered = np.array([_covered(extents[:, :, axis], cut.spacing) for axis in range(scene.dimension)])
     pulls = np.abs(gravity[acts])
-    along = pulls * covered
+    along = pulls * fluid_lengths(scene)
     upright = np.take_along_axis(along, pulls.argmax(axis=1)[:, None], axis=1)[:, 0]
     depths = 0.5 * (upright + along.sum(axis=1)) / np.sqrt(np.linalg.norm(pulls, axis=1))  # times sqrt(|g|)
     limits[acts] = DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths
     return limits
+
+
+def fluid_lengths(scene: SceneTables) -> Points:
+    """(d,) [m] along each axis, of the fluid at the start, without what is empty between bodies; there is some."""
+    spacing = scene.discretisation.spacing
+    extents = np.array([fluid.extent(spacing) for fluid in scene.fluid])
+    return np.array([_covered(extents[:, :, axis], spacing) for axis in range(scene.dimension)])
 
 
 def _covered(ends: Points, spacing: float) -> float:
