@@ -17,6 +17,7 @@ from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.creep import creep_sentence
+from cortado.scene.idle_keys import check_idle, idle_sentences
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
 from cortado.scene.sentences import sentences
@@ -36,6 +37,7 @@ class Scene(SceneTables):
     @model_validator(mode="after")
     def _check(self) -> Self:
         check_scene(self)
+        check_idle(self)
         for phase in self.phase:
             if phase.rest_density < LIGHTEST:
                 found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
@@ -48,7 +50,7 @@ class Scene(SceneTables):
         elif broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
             warn(f"{found}, which comes from {broken[0]}.")
-        for sentence in filter(None, (wall_sentence(self), creep_sentence(self))):
+        for sentence in filter(None, (wall_sentence(self), creep_sentence(self), *idle_sentences(self))):
             warn(sentence)
         return self
 

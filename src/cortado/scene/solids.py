@@ -164,6 +164,8 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
             raise field_error((*path, "times"), MISSING, f"a list of times, as there are {wrong[0]}")
         if not given:
             raise field_error((*path, "velocity"), MISSING, 'given, or times with positions, as motion is "path"')
+    elif not set(rows) & set(given):
+        raise field_error((*path, "positions"), MISSING, "given, or rotations, as there are times")
     else:
         _check_knots(solid, dimension, path)
         if wrong := [name for name in steady if name in given]:

@@ -74,6 +74,8 @@ class DatasetTable(Table):
             raise field_error(("test",), self.test, f"less than {1.0 - self.valid:g}, so that runs to train are left")
         if not self.vary and not self.position_noise and not self.velocity_noise:
             raise field_error(("vary",), "nothing", "given, or position_noise or velocity_noise, so that runs differ")
+        if not self.tangents and self.tangent_frames != "last":
+            raise field_error(("tangent_frames",), self.tangent_frames, "left out, as there are no tangents")
         for key in self.logarithmic:
             if key not in self.vary:
                 raise field_error(("logarithmic",), key, "one of the keys of vary")
