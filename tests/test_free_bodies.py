@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from cortado import InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.solids.mass import Mass
@@ -10,6 +11,7 @@ from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.solid_motion import posed
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.solid_shapes import AnySolid
 from cortado.solvers.contact_strength import STIFFNESS
 from floating_bodies import floating_box
 
@@ -100,13 +102,92 @@ def touching_in_space():
     return space(raft, {**ball, "density": 300.0, "velocity": [0.0, -0.4, 0.1]})
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_mass_has_the_volume_and_the_inertia_of_its_shape(dimension):
-    table = (plane(RAFT) if dimension == 2 else space(BRICK)).solid[0]
-    mass, sides = Mass.of(table.own_solid()), np.subtract(table.upper, table.lower)
-    assert mass.volume == pytest.approx(np.prod(sides), rel=2e-3)
-    about_z = np.prod(sides) * (sides[0] ** 2 + sides[1] ** 2) / 12.0
-    assert mass.inertia[2, 2] == pytest.approx(about_z, rel=3e-3)
+def rod(radius, length):
+    """Volume of a cylinder, and its inertia about its axis and across it."""
+    volume = np.pi * radius**2 * length
+    return volume, 0.5 * volume * radius**2, volume * (radius**2 / 4.0 + length**2 / 12.0)
+
+
+def capsule(radius, length):
+    volume, along, across = rod(radius, length)
+    ends = 4.0 / 3.0 * np.pi * radius**3
+    away = ends * (0.4 * radius**2 + 0.25 * length**2 + 0.375 * radius * length)
+    return volume + ends, along + 0.4 * ends * radius**2, across + away
+
+
+def cup(radius, height, thickness):
+    """That stands along y: a cylinder less another one."""
+    parts = (
+        (1.0, rod(radius + thickness, height), 0.5 * height),
+        (
+            -1.0,
+            rod(radius, height - thickness),
+            0.5 * (height + thickness),
+        ),
+    )
+    volume = sum(sign * own[0] for sign, own, _ in parts)
+    middle = sum(sign * own[0] * y for sign, own, y in parts) / volume
+    across = sum(sign * (own[2] + own[0] * (y - middle) ** 2) for sign, own, y in parts)
+    return volume, sum(sign * own[1] for sign, own, _ in parts), across
+
+
+def plank(x, y, z):
+    return x * y * z, *(x * y * z / 12.0 * np.array([y**2 + z**2, x**2 + z**2]))
+
+
+ALONG_X = {"axis": "x", "base": [-2.0, 0.1, 0.2], "height": 4.0}
+SLENDER = {
+    "plank": ({"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [4.0, 0.1, 1.0]}, plank(4.0, 0.1, 1.0)),
+    "far": ({"shape": "box", "lower": [1e5, 0.0, 0.0], "upper": [1e5 + 4.0, 0.125, 1.0]}, plank(4.0, 0.125, 1.0)),
+    "cylinder": ({"shape": "cylinder", "radius": 0.03, **ALONG_X}, rod(0.03, 4.0)),
+    "capsule": ({"shape": "capsule", "start": [0, 0, 0], "end": [3.0, 0, 0], "radius": 0.05}, capsule(0.05, 3.0)),
+    "ball": ({"shape": "sphere", "centre": [1.0, 2.0, 3.0], "radius": 0.2}, capsule(0.2, 0.0)),
+    "cup": (
+        {"shape": "cup", "base": [0.0, 0.0, 0.0], "radius": 0.1, "height": 2.0, "thickness": 0.01, "axis": "x"},
+        cup(0.1, 2.0, 0.01),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SLENDER)
+def test_a_mass_has_the_volume_and_the_inertia_of_its_shape(name):
+    """About the axis along x and across it; bodies are as slender as they like."""
+    table, (volume, along, across) = SLENDER[name]
+    mass = Mass.of(TypeAdapter(AnySolid).validate_python({"name": name, **table}).own_solid())
+    assert mass.volume == pytest.approx(volume, rel=1e-10)
+    np.testing.assert_allclose(np.diag(mass.inertia)[:2], [along, across], rtol=1e-10)
+    np.testing.assert_allclose(mass.inertia, np.diag(np.diag(mass.inertia)), atol=1e-12 * along)
+
+
+DISC, ROD = 0.05**2 * np.pi, 3.0 * 0.1
+ENDS = DISC * (0.05**2 / 2.0 + 1.5**2) + 4.0 * 1.5 * 2.0 / 3.0 * 0.05**3
+FLAT = {
+    "box": ({"shape": "box", "lower": [0, 0], "upper": [4.0, 0.1]}, 0.4, 0.4 * (16.0 + 0.01) / 12.0),
+    "disc": ({"shape": "sphere", "centre": [9.0, 1.0], "radius": 0.05}, DISC, 0.5 * DISC * 0.05**2),
+    "stadium": (
+        {"shape": "capsule", "start": [0, 0], "end": [1.8, 2.4], "radius": 0.05},
+        ROD + DISC,
+        ROD * (9.0 + 0.01) / 12.0 + ENDS,
+    ),
+    "cup": (
+        {"shape": "cup", "base": [0, 0], "radius": 0.2, "height": 0.5, "thickness": 0.1},
+        0.6 * 0.5 - 0.4 * 0.4,
+        0.3 * (0.36 + 0.25) / 12.0 + 0.3 * 0.25**2 - 0.16 * (0.16 + 0.16) / 12.0 - 0.16 * 0.3**2 - 0.027**2 / 0.14,
+    ),
+    "angle": (
+        {"shape": "polygon", "corners": [[5, 5], [5, 7], [5.5, 7], [5.5, 5.5], [7, 5.5], [7, 5]]},
+        1.75,
+        2.0 * 4.25 / 3.0 - 0.25 * 0.5 / 3.0 - 2.0 * 1.1875**2 / 1.75,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_a_mass_in_the_plane_has_the_area_and_the_inertia_of_its_shape(name):
+    table, area, inertia = FLAT[name]
+    mass = Mass.of(TypeAdapter(AnySolid).validate_python({"name": name, **table}).own_solid())
+    assert mass.volume == pytest.approx(area, rel=1e-10)
+    np.testing.assert_allclose(mass.inertia, np.diag([0.0, 0.0, inertia]), rtol=1e-10)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from bad_scenes import assert_one_sentence
 from cortado.discretise.solids.inside_points import points_inside
+from cortado.discretise.solids.mass import Mass
 from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_files import mesh_in_file, read_mesh, read_triangles
 from cortado.discretise.solids.mesh_fit import thickness_of
@@ -18,6 +19,7 @@ from cortado.discretise.solids.primitives import Box, Round
 from cortado.discretise.solids.solid import Hollow, Placed, Union
 from cortado.discretise.solids.surface_points import surface_feet, surface_points
 from cortado.errors import CortadoWarning, InputError
+from cortado.scene.solid_shapes import MeshSolid, PolygonSolid
 
 MAJOR, MINOR = 0.25, 0.1
 SPACING, SUPPORT = 0.05, 0.1
@@ -224,6 +226,115 @@ def test_a_body_within_another_is_told(tmp_path):
     np.testing.assert_allclose(mesh.distance(np.zeros((1, 3))), -0.5, atol=5e-3)
 
 
+PLANK = ([0.0, 0.0, 0.0], [0.8, 0.1, 0.2])
+UNIONS = {  # boxes of a file, and boxes with signs that sum up to their union
+    "nested": ([PLANK, ([0.6, 0.02, 0.05], [0.7, 0.08, 0.15])], [(1, PLANK)]),
+    "nested in a corner": ([PLANK, ([0.0, 0.0, 0.0], [0.3, 0.05, 0.1])], [(1, PLANK)]),
+    "flush": ([PLANK, ([0.5, 0.0, 0.0], [1.2, 0.1, 0.2])], [(1, ([0.0, 0.0, 0.0], [1.2, 0.1, 0.2]))]),
+    "touching": ([PLANK, ([0.8, 0.0, 0.0], [1.2, 0.1, 0.2])], [(1, ([0.0, 0.0, 0.0], [1.2, 0.1, 0.2]))]),
+    "crossing": (
+        [([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4]), ([-0.04, -0.5, -0.04], [0.04, 0.2, 0.04])],
+        [
+            (1, ([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4])),
+            (1, ([-0.04, -0.5, -0.04], [0.04, -0.05, 0.04])),
+            (1, ([-0.04, 0.05, -0.04], [0.04, 0.2, 0.04])),
+        ],
+    ),
+    "three": (
+        [PLANK, ([0.5, -0.2, 0.0], [0.6, 0.3, 0.2]), ([0.55, -0.1, 0.05], [0.9, 0.2, 0.15])],
+        [
+            (1, PLANK),
+            (1, ([0.5, -0.2, 0.0], [0.6, 0.0, 0.2])),
+            (1, ([0.5, 0.1, 0.0], [0.6, 0.3, 0.2])),
+            (1, ([0.6, -0.1, 0.05], [0.9, 0.2, 0.15])),
+            (-1, ([0.6, 0.0, 0.05], [0.8, 0.1, 0.15])),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNIONS)
+@pytest.mark.parametrize("turn", [np.eye(3), TURN], ids=["along the axes", "turned"])
+@pytest.mark.parametrize(("suffix", "error"), [("ply", 1e-6), ("obj", 1e-12)])  # of float32, and of all digits
+def test_the_moments_of_bodies_are_those_of_their_union(tmp_path, name, turn, suffix, error):
+    bodies, parts = UNIONS[name]
+    mesh = joined(*(box(*ends) for ends in bodies))
+    mesh.vertices = mesh.vertices @ turn.T
+    mesh.export(tmp_path / f"mesh.{suffix}", **({"digits": 17} if suffix == "obj" else {}))
+    found = mesh_in_file(str(tmp_path / f"mesh.{suffix}")).mesh.moments()
+    volumes = np.array([sign * np.prod(np.subtract(*ends[::-1])) for sign, ends in parts])
+    middles = np.array([np.mean(ends, axis=0) for _, ends in parts])
+    centre = volumes @ middles / volumes.sum()
+    second = sum(
+        volume * (np.diag(np.subtract(*ends) ** 2) / 12.0 + np.outer(middle - centre, middle - centre))
+        for volume, middle, (_, ends) in zip(volumes, middles, parts, strict=True)
+    )
+    assert found.volume == pytest.approx(volumes.sum(), rel=error)
+    np.testing.assert_allclose(found.centre, turn @ centre, atol=error)
+    np.testing.assert_allclose(found.second, turn @ second @ turn.T, atol=error * np.abs(second).max())
+
+
+def test_the_middle_of_a_plank_does_not_feel_a_box_inside_of_it(tmp_path):
+    path = written(tmp_path, joined(box(*PLANK), box([0.6, 0.02, 0.05], [0.7, 0.08, 0.15])), "plank.obj")
+    table = MeshSolid(name="plank", shape="mesh", file=path, scale=2.0)
+    np.testing.assert_allclose(table.middle(), [0.8, 0.1, 0.2], atol=1e-12)
+    assert Mass.of(table.own_solid()).volume == pytest.approx(8.0 * 0.016, rel=1e-12)
+    np.testing.assert_allclose(table.solid().distance(np.array([[1.3, 0.1, 0.2], [1.65, 0.1, 0.2]])), [-0.1, 0.05])
+
+
+def test_balls_that_overlap_are_a_lens_lighter(tmp_path):
+    first, second = (
+        trimesh.creation.icosphere(4, 0.4),
+        trimesh.creation.icosphere(4, 0.4).apply_translation([0.3, 0, 0]),
+    )
+    mesh = mesh_in_file(written(tmp_path, joined(first, second))).mesh
+    height = 0.4 - 0.15
+    lens = 2.0 * np.pi * height**2 * (1.2 - height) / 3.0
+    assert mesh.moments().volume == pytest.approx(8.0 / 3.0 * np.pi * 0.4**3 - lens, rel=4e-3)
+    np.testing.assert_allclose(mesh.moments().centre, [0.15, 0.0, 0.0], atol=1e-4)
+
+
+# ---- far from the origin -----------------------------------------------------------------------------------------
+
+FAR = {"1e5 m": [1e5, 1e5, 1e5], "on a map": [512345.0, 5412345.0, 100.0]}
+
+
+@pytest.mark.parametrize("place", FAR)
+def test_far_from_the_origin_a_solid_is_as_near_it(tmp_path, place):
+    shape, places = joined(torus(30, 16), box([0.2, -0.2, -0.2], [0.6, 0.2, 0.2])), []
+    for name, shift in (("near", np.zeros(3)), ("far", np.array(FAR[place]))):
+        far = trimesh.Trimesh(shape.vertices + shift, shape.faces, process=False)
+        far.export(tmp_path / f"{name}.obj", digits=12)
+        path = str(tmp_path / f"{name}.obj")
+        table = MeshSolid(name=name, shape="mesh", file=path, position=(0.0, 0.0, 0.0))
+        own, points = table.own_solid(), cloud(500)
+        mass = Mass.of(own)
+        middle = MeshSolid(name=name, shape="mesh", file=path).middle() - shift
+        places.append([middle, mass.volume, mass.inertia, own.distance(points), own.nearest(points)])
+    for near, far in zip(*places, strict=True):
+        np.testing.assert_allclose(far, near, atol=3e-9)
+
+
+def test_a_polygon_far_from_the_origin_is_about_its_middle():
+    corners = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.125], [0.125, 0.125], [0.125, 0.5], [0.0, 0.5]])
+    near, far = (
+        PolygonSolid(name="one", shape="polygon", corners=(corners + shift).tolist()) for shift in (0.0, 5412345.0)
+    )
+    np.testing.assert_allclose(far.middle() - 5412345.0, near.middle(), atol=2e-9)
+    np.testing.assert_allclose(Mass.of(far.own_solid()).inertia, Mass.of(near.own_solid()).inertia, rtol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["ball.stl", "ball.ply", "ball.glb"])
+def test_a_file_of_float32_far_from_the_origin_is_a_sentence(tmp_path, name):
+    ball = trimesh.creation.icosphere(3, 0.4)
+    with pytest.raises(InputError, match="far from the origin: move it before it is exported") as caught:
+        read(written(tmp_path, ball.copy().apply_translation(FAR["on a map"]), name))
+    assert_one_sentence(str(caught.value))
+    with pytest.warns(CortadoWarning, match="far from the origin.*rounds its coordinates to 0.0078") as told:
+        read(written(tmp_path, ball.copy().apply_translation(FAR["1e5 m"]), name), support=SPACING)
+    assert_one_sentence(str(told[0].message))
+
+
 def crossed_tube() -> trimesh.Trimesh:
     """A tube along a figure of eight, whose two branches go through one another in the middle."""
     t, angle = np.linspace(0, 2 * np.pi, 160, endpoint=False), np.linspace(0, 2 * np.pi, 24, endpoint=False)
@@ -398,6 +509,10 @@ BAD = {
     "a triangle turned": (half_turned(BALL), "inwards at some triangles.* change at 3 edges, the first at"),
     "a fin": (with_a_fin(), r"1 edge at which three triangles or more meet.* \(0.2, 0.2, 0\) in the file"),
     "a loop inside out": (figure_of_eight(), "of a part of .* point inwards"),
+    "bodies that touch at an edge": (
+        joined(box([0, 0, 0], [0.3, 0.3, 0.3]), box([0.3, 0.3, 0], [0.6, 0.6, 0.3])),
+        r"an edge that more than two triangles share, at \(0.3, 0.3, 0.15\) in the file",
+    ),
     "millimetres": (box([0, 0, 0], [300.0, 200.0, 200.0]), "300 times the container; .*millimetres: .*scale = 0.001"),
     "metres as millimetres": (box([0, 0, 0], [3e-4, 2e-4, 2e-4]), "less than a spacing, 0.05 m; .*larger scale than 1"),
     "too thin": (

@@ -82,6 +82,14 @@ def across(direction: ArrayLike) -> Points:
     return np.array(frame[1:])
 
 
+def whole_origin(points: Points) -> Points:
+    """(d,) [m] near the middle of points (n, d) [m] that are far from the origin beside how far they spread, and 0 of
+    all others: whole multiples of a power of two, so that taking it off rounds nothing."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
+    return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
+
+
 def whole_cells(lengths: Points, spacing: float) -> Points:
     """How many cells fit into lengths [m], any shape."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)

@@ -8,6 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.mesh import Mesh
+from cortado.discretise.solids.mesh_checks import FoundMesh
 from cortado.discretise.solids.mesh_files import mesh_in_file
 from cortado.discretise.solids.primitives import Polygon
 from cortado.discretise.solids.solid import Solid
@@ -42,9 +43,7 @@ class PolygonShape(Table):
     def shape_about(self) -> tuple[Solid, Points]:
         """The polygon about its centroid, and where that is (2,) [m]."""
         corners = np.array(self.corners)
-        following = np.roll(corners, -1, axis=0)
-        parts = corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]
-        middle = ((corners + following) * parts[:, None]).sum(axis=0) / (3.0 * parts.sum())
+        middle = Polygon(corners).moments().centre
         return Polygon(corners - middle), middle
 
 
@@ -69,14 +68,14 @@ class MeshShape(Table):
 
     def shape_about(self) -> tuple[Solid, Points]:
         """The mesh about its centroid, and where that is (3,) [m]."""
-        return _about_middle(mesh_in_file(self.file).mesh, self.scale)
+        return _about_middle(mesh_in_file(self.file), self.scale)
 
 
 @lru_cache(maxsize=8)
-def _about_middle(mesh: Mesh, scale: float) -> tuple[Mesh, Points]:
+def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
     """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
-    middle = scale * mesh.middle()
-    return mesh.moved(scale, -middle), middle
+    middle = found.mesh.moments().centre
+    return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:

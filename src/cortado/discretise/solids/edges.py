@@ -64,12 +64,16 @@ class Edges:
             )
 
     def _first(self, which: NDArray[np.bool_], vertices: Points) -> str:
-        return place_in_file(vertices[self.ends[np.argmax(which)]].mean(axis=0))
+        return self.place(int(np.argmax(which)), vertices)
+
+    def place(self, edge: int, vertices: Points) -> str:
+        """The middle of one of them, in words."""
+        return place_in_file(vertices[self.ends[edge]].mean(axis=0))
 
 
 def place_in_file(place: Points) -> str:
     """A point in words, for a sentence."""
-    return f"({', '.join(f'{value:g}' for value in place)}) in the file"
+    return f"({', '.join(f'{value:.7g}' for value in place)}) in the file"
 
 
 def many(count: int, one: str, several: str = "") -> str:

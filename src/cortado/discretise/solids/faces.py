@@ -65,7 +65,8 @@ def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -
 def polygon_faces(corners: Points) -> Faces:
     """Of a polygon (m, 2) [m], given either way round."""
     following = np.roll(corners, -1, axis=0)
-    area = (corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]).sum()
+    (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
+    area = (x * y_next - x_next * y).sum()
     ordered = corners if area > 0.0 else corners[::-1]
     numbers = np.arange(len(corners))
     return Faces(ordered, np.stack([numbers, np.roll(numbers, -1)], axis=1))
@@ -81,10 +82,6 @@ def arc(centre: Points, radius: float, start: float, end: float, fine: float) ->
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
     """Of a solid of revolution about an axis of space, from its cut with a plane through the axis, which is the same on
     both sides; faces around it are some ``fine`` [m] wide."""
-    edges = []
-    for start, end in profile.vertices[profile.corners]:
-        if max(start[0], end[0]) > 0.0:
-            edges.append([_cut(start, end), _cut(end, start)])
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -92,7 +89,7 @@ def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
     mirrored = -1.0 if axis == 1 else 1.0  # x, z and y make a left-handed frame
     vertices: list[Points] = []
     corners: list[NDArray[np.int64]] = []
-    for start, end in edges:
+    for start, end in outer_edges(profile):
         base = len(vertices) * count
         for radius, height in (start, end):
             ring = np.zeros((count, 3))
@@ -108,6 +105,12 @@ def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
         if end[0] > 0.0:
             corners.append(np.stack([there, there + count, here + count], axis=1))
     return Faces(np.concatenate(vertices), np.concatenate(corners))
+
+
+def outer_edges(profile: Faces) -> Points:
+    """(k, 2, 2) [m] where the edges of a profile start and end, as far as they are on one side of the axis."""
+    edges = profile.vertices[profile.corners]
+    return np.array([[_cut(start, end), _cut(end, start)] for start, end in edges if max(start[0], end[0]) > 0.0])
 
 
 def _cut(start: Points, end: Points) -> Points:

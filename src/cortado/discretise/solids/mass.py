@@ -1,4 +1,4 @@
-"""Volume and inertia of a solid, by points of a lattice inside it."""
+"""Volume and inertia of a solid."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.solids.solid import Solid
-
-POINTS = {2: 400, 3: 80}
-"""Of the lattice along the longest side, in 2 and 3 dimensions."""
 
 
 @dataclass(frozen=True)
@@ -22,22 +19,12 @@ class Mass:
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
-        """Each point counts for the part of its cell that is inside, as a flat surface at its distance would cut it."""
-        lower, upper = solid.extent()
-        dimension = len(lower)
-        step = float((upper - lower).max()) / POINTS[dimension]
-        sides = [
-            lo + step * (np.arange(int(np.ceil((hi - lo) / step)) + 1)) for lo, hi in zip(lower, upper, strict=True)
-        ]
-        points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
-        parts = np.clip(0.5 - solid.distance(points) / step, 0.0, 1.0) * step**dimension
-        volume = float(parts.sum())
-        middle = parts @ points / volume
-        x = np.zeros((len(points), 3))
-        x[:, :dimension] = points - middle
-        second = np.einsum("n,ni,nj->ij", parts, x, x)
-        inertia = np.trace(second) * np.eye(3) - second
-        return cls(volume, inertia if dimension == 3 else np.diag([0.0, 0.0, inertia[2, 2]]))
+        """By its moments, in the plane or in space."""
+        moments = solid.moments()
+        about = np.trace(moments.second) * np.eye(3)
+        if len(moments.centre) == 2:
+            return cls(moments.volume, np.diag([0.0, 0.0, about[2, 2]]))
+        return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
         """The same in volumes of so many [m^d]."""

@@ -3,17 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.faces import Faces
+from cortado.discretise.solids.mesh_union import outer_surface
+from cortado.discretise.solids.moments import Moments, enclosed_moments
 from cortado.discretise.solids.solid import Solid
 from cortado.discretise.solids.triangle_tree import Numbers, TriangleTree
 
 LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
 """Steps along two axes of a sequence that fills a square evenly: powers of 1 / p, p^3 = p + 1."""
+BESIDE = 1e-12
+"""Of the length of a mesh: how far from a triangle one looks at whether both sides of it are inside."""
 SEEN = 1e-3
 """Of the distance of points of a surface: how far outside of it one looks for another part of the solid."""
 
@@ -117,10 +122,20 @@ class Mesh(Solid):
         seen = self._looked_up(points + SEEN * fine * outward, SEEN * fine)[1] > 0.0
         return points[seen], outward[seen]
 
-    def middle(self) -> Points:
-        """(3,) the centroid of what it holds; overlapping parts count as often as they overlap [m]."""
-        volumes = np.linalg.det(self.corners)
-        return np.asarray((volumes[:, None] * self.corners.sum(axis=1)).sum(axis=0) / (4.0 * volumes.sum()))
+    def moments(self) -> Moments:
+        return self._moments
+
+    @cached_property
+    def _moments(self) -> Moments:
+        if not self.parts:
+            return enclosed_moments(self.corners, np.ones(len(self.corners)))
+        reach = BESIDE * float(np.ptp(self.extent(), axis=0).max())
+        pieces = list(zip(self.parts, self._trees, strict=True))
+        pairs = [part[tree.crossings(self.triangles[part], 0.0)] for part, tree in pieces]
+        for (one, tree), (other, beside) in combinations(pieces, 2):
+            first, second = tree.beside(beside, reach).T
+            pairs.append(np.column_stack([one[first], other[second]]))
+        return enclosed_moments(*outer_surface(self.corners, np.concatenate(pairs), self.holds, reach))
 
     def normals(self) -> Points:
         """(k, 3) unit vectors outwards from each triangle; 0 where it has no area."""

@@ -1,5 +1,6 @@
 """Files of triangles: STL, OBJ, PLY and glTF, as trimesh reads them; and meshes as solids out of them."""
 
+import re
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -47,7 +48,7 @@ def read_mesh(
     if support is None:
         check_unit(mesh, what, scale, spacing, container)
     else:
-        notes = (*notes, *check_fit(mesh, what, scale, spacing, support, container))
+        notes = (*notes, *check_fit(mesh, scale * found.origin, what, scale, spacing, support, container))
     for note in notes:
         warn(note)
     return mesh
@@ -69,12 +70,15 @@ def mesh_in_file(path: str) -> FoundMesh:
 @lru_cache(maxsize=8)
 def _found(path: str, changed: int, size: int) -> FoundMesh:
     """Read once for each version of the file: the time of its last change and its size stand for the version."""
-    return found_mesh(*read_triangles(path), repr(path))
+    vertices, triangles, rounding = read_triangles(path)
+    return found_mesh(vertices, triangles, repr(path), rounding)
 
 
-def read_triangles(path: str) -> tuple[Points, Numbers]:
-    """The vertices (m, 3) of all bodies of a file where its scene puts them, in the file's unit of length, and the
-    triangles (k, 3) between them, of which there is at least one; raises `InputError`."""
+def read_triangles(path: str) -> tuple[Points, Numbers, float]:
+    """Of all bodies of a file, where its scene puts them, in its unit of length: the vertices (m, 3), the triangles
+    (k, 3) between them, of which there is at least one, and to what the file rounds coordinates, 0 if they are not
+    float32; raises `InputError`."""
+    rounding, is_single = 0.0, _is_single(path)
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
     scene = _scene(path)
     for node in scene.graph.nodes_geometry:
@@ -88,10 +92,25 @@ def read_triangles(path: str) -> tuple[Points, Numbers]:
             vertices.append(np.asarray(body.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3])
             triangles.append(corners + count)
             count += len(vertices[-1])
+            if is_single and np.isfinite(body.vertices).all():
+                step = float(np.spacing(np.float32(np.abs(body.vertices).max())))
+                rounding = max(rounding, step * float(np.linalg.norm(transform[:3, :3], axis=0).max()))
     if len(triangles) == 1:
         what = "points or lines, but no triangles" if others else "no triangles that can be read; it may be damaged"
         raise InputError(f"{path!r} holds {what}: export the mesh as triangles.")
-    return np.concatenate(vertices), np.concatenate(triangles)
+    return np.concatenate(vertices), np.concatenate(triangles), rounding
+
+
+def _is_single(path: str) -> bool:
+    """Whether a file has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
+    suffix = Path(path).suffix.lower()
+    if suffix in (".stl", ".ply"):
+        with open(path, "rb") as file:
+            head = file.read(4096)
+        if suffix == ".ply":
+            return not re.search(rb"property (double|float64) x", head)
+        return len(head) >= 84 and Path(path).stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little")
+    return suffix in (".gltf", ".glb")
 
 
 def _scene(path: str) -> Any:

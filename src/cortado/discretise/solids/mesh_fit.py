@@ -1,7 +1,7 @@
 """What a mesh is beside particles of a spacing, and beside a container: its unit of length, and how thick it is."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,15 +25,22 @@ BEYOND = 1e-3
 
 
 def check_fit(
-    mesh: Mesh, what: str, scale: float, spacing: float, support: float, container: tuple[Points, Points] | None
+    mesh: Mesh,
+    origin: Points,
+    what: str,
+    scale: float,
+    spacing: float,
+    support: float,
+    container: tuple[Points, Points] | None,
 ) -> tuple[str, ...]:
     """Notes about a mesh beside particles a spacing [m] apart that see each other up to a support [m]; raises
     `InputError`, a sentence that calls the mesh ``what``, where it cannot be meant or cannot keep fluid out.
 
+    ``origin``: (3,) that of the mesh in the file, times the scale [m].
     ``container``: lower and upper corner, each (3,) [m], of the box around it.
     """
     check_unit(mesh, what, scale, spacing, container)
-    return tuple(_thickness_notes(mesh, what, spacing, support))
+    return tuple(_thickness_notes(mesh, origin, what, spacing, support))
 
 
 def check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
@@ -99,8 +106,9 @@ def thickness_of(mesh: Mesh, reach: float) -> Thickness:
     return Thickness(points, lengths, is_sheet)
 
 
-def _thickness_notes(mesh: Mesh, what: str, spacing: float, support: float) -> Iterator[str]:
+def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
     found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
+    found = replace(found, points=origin + found.points)
     sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet
     if found.share(sheet) > SHARE:
         raise InputError(

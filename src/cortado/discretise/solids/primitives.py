@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.discretise.shapes import Points, across
-from cortado.discretise.solids.faces import Faces, arc, box_faces, cut_box_faces, polygon_faces, revolved_faces
+from cortado.discretise.solids.faces import (
+    Faces,
+    arc,
+    box_faces,
+    cut_box_faces,
+    outer_edges,
+    polygon_faces,
+    revolved_faces,
+)
+from cortado.discretise.solids.moments import Moments, enclosed_moments, revolved_moments
 from cortado.discretise.solids.solid import Solid, Which
 
 
@@ -34,6 +43,10 @@ class Box(Solid):
 
     def faces(self, fine: float) -> Faces:
         return box_faces(self.half)
+
+    def moments(self) -> Moments:
+        volume = float(np.prod(2.0 * self.half))
+        return Moments(volume, np.zeros_like(self.half), np.diag(volume * self.half**2 / 3.0))
 
 
 @dataclass(frozen=True)
@@ -69,6 +82,18 @@ class Round(Solid):
         upright = profile if flat else revolved_faces(profile, 2, fine)
         return upright.moved(_standing(along), np.zeros(len(along)))
 
+    def moments(self) -> Moments:
+        """A rod and two half balls at its ends."""
+        dimension, length, r = len(self.half), float(np.linalg.norm(self.half)), self.radius
+        disc, ball = (2.0 * r, np.pi * r**2) if dimension == 2 else (np.pi * r**2, 4.0 / 3.0 * np.pi * r**3)
+        rod = 2.0 * length * disc
+        across = (rod / (dimension + 1) + ball / (dimension + 2)) * r**2
+        stretched = rod * length**2 / 3.0 + ball * length**2 + 4.0 * length * disc * r**2 / (dimension + 1)
+        upright = stretched + ball * r**2 / (dimension + 2)
+        along = self.half / length if length > 0.0 else np.zeros(dimension)
+        second = across * np.eye(dimension) + (upright - across) * np.outer(along, along)
+        return Moments(rod + ball, np.zeros(dimension), second)
+
     def _within(self, points: Points) -> Points:
         """(n, d) the nearest points of the segment."""
         square = float(self.half @ self.half)
@@ -81,7 +106,8 @@ class Revolved(Solid):
     """A solid of revolution about an axis of space through the origin."""
 
     profile: Solid
-    """Its cut with a plane through the axis, in 2-D: across the axis, to both sides, and along it."""
+    """Its cut with a plane through the axis, in 2-D, with straight sides: across the axis, to both sides, and along
+    it."""
     axis: int
 
     def extent(self) -> tuple[Points, Points]:
@@ -101,6 +127,9 @@ class Revolved(Solid):
 
     def faces(self, fine: float) -> Faces:
         return revolved_faces(self.profile.faces(fine), self.axis, fine)
+
+    def moments(self) -> Moments:
+        return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
 
     def _flat(self, points: Points) -> Points:
         """(n, 2) distance from the axis, and height [m]."""
@@ -171,6 +200,11 @@ class Polygon(Solid):
 
     def faces(self, fine: float) -> Faces:
         return polygon_faces(self.corners)
+
+    def moments(self) -> Moments:
+        edges = np.stack([self.corners, np.roll(self.corners, -1, axis=0)], axis=1)
+        clockwise = enclosed_moments(edges, np.ones(len(edges))).volume < 0.0
+        return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def _holds(self, points: Points) -> Which:
         """(n,) by the number of sides that a ray along the first axis crosses."""

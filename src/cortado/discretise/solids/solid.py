@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.faces import Faces
+from cortado.discretise.solids.moments import Moments
 
 Which = NDArray[np.bool_]
 
@@ -37,6 +38,10 @@ class Solid(ABC):
     @abstractmethod
     def faces(self, fine: float) -> Faces:
         """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
+
+    def moments(self) -> Moments:
+        """Its volume, centroid and second moments, to round-off; solids that may move freely have them."""
+        raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
         """The same as pictures have it: within the box around it."""

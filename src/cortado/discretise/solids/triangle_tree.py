@@ -90,6 +90,29 @@ class TriangleTree:
         pairs = np.column_stack([np.repeat(np.arange(count), counts), others[: places[-1]]])
         return np.sort(self.order[pairs], axis=1)
 
+    def beside(self, other: "TriangleTree", reach: float) -> Numbers:
+        """(m, 2) the pairs of a triangle of this tree and one of another whose boxes are no further apart than a reach
+        [m] along any axis."""
+        pairs = np.ones((1, 2), dtype=np.int64)
+        leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
+        while (pairs < leaves).any():
+            for side in range(2):
+                opened = pairs[:, side] < leaves[side]
+                below = np.repeat(pairs[opened], 2, axis=0)
+                below[:, side] = 2 * below[:, side] + np.arange(len(below)) % 2
+                pairs = np.concatenate([pairs[~opened], below])
+            pairs = pairs[_near(self.boxes[pairs[:, 0]], other.boxes[pairs[:, 1]], reach)]
+        found = [np.zeros((0, 2), dtype=np.int64)]
+        for one, two in pairs - leaves:
+            ends = self.starts[one : one + 2], other.starts[two : two + 2]
+            found.append(
+                np.stack(np.meshgrid(*(np.arange(*end) for end in ends), indexing="ij"), axis=-1).reshape(-1, 2)
+            )
+        pairs = np.concatenate(found)
+        first, second = (np.hstack([tree.corners.min(axis=1), tree.corners.max(axis=1)]) for tree in (self, other))
+        pairs = pairs[_near(first[pairs[:, 0]], second[pairs[:, 1]], reach)]
+        return np.column_stack([self.order[pairs[:, 0]], other.order[pairs[:, 1]]])
+
     def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
         """Launch one of the kernels for points (n, d) [m], with what it takes beside the tree; it writes to arrays that
         it takes."""
@@ -111,6 +134,12 @@ class TriangleTree:
 def _starts(count: int, level: int) -> Numbers:
     """(2^level + 1,) the first triangle of each node of a level, and the number of all."""
     return (np.arange(2**level + 1) * count) >> level
+
+
+def _near(first: Points, second: Points, reach: float) -> NDArray[np.bool_]:
+    """(n,) whether boxes (n, 6) are no further apart than a reach along any axis."""
+    apart = np.maximum(first[:, :3] - second[:, 3:], second[:, :3] - first[:, 3:])
+    return np.asarray((apart <= reach).all(axis=1))
 
 
 def _along_a_curve(points: Points) -> Numbers:
