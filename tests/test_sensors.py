@@ -9,14 +9,17 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
+from cortado.cli.commands.describe import MeasuredSpeed
 from cortado.discretise.domain import Domain
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.series import SensorMatch
+from cortado.runs.sensors.log import Readings, as_csv, from_csv
 from cortado.runs.sensors.sensor import value_of
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
+from cortado.watching import Watch
 from finite_differences import distance
 from scenes import jet, plane, scene
 
@@ -453,3 +456,73 @@ def test_the_gradient_of_a_sensor_across_a_period_is_that_of_differences(dimensi
     derivative, gradient = problem.tangent(point, along), problem.value_and_gradient(point)[1]
     assert (gradient["initial_velocities"] * along["initial_velocities"]).sum() == pytest.approx(derivative, rel=1e-10)
     assert distance(problem.value, point, along, derivative, [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7], enough=1e-6) < 1e-6
+
+
+BLOCK = {"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.65, 0.8]}
+NOWHERE = {
+    "a probe in millimetres": (PressureProbe([300.0, 100.0]), "outside of the container.*positions are in metres"),
+    "a probe behind a wall": (PressureProbe([-0.02, 0.1]), "outside of the container, which is from"),
+    "a probe in a solid": (PressureProbe([0.58, 0.1]), "in the solid 'block', where it begins"),
+    "a probe that sees nothing": (PressureProbe([0.2, 0.1], 1e-9), "less than half a spacing"),
+    "a gauge outside": (WaveGauge([0.9, 0.0], 0.3), "outside of the container.*its floor, 0.3 m"),
+    "a gauge in a solid": (WaveGauge([0.58, 0.0]), "in the solid 'block'"),
+    "a plane outside": (FlowRate([0.9, 0.0], [1.0, 0.1]), "has its plane through .* outside of the container"),
+    "a region without walls": (WallForce([0.3, 0.35], [0.32, 0.37]), "without walls"),
+}
+
+
+@pytest.mark.parametrize(("sensor", "words"), NOWHERE.values(), ids=NOWHERE)
+def test_a_sensor_that_can_never_see_fluid_is_warned_of_before_the_run(sensor, words):
+    simulation = cortado.Simulation(plane(solid=[{**BLOCK, "motion": "path", "velocity": [0.0, 0.0]}]))
+    dt, series = simulation.scene.solver.time_step, [[0.0] * len(sensor.columns(2))] * 2
+    with pytest.warns(CortadoWarning, match=f"the sensor 'mine' .*{words}"):
+        Watch(simulation, simulation.rollout(1), sensors={"mine": sensor})
+    with pytest.warns(CortadoWarning, match=words):
+        cortado.Problem(simulation, 1, Series(sensor, [0.0, dt], series, dt))
+    with pytest.warns(CortadoWarning, match=words):
+        times, column = dt * np.arange(4), [*sensor.columns(2)][:1]
+        observed = cortado.measured.SensorSeries(sensor, times, np.zeros((4, 1)), 2, column)
+        cortado.measured.Experiment(simulation, {"mine": observed})
+
+
+def test_sensors_among_fluid_are_not_warned_of(recwarn):
+    own = {"corner": PressureProbe([0.0, 0.0]), "edge": FlowRate([0.69, 5.0], [1.0, 0.0])}
+    own["beside"] = WaveGauge([0.49, 0.0])
+    for made, sensors in ((plane(solid=[BLOCK]), {**IN_THE_PLANE, **own}), (scene(), IN_SPACE)):
+        simulation = cortado.Simulation(made)
+        Watch(simulation, simulation.rollout(1), sensors=sensors)
+    for dimension in (2, 3):
+        simulation = channel(dimension)[0]
+        Watch(simulation, simulation.rollout(1), sensors=ROUND_THE_EDGE[dimension])
+    assert not [one for one in recwarn if "the sensor" in str(one.message)]
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"kind": "flow_rate", "position": [0.1, 0.1], "normal": [0.0, 0.0]}, "sensor\\[0\\].normal is .* not zero"),
+        ({"kind": "wall_force", "lower": [0.5, 0.0], "upper": [0.1, 0.2]}, "sensor\\[0\\].upper is .* greater than"),
+        *(
+            ({"kind": "wall_force", "name": name}, "sensor\\[0\\].name is .* one line of text")
+            for name in ("=cmd|calc", "+1", "-1", "@sum", " =1", "\uff1d1", "two\nlines", "a\ttab")
+        ),
+    ],
+)
+def test_tables_of_sensors_that_make_no_sense_are_refused_by_their_field(table, words):
+    with pytest.raises(cortado.SceneError, match=words):
+        plane(sensor=[{"name": "mine", **table}])
+
+
+@pytest.mark.parametrize("name", ["a, b", 'a "b"', "a [b", "a.b", "a = b"])
+def test_other_names_of_sensors_come_back_from_the_table(name, tmp_path):
+    read = Readings(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), {"height": "m"})
+    (tmp_path / "sensors.csv").write_text(as_csv({name: read}))
+    (found,) = from_csv(tmp_path / "sensors.csv").items()
+    assert found[0] == name and found[1]["height"].tolist() == [1.0, 2.0]
+
+
+def test_describe_counts_what_sensors_cost(monkeypatch):
+    read = []
+    monkeypatch.setattr(Watch, "step", lambda own, step, state: read.append(step))
+    speed = MeasuredSpeed.measured(cortado.Simulation(plane(sensor=[{"kind": "wall_force", "name": "walls"}])))
+    assert len(read) >= 3 * speed.steps

@@ -24,6 +24,7 @@ from cortado.rollout.residual import Residual
 from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import Moment, row_of
+from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.trajectory import noted
 from cortado.scene.parameters.values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
@@ -80,6 +81,7 @@ class Problem:
         self.memory_budget = whole_number("memory_budget", memory_budget, 0)
         self._states = [one.fixed() for one in one_for_each(state, simulation.batch)]
         self._losses = LossesByStep(loss, self.steps, simulation.scene.solver.chooses)
+        warn_of_places(simulation, self._losses.sensors)
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
         self._derivatives: dict[AdjointEstimator, BackwardStep] = {}

@@ -16,6 +16,7 @@ from cortado.runs.quantities.moment import Moment
 from cortado.runs.quantities.recorder import Recorder
 from cortado.runs.sensors.log import Readings, SensorLog
 from cortado.runs.sensors.of_scene import sensors_of
+from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameters.values import Arrays
 
@@ -44,6 +45,7 @@ class Watch:
             return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
 
         of_scene = sensors_of(simulation.scene) if simulation.batch is None else {}
+        warn_of_places(simulation, of_scene | dict(sensors or {}))
         self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
         self._log = SensorLog(of_scene | dict(sensors or {}), simulation.dimension)
         self._rollout, self._dimension, self._evaluator = rollout, simulation.dimension, evaluator

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from cortado.discretise.pairs import wrapped
+from cortado.discretise.pairs import apart, wrapped
 from cortado.discretise.shapes import Points
 
 ALONG = 1e-3
@@ -39,6 +39,10 @@ class Domain:
         """The images of points (..., d) [m] that are within the period; along other axes as they are."""
         lower = np.array(self.lower)
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
+
+    def shortest(self, ways: Points) -> Points:
+        """Of ways (n, d) [m] those to the nearest images."""
+        return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
         """The images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower corner

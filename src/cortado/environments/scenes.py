@@ -18,6 +18,7 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.stepper import Stepper
+from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.simulation import Simulation
@@ -55,6 +56,7 @@ class Scenes:
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
         self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
+        warn_of_places(self.simulation, self._sensors)
         self._domain, self._stepper = self.simulation.lattice.domain, Stepper(self.simulation, task.substeps)
         self.reward = replace(task.reward(self.simulation), domain=self._domain)
         self._first = self.simulation.on_device()

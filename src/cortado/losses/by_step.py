@@ -29,6 +29,8 @@ class LossesByStep(Mapping[int, Loss]):
             if step not in range(steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {steps}.")
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
+        self.sensors = {repr(one.sensor): one.sensor for one in by_step.values() if hasattr(one, "sensor")}
+        """Those that losses read, by what they are."""
         self._frames = loss if isinstance(loss, Frames) else None
 
     def __getitem__(self, step: int) -> Loss:

@@ -1,10 +1,12 @@
 """Sensors that a scene names: what `cortado run` reads in every step. They change nothing of what is computed."""
 
+import unicodedata
 from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
-from cortado.scene.fields import FieldPath, Length, Text, Vector, quantity
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
+from cortado.scene.fluids import check_order
 from cortado.scene.tables import Table
 
 Reach = Annotated[float, quantity("m", gt=0.0)] | None
@@ -16,6 +18,16 @@ class SensorTable(Table):
 
     name: Text
     """What its columns in sensors.csv begin with."""
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str) -> str:
+        """A spreadsheet runs a cell that begins with one of these signs, wide ones too, as a formula."""
+        plain = unicodedata.normalize("NFKC", name).strip()
+        if plain[:1] in tuple("=+-@") or not name.isprintable():
+            wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
+            raise field_error((), name, wanted)
+        return name
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("lower", "upper", "about"), dimension, path)
@@ -41,7 +53,7 @@ class WaveGaugeTable(SensorTable):
     position: Vector[Length]
     """(d,) a point of the middle of the column [m]; its height does not matter."""
     floor: Length = 0.0
-    """Where the fluid stands on [m], against gravity."""
+    """Where the fluid stands on [m], against gravity: above a solid, which the gauge does not count, its upper end."""
     radius: Reach = None
     """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
 
@@ -59,6 +71,13 @@ class FlowRateTable(SensorTable):
     """Half of the thickness of the layer that counts [m]; two support radii, but at least five spacings, if left
     out."""
 
+    @field_validator("normal")
+    @classmethod
+    def _check_normal(cls, normal: tuple[float, ...]) -> tuple[float, ...]:
+        if not any(normal):
+            raise field_error((), normal, "a vector that is not zero")
+        return normal
+
 
 class WallForceTable(SensorTable):
     """The force, and its torque, with which the fluid in a region pushes the walls."""
@@ -71,6 +90,12 @@ class WallForceTable(SensorTable):
     """(d,) upper corner of the region [m]; without an end there if left out."""
     about: Corner = None
     """(d,) the point of the torque [m]; the origin if left out."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.lower is not None and self.upper is not None:
+            check_order(self.lower, self.upper)
+        return self
 
 
 class SolidLoadTable(SensorTable):

@@ -30,6 +30,7 @@ from cortado.scene.stability import chosen_limits, is_implicit, stability_limits
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
+from cortado.watching import Watch
 from cortado.words import counted
 
 SAME = 1e-6
@@ -40,7 +41,7 @@ FIRST, MOST, ENOUGH = 4, 100, 0.5
 
 @dataclass(frozen=True)
 class MeasuredSpeed:
-    """How long the first steps of a scene take."""
+    """How long the first steps of a scene take, with what its sensors read after each."""
 
     steps: int
     """That were measured, after twice as many that were not."""
@@ -53,10 +54,11 @@ class MeasuredSpeed:
         steps = FIRST
         while True:
             rollout = simulation.rollout(steps)
+            watch = Watch(simulation, rollout).step if simulation.scene.sensor else None
             for _ in range(2):  # the first time compiles, the second captures graphs
-                rollout.forward(keep=False)
+                rollout.forward(watch, keep=False)
             begun = time.perf_counter()
-            rollout.forward(keep=False)
+            rollout.forward(watch, keep=False)
             wp.synchronize_device(simulation.device)
             seconds = (time.perf_counter() - begun) / steps
             if steps == MOST or steps * seconds > 0.5 * ENOUGH:
@@ -173,6 +175,7 @@ def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
         "milliseconds_per_step": 1e3 * speed.seconds,
         "measured_steps": speed.steps,
         "expected_seconds": steps * speed.seconds,
+        "sensors": len(simulation.scene.sensor),
     }
 
 
@@ -260,9 +263,10 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
     slower = "later ones may take more pressure iterations"
     if found["particles_in_emitter"]:
         slower = "later ones take longer, as fluid comes out of the emitter"
+    read = f"with {counted(found['sensors'], 'sensor')}, " if found["sensors"] else ""
     return (
-        f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, without what is "
-        f"recorded (mean of the first {found['measured_steps']} steps; {slower}); "
+        f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, {read}without "
+        f"what is recorded (mean of the first {found['measured_steps']} steps; {slower}); "
         f"{length.in_words}: {_duration(found['expected_seconds'])}"
     )
 

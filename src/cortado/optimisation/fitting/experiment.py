@@ -14,6 +14,7 @@ from cortado.optimisation.fitting.observation import CLOCK, Again, Direction, Fr
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer
+from cortado.runs.sensors.places import warn_of_places
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.restart import RestartState
 from cortado.scene.stability import is_implicit
@@ -56,6 +57,7 @@ class Experiment:
         last = max(float(one.times[-1]) for one in observations.values())
         steps = int(np.ceil(last / step - 1e-6)) if steps is None else check_steps(steps)
         self.simulation, self.observations = simulation, FixedDict(observations)
+        warn_of_places(simulation, {name: getattr(one, "sensor", None) for name, one in observations.items()})
         self.problem = Problem(simulation, steps, FinalPositions(simulation.positions), state=state)
         for one in observations.values():
             Frames.of(one.times, step, steps)  # raises for times beyond the run

@@ -17,6 +17,7 @@ from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.residual import Residual
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.moment import Moment, row_of
+from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import QUANTITIES, check_quantity
@@ -46,6 +47,7 @@ class Measure(Layer):
         self._simulation = simulation
         self._name = check_quantity(what) if isinstance(what, str) else None
         self._sensor = None if isinstance(what, str) else checked_sensor(what)
+        warn_of_places(simulation, {repr(what): what})
         self._states, self._parameters = named_states(simulation), LayerParameters(simulation, 1, each=False)
         self._space, self._rollout = ParameterSpace(simulation, 1), Rollout(simulation.solver, 1)
         self.real, self.device = simulation.precision.numpy, simulation.device

@@ -102,10 +102,10 @@ def from_csv(path: Path) -> dict[str, Readings]:
     if not len(times):
         raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {TIME}.")
     for head in columns:
-        name, dot, number = head.partition(" [")[0].rpartition(".")
+        name, dot, number = head.rpartition(" [")[0].rpartition(".")
         if not dot or not head.endswith("]"):
             raise InputError(f"{path} has the column {head!r}, but must be a table of readings that Cortado wrote.")
-        found.setdefault(name, {})[number] = head.partition(" [")[2].removesuffix("]")
+        found.setdefault(name, {})[number] = head.rpartition(" [")[2].removesuffix("]")
     return {
         name: Readings(times, np.stack([columns[f"{name}.{n} [{unit}]"] for n, unit in units.items()], axis=1), units)
         for name, units in found.items()

@@ -16,7 +16,8 @@ class WaveGauge:
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1,
 
     where r_i is the horizontal distance and V the volume of a particle, spacing^d. Fluid that is in the air counts too.
-    The column is to be away from side walls by its radius.
+    Solids do not: above one that stands on the floor h is less than the level of the surface by its height. The column
+    is to be away from side walls by its radius.
     """
 
     def __init__(self, position: Any, floor: float = 0.0, radius: float | None = None, up: Any = None):

@@ -1,0 +1,124 @@
+"""Sensors where no fluid can be: what to warn of before a run, as they read 0 like dry ones."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.errors import warn
+from cortado.runs.sensors.flow_rate import FlowRate
+from cortado.runs.sensors.pressure_probe import PressureProbe
+from cortado.runs.sensors.wall_force import WallForce
+from cortado.runs.sensors.wave_gauge import WaveGauge
+from cortado.scene.discrete_scene import Lattice
+from cortado.scene.scene import Scene
+from cortado.scene.sentences import point_in_words
+
+DEEP = 0.01
+"""In spacings: a place that is less deep in a wall or a solid is on its surface."""
+MOST = 16
+"""Points along an axis by which planes and columns are looked at."""
+
+
+class Prepared(Protocol):
+    """What is known of a simulation."""
+
+    scene: Scene
+    lattice: Lattice
+    walls: Points
+
+
+def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
+    """Warn of sensors, by their names, of which the scene, as it begins, keeps all fluid away."""
+    for name, sensor in sensors.items():
+        found = _doubt(simulation, sensor)
+        if found is not None:
+            warn(f"the sensor {name!r} {found}.")
+
+
+def _doubt(simulation: Prepared, sensor: Any) -> str | None:
+    """Why a sensor may never see fluid; None where it may, and of sensors that are not Cortado's own."""
+    scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
+    place = getattr(sensor, "position", None)
+    if place is not None and len(place) != scene.dimension:
+        return None  # refused where it is read
+    if isinstance(sensor, WallForce):
+        return _without_walls(simulation, sensor)
+    if not isinstance(sensor, PressureProbe | WaveGauge | FlowRate):
+        return None
+    there = _what_is_at(scene, _looked_at(scene, sensor))
+    if all(there):
+        what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
+        reads = f"its floor, {sensor.floor:g} m," if isinstance(sensor, WaveGauge) else "0"
+        names = " and ".join(dict.fromkeys(filter(None, there)))
+        return f"{what} {point_in_words(place)} m, {names}: it reads {reads} as without fluid{_in_metres(scene, place)}"
+    key = "reach" if isinstance(sensor, FlowRate) else "radius"
+    wide = getattr(sensor, key)
+    if wide is not None and wide < 0.5 * spacing:
+        return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
+    return None
+
+
+def _looked_at(scene: Scene, sensor: Any) -> Points:
+    """(n, d) points of a sensor, of which fluid has to reach one [m]."""
+    place, ends = sensor.position, scene.container.extent()
+    if isinstance(sensor, PressureProbe) or ends is None:
+        return np.array([place])
+    corners = _product([np.array(pair) for pair in zip(*ends, strict=True)])
+    if isinstance(sensor, WaveGauge):
+        heights = (corners - place) @ sensor.up
+        return np.asarray(place + np.linspace(heights.min(), heights.max(), 4 * MOST)[1:-1, None] * sensor.up)
+    off = (corners - place) @ sensor.normal
+    if off.min() > 0.0 or off.max() < 0.0:
+        return np.array([place])
+    points = _product([np.linspace(a, b, MOST)[1:-1] for a, b in zip(*ends, strict=True)])
+    return np.asarray(points - ((points - place) @ sensor.normal)[:, None] * sensor.normal)
+
+
+def _product(axes: list[Points]) -> Points:
+    """(n, d) the points that have one of the coordinates of each axis."""
+    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+
+def _what_is_at(scene: Scene, points: Points) -> list[str | None]:
+    """What keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
+    d, deep = scene.dimension, DEEP * scene.discretisation.spacing
+    region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
+    found: list[str | None] = [None] * len(points)
+    if ends is not None:
+        where = f"outside of the container, which is from {point_in_words(ends[0])} to {point_in_words(ends[1])} m"
+        found = [None if inside else where for inside in region.contains(points, deep)]
+    domain = scene.container.domain(d)
+    for table in scene.solid:
+        solid, middle = table.solid(), table.middle()
+        near = middle + domain.shortest(points - middle)
+        called = f"in the solid {table.name!r}{', where it begins' if table.moves else ''}"
+        for k in np.flatnonzero(solid.distance(near) < -deep):
+            found[k] = found[k] or called
+    return found
+
+
+def _in_metres(scene: Scene, place: Points) -> str:
+    """A hint where a place is far outside, as it would be in millimetres."""
+    ends = scene.container.extent()
+    if ends is None or np.abs(place).max() <= 10.0 * np.abs(ends).max():
+        return ""
+    return " (positions are in metres)"
+
+
+def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
+    """Of a region that no particle is in which could push walls."""
+    walls, d = simulation.walls, simulation.scene.dimension
+    lower = np.full(d, -np.inf) if sensor.lower is None else sensor.lower
+    upper = np.full(d, np.inf) if sensor.upper is None else sensor.upper
+    if len(lower) != d or len(upper) != d:
+        return None  # refused where it is read
+    if not len(walls):
+        return "reads forces on walls, but the scene has none: it reads 0"
+    reach = simulation.lattice.support + 0.5 * simulation.scene.discretisation.spacing
+    if simulation.lattice.domain.within(walls, lower - reach, upper + reach)[1].any():
+        return None
+    ends = " to ".join(point_in_words(end) for end in (walls.min(axis=0), walls.max(axis=0)))
+    region = f"from {point_in_words(lower)} to {point_in_words(upper)} m"
+    return f"looks at a region {region} without walls: all are within {ends} m, and it reads 0"
