@@ -21,6 +21,10 @@ from cortado.scene.restart import RestartState
 class Measured(Steppable, Protocol):
     """A simulation as its quantities see it."""
 
+    @property
+    def walls(self) -> NDArray:
+        """(b, d) wall particles [m]"""
+
     def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
         """A rollout that is ready to go forward."""
 

@@ -24,9 +24,17 @@ MOST = 16
 class Prepared(Protocol):
     """What is known of a simulation."""
 
-    scene: Scene
-    lattice: Lattice
-    walls: Points
+    @property
+    def scene(self) -> Scene:
+        """What is simulated."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the particles at rest."""
+
+    @property
+    def walls(self) -> Points:
+        """(b, d) wall particles [m]"""
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
@@ -40,13 +48,13 @@ def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
 def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     """Why a sensor may never see fluid; None where it may, and of sensors that are not Cortado's own."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
-    place = getattr(sensor, "position", None)
-    if place is not None and len(place) != scene.dimension:
-        return None  # refused where it is read
     if isinstance(sensor, WallForce):
         return _without_walls(simulation, sensor)
     if not isinstance(sensor, PressureProbe | WaveGauge | FlowRate):
         return None
+    place = sensor.position
+    if len(place) != scene.dimension:
+        return None  # refused where it is read
     there = _what_is_at(scene, _looked_at(scene, sensor))
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
