@@ -30,6 +30,7 @@ REFUSED = {
     "forces.viscous_solve": lambda: plane(forces={"viscosity": "pairwise", "viscous_solve": "implicit"}),
     "forces.surface_tension_form": lambda: plane(forces={"surface_tension_form": "pairwise"}),
     "container.slip": lambda: plane(container={**ROOM, "periodic": [True, True], "slip": "no"}),
+    "picture.light": lambda: plane(picture={"light": "noon", "background": [0.5, 0.5, 0.5]}),
     "picture.floor": lambda: plane(picture={"floor": False}),
     "picture.field_of_view": lambda: plane(picture={"field_of_view": 40.0}),
     "picture.surface": lambda: plane(picture={"surface": "spheres"}),

@@ -69,6 +69,8 @@ def _idle_in_picture(picture: Picture, dimension: int) -> Iterator[Idle]:
     path = ("picture",)
     if dimension == 2:
         yield path, picture, OF_SPACE, "the scene has 2 dimensions"
+        if picture.background is not None:
+            yield path, picture, ("light",), "background is given, which is all that a plane shows of it"
     if picture.surface == "spheres":
         yield path, picture, ("transparency",), 'surface is "spheres", which are not clear'
     if picture.film_frames == 0:
