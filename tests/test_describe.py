@@ -10,8 +10,8 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.describe import _masses
 from cortado.cli.commands.drawing_time import seconds_of_picture
+from cortado.cli.commands.fluid_masses import FluidMasses
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.cli.commands.run_length import RunLength
 from cortado.cli.commands.run_summary import Energy, RunSummary
@@ -53,6 +53,18 @@ def test_it_says_what_the_scene_has(capsys):
     assert 0 < found["memory_bytes"] < found["gradient_memory_bytes"]
 
 
+def test_another_mass_than_was_asked_for_is_told(capsys):
+    """A box of 6.6 x 6.6 cells holds 42 particles, where one of 10.5 x 20 cells holds its volume."""
+    whole = ["--set", "fluid.0.upper=[0.525,1]", "--set", "container.upper=[1,1]"]
+    for upper, mass in ((["--set", "fluid.0.upper=[0.33,0.33]"], 108.9), (whole, 525.0)):
+        found = described(capsys, "scene.toml", "--steps", "2", *upper)
+        given, asked = found["mass_of_phase_kg"]["water"], found["mass_asked_of_phase_kg"]["water"]
+        assert asked == pytest.approx(mass) and ("asked" in found["mass_in_words"][0]) == (upper is not whole)
+        assert (given == pytest.approx(asked, rel=0.003)) == (upper is whole)
+    main(["run", "scene.toml", "--steps", "2", "--set", "fluid.0.upper=[0.33,0.33]"])
+    assert "where 108.9 kg were asked for" in "".join(capsys.readouterr())
+
+
 def test_a_cubic_metre_of_water_is_a_tonne():
     """With every kernel and support."""
     for kernel in KERNELS:
@@ -64,8 +76,8 @@ def test_a_cubic_metre_of_water_is_a_tonne():
                 "container.lower=[0,0]",
             ]
             cut = ["discretisation.spacing=0.2", f"discretisation.kernel={kernel}", f"discretisation.support={support}"]
-            found = _masses(cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])))
-            assert sum(found.values()) == pytest.approx(1000.0, rel=1e-6)
+            found = FluidMasses.of(cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])))
+            assert sum(found.given.values()) == pytest.approx(1000.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(

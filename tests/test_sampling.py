@@ -51,9 +51,19 @@ def test_round_off_neither_adds_nor_loses_a_layer(lower, cells):
     assert len(fluid_particles(scene).positions) == cells
 
 
-def test_no_particle_is_beyond_a_box_that_is_no_multiple_of_the_spacing():
-    positions = fluid_particles(scene_of(2, [box([0.0, 0.0], [0.24, 0.17])])).positions
-    assert len(positions) == 4 * 3 and (positions < [0.24, 0.17]).all()
+@pytest.mark.parametrize(
+    "upper, within",
+    [([0.24, 0.17], 0.03), ([1.025, 2.0], 1e-9), ([0.63, 0.48, 1.01], 0.02), ([0.72, 0.57, 0.87], 0.003)],
+)
+def test_a_box_that_is_no_multiple_of_the_spacing_is_full(upper, within):
+    """Its particles are as many as its volume holds, half a cell from its faces, and little stretched."""
+    dimension = len(upper)
+    x = fluid_particles(scene_of(dimension, [box([0.0] * dimension, upper)])).positions
+    assert len(x) * SPACING**dimension == pytest.approx(np.prod(upper), rel=within)
+    apart = np.array([np.diff(np.unique(x[:, axis])).max() for axis in range(dimension)])
+    np.testing.assert_allclose(x.min(axis=0), 0.5 * apart)
+    np.testing.assert_allclose(upper - x.max(axis=0), 0.5 * apart)
+    assert np.abs(np.log(apart / SPACING)).max() < 0.2
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

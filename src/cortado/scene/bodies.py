@@ -85,7 +85,7 @@ class CutBody:
         if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
-        return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.spacing).any())
+        return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.fluid.block(self.spacing).spacings.min()).any())
 
 
 @dataclass(frozen=True)

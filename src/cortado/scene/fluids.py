@@ -9,7 +9,7 @@ from pydantic import ValidationInfo, field_validator, model_validator
 
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
+from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
 from cortado.discretise.solids.primitives import Box, Revolved
 from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
@@ -82,6 +82,10 @@ class Fluid(FluidBody):
         """(n, d) [m] those that a container and solids leave room for."""
         return self.particles(spacing)
 
+    def volume(self, spacing: float) -> float:
+        """[m^d] that it is to have, where nothing cuts it."""
+        return self.count(spacing) * spacing ** len(self.velocity)
+
 
 class LatticeFluid(Fluid):
     """A body of fluid whose particles are on a lattice of the spacing."""
@@ -102,7 +106,7 @@ class LatticeFluid(Fluid):
     def particles_in(self, room: Room, spacing: float) -> Points:
         """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
         everything = self.particles(spacing)
-        return everything[room.contains(everything, (ROUND_OFF - 0.5) * spacing)]
+        return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
 
 class RegionFluid(LatticeFluid):
@@ -136,7 +140,9 @@ class Turnable(RegionFluid):
 
 
 class BoxFluid(Turnable):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned."""
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned. Where a side is no
+    whole multiple of the spacing, they are a few percent further apart along some axes and closer along others: the box
+    is full, with the mass of its volume within 0.3 %. Where that cannot be, `describe` and a run say both masses."""
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
@@ -150,11 +156,14 @@ class BoxFluid(Turnable):
         return self
 
     def block(self, spacing: float) -> Block:
-        return block_between(self.lower, self.upper, spacing)
+        return block_filling(self.lower, self.upper, spacing)
+
+    def volume(self, spacing: float) -> float:
+        return float(np.prod(np.subtract(self.upper, self.lower)))
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        first, last = self.block(spacing).extent
-        return Region.between(first - 0.5 * spacing, last + 0.5 * spacing).distance(points)
+        (first, last), half = self.block(spacing).extent, 0.5 * self.block(spacing).spacings
+        return Region.between(first - half, last + half).distance(points)
 
     def witnesses(self, spacing: float) -> Points:
         return self.box_corners(spacing)
@@ -211,7 +220,7 @@ class CylinderFluid(Turnable, RoundFluid):
         half[axis] = 0.5 * self.height
         block = block_about(base, half, spacing)
         standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
-        return Block(standing, block.counts, spacing)
+        return Block(standing, block.counts, block.spacings)
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         axis = INDEX_OF_AXIS[self.axis]

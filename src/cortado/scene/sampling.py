@@ -51,11 +51,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
     """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
     gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
-    room = room_of(scene)
-    reach = scene.discretisation.support_radius
-    bodies = [
-        CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None for fluid in scene.fluid
-    ]
+    room, bodies = room_of(scene), _cut_bodies(scene)
     positions = [
         fluid.particles_in(room, spacing) if body is None else body.particles()
         for fluid, body in zip(scene.fluid, bodies, strict=True)
@@ -96,6 +92,21 @@ def reserve_offset(scene: Scene) -> Points:
     size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
     aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
     return 2.0 * (size + scene.discretisation.support_radius) * aside
+
+
+def asked_volumes(scene: Scene) -> dict[str, float]:
+    """By phase [m^d], what its bodies of fluid are to hold, without what walls take of them; of points what they
+    hold."""
+    spacing, found = scene.discretisation.spacing, dict.fromkeys((phase.name for phase in scene.phase), 0.0)
+    for fluid, body in zip(scene.fluid, _cut_bodies(scene), strict=True):
+        found[fluid.phase] += fluid.volume(spacing) if body is None else body.volume()
+    return found
+
+
+def _cut_bodies(scene: Scene) -> list[CutBody | None]:
+    """Of each body of fluid the part that walls leave room for, where its particles may be packed; None of others."""
+    spacing, reach, room = scene.discretisation.spacing, scene.discretisation.support_radius, room_of(scene)
+    return [CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None for fluid in scene.fluid]
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:

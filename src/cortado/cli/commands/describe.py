@@ -4,6 +4,7 @@ import json
 import math
 import time
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ import numpy as np
 import warp as wp
 
 from cortado.cli.commands.drawing_time import seconds_of_picture
+from cortado.cli.commands.fluid_masses import FluidMasses
 from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.cli.commands.run_length import RunLength
 from cortado.device.memory import step_parts
 from cortado.errors import DivergedError, InputError
 from cortado.files.atomic import sentences
+from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
@@ -35,6 +38,8 @@ from cortado.words import counted
 
 SAME = 1e-6
 """Relative: a time step that is rounded to float32 is the same."""
+MANY = 1_000_000
+"""Particles: so many are announced before they are made, as that takes some seconds or minutes."""
 FIRST, MOST, ENOUGH = 4, 100, 0.5
 """Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
 
@@ -80,7 +85,11 @@ def describe_scene(
     """As text, or as JSON; a picture of the first state is written where one is asked for."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
-    simulation = Simulation(load_scene(scene_file, overrides).lasting(time, steps), device, precision)
+    scene = load_scene(scene_file, overrides).lasting(time, steps)
+    bodies = scene.fluid if scene.emitter is None else (*scene.fluid, scene.emitter)
+    count = sum(body.count(scene.discretisation.spacing) for body in bodies)
+    with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
+        simulation = Simulation(scene, device, precision)
     length = RunLength.of(simulation, steps, time, frames)
     found = _described(simulation, length)
     if length.film is not None:
@@ -98,6 +107,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
     (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
+    masses = FluidMasses.of(simulation)
     found: dict[str, Any] = {
         "name": scene.name,
         "dimension": scene.dimension,
@@ -108,7 +118,9 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
         "wall_particles": len(simulation.walls),
         "fluid_size_m": _fluid_size(simulation),
         "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
-        "mass_of_phase_kg": _masses(simulation),
+        "mass_of_phase_kg": masses.given,
+        "mass_asked_of_phase_kg": masses.asked,
+        "mass_in_words": [masses.off.get(name, f"{mass:.3g} kg of {name}") for name, mass in masses.given.items()],
         "gravity_m_s2": list(scene.forces.gravity),
         "spacing_m": scene.discretisation.spacing,
         "time_step_s": size,
@@ -156,13 +168,6 @@ def _viscosity(scene: Scene) -> str:
         return str(form)
     when = "implicit, at the end of a step" if is_implicit(scene) else "explicit, at the start of a step"
     return f"stress, {when}; an explicit one bears steps of {limit:.3g} s"
-
-
-def _masses(simulation: Simulation) -> dict[str, float]:
-    """By phase [kg]; in 2-D of a layer one metre thick."""
-    volumes = simulation.lattice.cell * simulation.mass_fractions.sum(axis=0)
-    phases = simulation.scene.phase
-    return {phase.name: float(phase.rest_density * volume) for phase, volume in zip(phases, volumes, strict=True)}
 
 
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
@@ -240,7 +245,7 @@ def _size(found: dict[str, Any]) -> str:
     fluid, held = (
         " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
     )
-    masses = ", ".join(f"{mass:.3g} kg of {name}" for name, mass in found["mass_of_phase_kg"].items())
+    masses = ", ".join(found["mass_in_words"])
     layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
     container = f", in a container of {held} m" if held else ""
     gravity = vector(found["gravity_m_s2"])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.cli.commands.fluid_masses import FluidMasses
 from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
@@ -86,6 +87,8 @@ class RunSummary:
     """Particles beside or below an open cup at the end."""
     particles: int
     """That did not begin in an emitter."""
+    masses: FluidMasses
+    """Of the fluid at the start."""
     readings: Mapping[str, Readings] = field(default_factory=dict)
     """What sensors read, by their names."""
 
@@ -115,6 +118,7 @@ class RunSummary:
             densities=found,
             spilt=_spilt(simulation, last),
             particles=simulation.free_particles,
+            masses=FluidMasses.of(simulation),
             readings=readings or {},
         )
 
@@ -132,7 +136,14 @@ class RunSummary:
         energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
         sensors = {"sensors": summary(self.readings)} if self.readings else {}
-        return {"energy": energies, "density": {"least": least, "greatest": greatest}, "spilt": self.spilt, **sensors}
+        masses = {"given": self.masses.given, "asked": self.masses.asked}
+        return {
+            "energy": energies,
+            "mass": masses,
+            "density": {"least": least, "greatest": greatest},
+            "spilt": self.spilt,
+            **sensors,
+        }
 
     def rows(self) -> list[tuple[object, ...]]:
         """(what, value, unit) of each row of a table."""
@@ -148,6 +159,7 @@ class RunSummary:
             ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
             (f"time that {self._computed_in_words} steps took", f"{self.seconds:.3g}", "s"),
             *energies,
+            *((f"fluid at the start: {words}", "", "") for words in self.masses.off.values()),
             *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
             *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
             *(
@@ -173,6 +185,8 @@ class RunSummary:
             text += f"; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3"
         if self.spilt:
             text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
+        if self.masses.off:
+            text += f". The fluid began with {' and '.join(self.masses.off.values())}"
         return f"{text}."
 
 
