@@ -11,6 +11,7 @@ import pytest
 
 import cortado
 from cortado import InputError, SceneError, Simulation, Trajectory
+from cortado.rollout import retaking
 from cortado.scene.restart import Clock
 from cortado.scene.stability import chosen_limits, is_implicit, viscous_limit
 from cortado.sensors import PressureProbe
@@ -497,3 +498,35 @@ def test_a_time_that_is_none_is_refused(run_command, tmp_path, words, what):
     code, _, err = run_command(*words)
     assert code == 2 and what in err and len(err.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+# ---- steps that are taken again ----------------------------------------------------------------------------------
+
+
+def wedge(gap, **solver):
+    """A column in the plane that collapses and flows under a disc, so far above the floor [m]."""
+    return cortado.Scene(
+        dimension=2,
+        discretisation={"spacing": 0.03},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.6], "phase": "water"}],
+        solid=[{"name": "disc", "shape": "sphere", "centre": [0.75, 0.14 + gap], "radius": 0.14}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.1, 1.0]},
+        solver={"kind": "projection", **CHOSEN, **solver},
+    )
+
+
+def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monkeypatch):
+    simulation = Simulation(wedge(0.02))
+    whole = simulation.run(80)
+    sizes = sizes_of(whole)
+    again = np.flatnonzero(sizes[1:] < 0.3 * sizes[:-1]) + 1
+    assert len(again) > 0
+    before = int(again[0])
+    rest = simulation.run(80 - before, state=whole[: before + 1].last_state)  # of which the first step is taken again
+    assert rest.positions.tobytes() == whole.positions[before:].tobytes()
+    pair = Simulation(wedge(0.02), batch=2).run(80, {"viscosity": np.array([0.001, 0.1])})
+    assert pair[0].positions.tobytes() == whole.positions.tobytes()
+    monkeypatch.setattr(retaking, "TIMES", 0)
+    with pytest.raises(cortado.DivergedError):
+        simulation.run(80)

@@ -173,7 +173,7 @@ class Rollout(Staying):
                 last = min(step + min(len(self._chunk), self.step_sizes.longest_chunk), self.steps)
                 self._buffer.assign(state)  # which may be one of the states that steps overwrite
                 chunk = self._advance(step, last)
-                while self.solver.make_room():
+                while self.solver.make_room() or self.step_sizes.again(step, last):
                     self._forget_stale_graphs()
                     self.solver.reset(step)
                     chunk = self._advance(step, last)

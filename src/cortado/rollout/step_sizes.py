@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import sum_and_maximum
 from cortado.particles.state import Parameters, State
+from cortado.rollout.retaking import SHORTER, Retaken
 from cortado.rollout.step_size_kernels import step_size_kernels
 from cortado.scene.restart import Clock, RecordedClock
-from cortado.solvers.solver import Solver
+from cortado.solvers.solver import Solver, StepLog
 
 GROWTH = 1.1
 """A step is at most so many times as long as the one before."""
@@ -57,6 +58,9 @@ class StepSizes(Protocol):
         """Read the steps behind the first of these states, up to the one after the last. Returns the last state that
         belongs to the run, and whether the run ends with it."""
 
+    def again(self, first: int, last: int) -> bool:
+        """Whether the steps between these states, which were taken, are to be taken again, as some are shorter now."""
+
     def is_end(self, step: int) -> bool:
         """Whether the run ends with the state after so many steps, which was read."""
 
@@ -96,6 +100,10 @@ class FixedSteps:
         """See `StepSizes`."""
         return last, False
 
+    def again(self, first: int, last: int) -> bool:
+        """See `StepSizes`."""
+        return False
+
     def is_end(self, step: int) -> bool:
         """See `StepSizes`."""
         return False
@@ -121,11 +129,11 @@ class ChosenSteps:
     the step before is in its clock, so that a run that goes on has the steps of one that did not stop.
     """
 
-    def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
-        """``length``: how far a particle may move in a step [m]."""
+    def __init__(self, solver: Solver, parameters: Parameters, log: StepLog, steps: int, length: float):
+        """``log`` is what the solver notes of the steps; ``length``: how far a particle may move in a step [m]."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
-        self._solver, self._parameters, self._length = solver, parameters, length
+        self._solver, self._parameters, self._log, self._length = solver, parameters, log, length
         self._kernels = step_size_kernels(layout.precision)
         self._squares = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
@@ -135,6 +143,7 @@ class ChosenSteps:
         self._first = wp.zeros(layout.members, dtype=real, device=device)
         self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
         self._fill: Fill | None = None
+        self._retaken = Retaken()
         self.end = inf
         self.longest_chunk = FixedSteps.longest_chunk
 
@@ -145,7 +154,7 @@ class ChosenSteps:
         self._bounds.assign(bounds)
         self._first.assign([clock.time_step for clock in clocks])
         self._times[0].assign([clock.time for clock in clocks])
-        self._fill, self.end = fill, inf
+        self._fill, self._retaken, self.end = fill, Retaken(), inf
         self.longest_chunk = FixedSteps.longest_chunk if fill is None else 1
         found = self._read = RecordedSizes(np.zeros(self._sizes.shape), np.zeros(self._times.shape))
         own = zip(clocks, found.times.T, found.sizes.T, strict=True)
@@ -200,6 +209,19 @@ class ChosenSteps:
         self._look(first + 1, last)
         past = np.flatnonzero(self._read.times[first + 1 : last + 1, 0] >= self.end)
         return (first + 1 + int(past[0]), True) if len(past) else (last, False)
+
+    def again(self, first: int, last: int) -> bool:
+        """See `StepSizes`."""
+        found = self._retaken.found(self._solver, self._log, first, last)
+        if not found:
+            return False
+        sizes, bounds = self._sizes.numpy(), self._bounds.numpy()
+        for step, member in found:
+            sizes[step, member] = bounds[step, member] = SHORTER * sizes[step, member]
+        self._sizes.assign(sizes)
+        self._bounds.assign(bounds)
+        self._look(first, first)
+        return True
 
     def is_end(self, step: int) -> bool:
         """See `StepSizes`."""
