@@ -1,4 +1,4 @@
-"""Sensors: of a fluid that moves as a whole they read what a closed form says, and one that can read nothing is told."""
+"""Sensors read what a closed form says of a fluid that moves as a whole; one that can read nothing is told of."""
 
 from pathlib import Path
 from typing import Any
