@@ -32,7 +32,7 @@ FAULTS = (
     "return None",
     "return object()",
 )
-PLACES = ("made", "force", "begun", "parameters", "called", "loaded")
+PLACES = ("made", "force", "stepped", "parameters", "called", "loaded")
 TEXT = """
 import sys
 import warnings
@@ -65,11 +65,12 @@ class Part:
 
 
 class Force:
-    names = ()
-    {called} = None
+    shares = ()
 
-    def begin(self, *arguments, **options):
-        {begun}
+    def accelerate(self, *arguments, **options):
+        {stepped}
+
+    tangent = adjoint = accelerate
 
     def __getattr__(self, name):
         {called_fault}
@@ -86,7 +87,7 @@ def run_a_part(case: Case) -> None:
     fault, place = str(case.random.choice(FAULTS)), str(case.random.choice(PLACES))
     at = {name: ("return fault()" if name == place else "pass") for name in PLACES}
     at["loaded"] = "fault()" if place == "loaded" else ""
-    text = TEXT.format(fault=fault, called_fault=at.pop("called"), called="_nothing", **at)
+    text = TEXT.format(fault=fault, called_fault=at.pop("called"), **at)
     module = f"fuzzed_part_{case.number}"
     (case.folder / f"{module}.py").write_text(text)
     info = case.folder / f"fuzzed{case.number}-1.0.dist-info"
@@ -112,6 +113,6 @@ def run_a_part(case: Case) -> None:
         raise SystemExit(0 if (folder / "out" / "trajectory.vtkhdf").exists() else 3)
 
     outcome = case.read(program, case.folder, codes=(0, 1, 2))
-    is_named = any(word in outcome.err for word in ("fuzzed", "rate is 3", "memory"))
+    is_named = any(word in outcome.err for word in ("fuzzed", "the force Force", "rate is 3", "memory"))
     if outcome.code in (1, 2) and not is_named:
         case.complaints.append("what is said names neither the package nor the part")
