@@ -25,7 +25,7 @@ def read_a_moving_fluid(case: Case) -> None:
     length, depth = across * SPACING, layers * SPACING
     origin = float(random.uniform(-3.0, 3.0))
     speed = float(random.choice([-1.0, 1.0]) * random.uniform(1.0, 4.0))
-    rounds, steps = float(random.uniform(0.5, 2.5)), 60
+    rounds, steps = float(random.uniform(0.5, 2.5)), 240
     kernel, support = str(random.choice(KERNELS)), float(random.choice([2.0, 2.5, 3.0]))
     place = origin + length * float(random.choice([0.0, 1.0, random.uniform(), 0.01, 0.99]))
     block = {"shape": "box", "lower": [origin, 0.0], "upper": [origin + length, depth], "phase": "water"}
