@@ -6,7 +6,7 @@ import warp as wp
 
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.errors import InputError
-from cortado.losses import FinalPositions, Frames, Snapshot, SnapshotAdjoint
+from cortado.losses import FinalPositions, Frames, Recorded, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.particles.fields import POSITIONS, VELOCITIES
 from cortado.particles.state import Layout, State
@@ -151,3 +151,38 @@ def test_a_function_whose_arguments_cannot_be_told_is_taken():
 def test_a_function_of_warp_arrays_is_taken():
     assert as_loss(lambda x, v, loss: loss.fill_(float(len(x)))).value(END) == N
     assert isinstance(END.state.positions, wp.array)
+
+
+GAIN = 2.0
+
+
+@wp.func
+def gained(x: wp.float64):
+    return wp.float64(GAIN) * x
+
+
+@wp.kernel
+def add_heights(x: wp.array(dtype=wp.vec3d), loss: wp.array(dtype=wp.float64)):
+    wp.atomic_add(loss, 0, gained(x[wp.tid()][1]))
+
+
+def heights(positions, velocities, loss):
+    wp.launch(add_heights, dim=len(positions), inputs=[positions, loss])
+
+
+def test_a_loss_in_warp_is_told_from_one_of_other_code_or_numbers(monkeypatch):
+    """Also through a kernel and the function that it calls; a search of the one does not go on with the other."""
+
+    def of(power):
+        def function(positions, velocities, loss):
+            heights(positions, velocities, loss)
+            return power
+
+        return function
+
+    found = {fingerprint(Recorded(one)) for one in (heights, of(1), of(2), lambda x, v, loss: heights(v, x, loss))}
+    assert len(found) == 4 and fingerprint(heights) != fingerprint(of(1))
+    assert fingerprint(Recorded(of(1))) == fingerprint(Recorded(of(1)))
+    before = fingerprint(Recorded(heights))
+    monkeypatch.setitem(globals(), "GAIN", 3.0)
+    assert fingerprint(Recorded(heights)) != before

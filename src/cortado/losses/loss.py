@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from inspect import isfunction
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from cortado.device.launching import add
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
+from cortado.losses.code_words import code_words
 from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.discrete_scene import Lattice
@@ -197,5 +199,5 @@ class Frames:
 
 
 def fingerprint(loss: Any) -> str:
-    """A text that tells one loss from another; of a loss without its own ``fingerprint`` only the type."""
-    return getattr(loss, "fingerprint", type(loss).__qualname__)
+    """A text that tells one loss from another: its own ``fingerprint``, the code of a function, or else the type."""
+    return getattr(loss, "fingerprint", code_words(loss) if isfunction(loss) else type(loss).__qualname__)

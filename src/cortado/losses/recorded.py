@@ -9,6 +9,7 @@ import warp as wp
 from cortado.arrays import require_methods
 from cortado.device.threads import WARP
 from cortado.fixed import fixed
+from cortado.losses.code_words import code_words
 from cortado.losses.loss import Adjoint, Snapshot
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
@@ -26,6 +27,11 @@ class Recorded:
     def __init__(self, function: WarpFunction):
         require_methods("function", function, ("__call__",), "a function of positions, velocities and a loss")
         self.function = function
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells the loss from one of another function, or of other numbers, for searches that go on."""
+        return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP
     def value(self, end: Snapshot) -> float:

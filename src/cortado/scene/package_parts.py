@@ -31,11 +31,11 @@ def _in_words(problem: BaseException, package: str) -> str:
 
 @contextmanager
 def guarded(what: str, package: str, error: type[CortadoError] = InputError) -> Iterator[None]:
-    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors,
-    for an interruption and for a lack of memory. One that asks for the end of the process does not get it."""
+    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors
+    and for an interruption. One that asks for the end of the process does not get it."""
     try:
         yield
-    except (CortadoError, KeyboardInterrupt, MemoryError, GeneratorExit):
+    except (CortadoError, KeyboardInterrupt):
         raise
     except BaseException as problem:
         raise error(f"{what} {_in_words(problem, package)}.") from problem
