@@ -30,12 +30,14 @@ def _in_words(problem: BaseException, package: str) -> str:
 
 
 @contextmanager
-def guarded(what: str, package: str, error: type[CortadoError] = InputError) -> Iterator[None]:
-    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors
-    and for an interruption. One that asks for the end of the process does not get it."""
+def guarded(
+    what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
+) -> Iterator[None]:
+    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors,
+    for an interruption and for what is ``expected``. One that asks for the end of the process does not get it."""
     try:
         yield
-    except (CortadoError, KeyboardInterrupt):
+    except (CortadoError, KeyboardInterrupt, *expected):
         raise
     except BaseException as problem:
         raise error(f"{what} {_in_words(problem, package)}.") from problem
@@ -103,15 +105,19 @@ def _guarded_class(cls: type, kind: str, package: str) -> type:
         found, what = getattr_static(cls, name), f'"{kind}" fails in {name} of {cls.__name__}:'
         if isinstance(found, property) and found.fget and not _is_ours(found.fget):
             own[name] = property(_guarded_method(found.fget, what, kind, package), found.fset, found.fdel)
+        elif isfunction(found) and name == "__getattr__":
+            own[name] = _guarded_method(found, what, kind, package, (AttributeError,))
         elif isfunction(found) and not name.startswith("__") and not _is_ours(found):
             own[name] = _guarded_method(found, what, kind, package)
     return type(cls)(cls.__name__, (cls,), own)
 
 
-def _guarded_method(function: Callable[..., Any], what: str, kind: str, package: str) -> Callable[..., Any]:
+def _guarded_method(
+    function: Callable[..., Any], what: str, kind: str, package: str, expected: tuple[type[BaseException], ...] = ()
+) -> Callable[..., Any]:
     @wraps(function)
     def call(*arguments: Any, **more: Any) -> Any:
-        with guarded(what, package, ComputationError):
+        with guarded(what, package, ComputationError, expected):
             return _at_work(function(*arguments, **more), kind, package)
 
     return call
