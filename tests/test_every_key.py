@@ -42,6 +42,19 @@ BASES = {
     "mixture": lambda: plane_of_three(
         render={"resolution": [16, 16], "background": [0.5, 0.6, 0.7], "extinction": 5.0},
     ),
+    "shapes": lambda: scene(
+        forces={"gravity": [0.0, -9.81, 0.0]},
+        phase=[{**WATER, "rheology": {"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.5}}],
+        container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.3, "height": 0.6, "slip": "no"},
+        fluid=[
+            {"shape": "cylinder", "base": [0.0, 0.05, 0.0], "radius": 0.12, "height": 0.1, "phase": "water"},
+            {"shape": "sphere", "centre": [0.0, 0.4, 0.0], "radius": 0.1, "phase": "water"},
+        ],
+        solid=[
+            {"name": "rod", "shape": "capsule", "start": [-0.17, 0.3, 0.0], "end": [-0.17, 0.5, 0.0], "radius": 0.06},
+            {"name": "pole", "shape": "cylinder", "base": [0.2, 0.3, 0.0], "radius": 0.06, "height": 0.1, "slip": "no"},
+        ],
+    ),
     "space": lambda: scene(
         picture={**SPACE, "camera_path": {"kind": "dolly", "distance": 0.5}},
         render={"view": "volume", "resolution": [16, 16], "position": [1.0, 1.0, 1.0], "look_at": [0.1, 0.1, 0.1]},
