@@ -13,7 +13,7 @@ import cortado
 from cortado import InputError, SceneError, Simulation, Trajectory
 from cortado.rollout import retaking
 from cortado.scene.restart import Clock
-from cortado.scene.stability import chosen_limits, is_implicit, viscous_limit
+from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.sensors import PressureProbe
 from scenes import jet, plane, two_layers
 
@@ -530,3 +530,18 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monk
     monkeypatch.setattr(retaking, "TIMES", 0)
     with pytest.raises(cortado.DivergedError):
         simulation.run(80)
+
+
+def test_the_fall_through_a_funnel_bounds_the_step():
+    """Without a container fluid falls from the top of its box to the foot of the lowest solid."""
+    sides = [
+        [[-0.4, 0.5], [-0.4, 0.45], [-0.05, 0.0], [-0.05, 0.05]],
+        [[0.4, 0.5], [0.05, 0.05], [0.05, 0.0], [0.4, 0.45]],
+    ]
+    scene = plane(
+        container={"shape": "none"},
+        fluid=[{"shape": "box", "lower": [-0.2, 0.4], "upper": [0.2, 0.6], "phase": "water"}],
+        solid=[{"name": f"side {k}", "shape": "polygon", "corners": corners} for k, corners in enumerate(sides)],
+    )
+    fall = np.sqrt(2.0 * 9.81 * 0.6)
+    assert stability_limits(scene)["speed"] == pytest.approx(0.4 * scene.discretisation.support_radius / fall)

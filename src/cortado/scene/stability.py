@@ -13,6 +13,7 @@ from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.rheology import greatest_viscosity
+from cortado.scene.room import solids_of
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
@@ -83,7 +84,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
-    the extent of the fluid if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its outlet.
+    the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
+    outlet.
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
@@ -228,14 +230,16 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """The box around the container, or around the fluids if there is none, or around the outlet if there is only the
-    emitter: lower and upper, each (d,) [m]."""
+    """The box around the container, or around the fluids and the solids, which fluid falls along, if there is none, or
+    around the outlet if there is only the emitter: lower and upper, each (d,) [m]."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
-    if not scene.fluid:
-        assert scene.emitter is not None
-        return np.array(scene.emitter.outlet), np.array(scene.emitter.outlet)
-    lower, upper = np.swapaxes([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid], 0, 1)
     half = 0.5 * scene.discretisation.spacing
-    return lower.min(axis=0) - half, upper.max(axis=0) + half
+    fluids = np.array([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid])
+    boxes = [(lower - half, upper + half) for lower, upper in fluids]
+    boxes += [solid.extent() for solid in solids_of(scene.solid)]
+    if scene.emitter is not None and not boxes:
+        boxes = [(np.array(scene.emitter.outlet), np.array(scene.emitter.outlet))]
+    lower, upper = np.swapaxes(boxes, 0, 1)
+    return lower.min(axis=0), upper.max(axis=0)
