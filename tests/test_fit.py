@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 import cortado
 from bad_scenes import assert_one_sentence
 from cortado import measured
-from cortado.errors import ComputationError, InputError
+from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import TOO_LARGE_IN_MOTION, still_and_moving
 from cortado.optimisation.fitting.figures import video_figures
@@ -271,7 +271,7 @@ def test_a_fit_finds_what_was_measured_without_noise(experiment):
     assert found.converged and found.values["viscosity"] == pytest.approx(TRUE, rel=1e-4)
     assert found.values["camera.width"] == pytest.approx(0.48, rel=1e-4)
     assert found.labels == ["viscosity", "camera.translation[0]", "camera.translation[1]", "camera.width"]
-    assert "viscosity 2.0" in str(found) and "Pa s" in str(found)
+    assert "viscosity" in str(found) and "Pa s" in str(found)
 
 
 def test_frames_of_a_video_are_drawn_beside_what_was_found(simulation, tmp_path, monkeypatch):
@@ -375,6 +375,78 @@ def test_a_wrong_model_is_doubted(shaken):
     )
     assert found.doubts and "model is" in found.doubts[0]
     assert not cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}).doubts
+
+
+@pytest.fixture(scope="module")
+def weighed(simulation):
+    """A scale below the container, with times enough for trends."""
+    times = TIME_STEP * np.linspace(1.0, STEPS, 20)
+    scale = measured.SensorSeries(WallForce(), times, np.zeros((20, 1)), 2, columns=["force_y"])
+    found = measured.Experiment(simulation, {"scale": scale})
+    return found.measured_again(found.predicted({"viscosity": TRUE}))
+
+
+def with_noise(experiment, size, seed=0, wrong=0.0):
+    """Of every observation, so much of its largest number, and something that is ``wrong`` besides."""
+    random, noisy = np.random.default_rng(seed), {}
+    for name, one in experiment.observations.items():
+        noise = size * np.nanmax(np.abs(one.measured)) * random.standard_normal(one.measured.shape)
+        noisy[name] = one.measured + noise + wrong
+    return experiment.measured_again(noisy)
+
+
+def test_a_trend_in_a_single_series_is_doubted(weighed):
+    """From -4 to 4 % of the force, with noise of 1 %."""
+    drift = 0.04 * np.abs(weighed.observations["scale"].measured).max() * np.linspace(-1.0, 1.0, 20)[:, None]
+    doubts = cortado.fit(with_noise(weighed, 0.01, wrong=drift), {"viscosity": 1.5}, starts=1).doubts
+    assert any("The residuals of scale have a trend, from " in one for one in doubts)
+    assert not any(
+        "trend" in one for one in cortado.fit(with_noise(weighed, 0.01), {"viscosity": 1.5}, starts=1).doubts
+    )
+
+
+def test_a_clock_that_is_late_is_doubted_where_it_is_not_searched(clocked, simulation):
+    """By 8 ms: the tracers are where they should be then."""
+    moved = clocked.predicted({"viscosity": TRUE, "tracers.start": 0.008, "gauge.start": 0.0})["tracers"]
+    times, first = clocked.observations["tracers"].times, simulation.positions[::5]
+    tracks = measured.Tracks(simulation, first, times, np.zeros((9, *first.shape)))
+    late = measured.Experiment(simulation, {"tracers": tracks}).measured_again({"tracers": moved})
+    found = cortado.fit(with_noise(late, 1e-4), {"viscosity": 1.5}, starts=1)
+    assert any('clock right? calibrate = ["start"]' in one for one in found.doubts)
+
+
+def test_an_estimate_at_its_bound_is_doubted(shaken):
+    found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.0}, {"viscosity": (0.5, 1.5)}, starts=1)
+    assert any(one.startswith("viscosity is 1.5, its upper bound") for one in found.doubts)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [("container.slip=free", "is container.slip right?"), ("phase.0.rest_density=1700", "is rest_density right?")],
+)
+def test_a_wrong_density_and_a_wrong_slip_are_named(change, words, experiment, simulation):
+    """The data are those of another scene; the viscosity is known, else it makes up for the slip."""
+    names = {"tracers", "scales"}
+    observations = {name: one for name, one in experiment.observations.items() if name in names}
+    other = cortado.Simulation(SCENE.replaced(change), precision="float64")
+    wrong = measured.Experiment(other, observations).predicted({"viscosity": TRUE})
+    own = measured.Experiment(simulation, observations).measured_again(wrong)
+    found = cortado.fit(with_noise(own, 1e-3), {"viscosity": 2.0}, {"viscosity": (1.95, 2.05)}, starts=1)
+    assert any(words in one for one in found.doubts), found.doubts
+
+
+def test_points_whose_runs_diverge_are_counted(shaken, monkeypatch):
+    predicted = measured.Experiment.predicted
+
+    def lost(self, parameters):
+        if parameters["viscosity"] > 2.5:
+            raise DivergedError(3, "it is lost", "try less", 0)
+        return predicted(self, parameters)
+
+    monkeypatch.setattr(measured.Experiment, "predicted", lost)
+    found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}, starts=8)
+    assert found.refused > 0 and f"The runs at {found.refused} points" in str(found)
+    assert "of noise alone" in str(found) and "of noise alone" in found._repr_html_()
 
 
 def test_what_cannot_be_told_is_said(simulation, shaken):

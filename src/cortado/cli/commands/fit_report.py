@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
-from cortado.optimisation.fitting.fitted import Fit, Profile, unit_of
+from cortado.optimisation.fitting.fitted import NOISE_ALONE, Fit, Profile, unit_of
 from cortado.optimisation.inverse.fit_task import FitTask
 from cortado.runs.report import Section
 from cortado.scene.in_words import scene_in_words
@@ -21,7 +21,7 @@ def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Pa
     return [
         Section("What was asked", _asked(task, fitted)),
         Section("What was found", fitted.lines(), [*_apart(fitted), *fitted.doubts]),
-        Section("In numbers", [COUNTED], head=head, rows=_rows(fitted)),
+        Section("In numbers", [NOISE_ALONE, COUNTED], head=head, rows=_rows(fitted)),
         Section("Measured and found", figures=video_figures(fitted, folder)),
         Section(
             "Residuals", figures=residual_figure(fitted, folder / "residuals.png"), head=noise, rows=_parts(fitted)
@@ -108,7 +108,9 @@ def _effort(fitted: Fit) -> str:
     converged = "converged, but there is doubt," if fitted.doubts else "converged"
     ended = converged if fitted.converged else "ended after its last trial point"
     runs, tangents = counted(fitted.runs, "forward run"), counted(fitted.tangents, "run")
-    return f"The fit {ended} after {runs} and {tangents} along a tangent, from {counted(len(fitted.tried), 'start')}."
+    lost = f", of which those at {counted(fitted.refused, 'point')} diverged" if fitted.refused else ""
+    starts = counted(len(fitted.tried), "start")
+    return f"The fit {ended} after {runs} and {tangents} along a tangent, from {starts}{lost}."
 
 
 def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
@@ -126,6 +128,8 @@ def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
         "converged": fitted.converged,
         "runs": fitted.runs,
         "tangents": fitted.tangents,
+        "refused": fitted.refused,
+        "bars": NOISE_ALONE,
         "starts": [
             {
                 "start": fitted.coordinates.numbers(one.start),

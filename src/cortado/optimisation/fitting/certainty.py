@@ -2,17 +2,29 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from cortado.errors import ComputationError
 from cortado.optimisation.fitting.fitted import FittedPart
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting
 from cortado.optimisation.fitting.noise import ScoreCovariance, correlation_time, independent_frames, score_covariance
 
 SINGULAR = 1e-10
 """Relative: where the Hessian has an eigenvalue below, a combination of parameters cannot be told."""
+
+
+class Fitted(Protocol):
+    """What is fitted: a `LeastSquares`, or what has these of it."""
+
+    @property
+    def parts(self) -> list[Part]:
+        """The observations."""
+
+    @property
+    def labels(self) -> list[str]:
+        """(free,) of the numbers."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +42,7 @@ class Certainty:
     parts: tuple[FittedPart, ...]
 
     @classmethod
-    def of(cls, problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> "Certainty":
+    def of(cls, problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> "Certainty":
         """Raises `ComputationError` where a combination of parameters cannot be told."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
@@ -47,7 +59,7 @@ class Certainty:
         return cls(N, covariance, freedom, tuple(scores), tuple(parts))
 
 
-def noise_of(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
+def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
     """Weights that the residuals of a first fit ask for: correlated numbers weigh less, as they tell less."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
@@ -59,22 +71,22 @@ def noise_of(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
     return found
 
 
-def counted_covariance(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+def counted_covariance(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
     """The covariance where every number was taken for independent of all others."""
     alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return inverse(problem, hessian(problem, at, alone))
 
 
-def hessian(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
     """N = J^T J of weighted Jacobians."""
     each = zip(problem.parts, at.jacobians, weights, strict=True)
     flat = (weight.of(J, part.observation.times).reshape(-1, len(at.u)) for part, J, weight in each)
     return np.asarray(sum(J.T @ J for J in flat))
 
 
-def inverse(problem: LeastSquares, N: np.ndarray) -> np.ndarray:
+def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
     """N^-1; raises `ComputationError` where a combination of parameters cannot be told."""
-    labels, size = problem.coordinates.labels, np.sqrt(np.diag(N))
+    labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
     if not size.all():

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cortado.optimisation.fitting.causes import cheap_causes
 from cortado.optimisation.fitting.certainty import Certainty
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
 from cortado.optimisation.fitting.noise import ScoreCovariance
@@ -26,6 +27,8 @@ VAGUE = 1.0
 """Standard error of a logarithm."""
 GREATEST = 20.0
 """Of these logarithms, in a sentence."""
+AT_BOUND = 1e-6
+"""Of a coordinate, or of 1 if that is more: an estimate that is nearer to a bound is at it."""
 TOO_FAR = 3.0
 """Distance between what two halves of a record say, over its error."""
 
@@ -63,8 +66,9 @@ def doubts_of(
                 f"{weight.correlation_time:.2g} s of a record of {length:.2g} s, which noise seldom is. The model is "
                 f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
-    halves = [] if is_exact else _halves(problem, at, weights, certainty.scores)
-    return (*found, *halves, *_vague(problem, at, certainty))
+    if not is_exact:
+        found += _halves(problem, at, weights, certainty.scores) + cheap_causes(problem, at, weights)
+    return (*found, *_at_bounds(problem, at), *_vague(problem, at, certainty))
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
@@ -77,6 +81,19 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
         return np.inf, 0.0
     quiet, moving = (float(np.sqrt(np.mean(r[:, chosen] ** 2))) for chosen in (still, counted & ~still))
     return max(quiet, ROUNDING * float(np.nanmax(np.abs(measured)))), moving
+
+
+def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
+    """Of numbers that the bounds hold."""
+    found = []
+    for which, ends in zip(("lower", "upper"), problem.coordinates.bounds, strict=True):
+        for label, u, end, value in zip(problem.labels, at.u, ends, problem.coordinates.numbers(at.u), strict=True):
+            if np.isfinite(end) and abs(u - end) <= AT_BOUND * max(abs(end), 1.0):
+                found.append(
+                    f"{label} is {value:.4g}, its {which} bound: what was measured asks for a value beyond it, and its "
+                    "error bar tells nothing."
+                )
+    return found
 
 
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:

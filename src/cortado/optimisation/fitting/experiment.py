@@ -61,6 +61,7 @@ class Experiment:
         self.problem = Problem(simulation, steps, FinalPositions(simulation.positions), state=state)
         for one in observations.values():
             Frames.of(one.times, step, steps)  # raises for times beyond the run
+        self._state = state
         self._time_step, self._problems = step, {(is_implicit(simulation.scene), steps): self.problem}
 
     def __repr__(self) -> str:
@@ -87,6 +88,10 @@ class Experiment:
                 start, half = float(one.start[CLOCK]), 0.5 * float(one.times[-1] - one.times[0])
                 found[f"{name}.{CLOCK}"] = (start - half, start + half)
         return found
+
+    def simulated_by(self, simulation: Simulation) -> "Experiment":
+        """The same experiment by another simulation of as many particles."""
+        return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
         """The same experiment, in the same arrays, with other numbers measured, (frames, m) by name."""

@@ -10,6 +10,7 @@ from cortado.arrays import require_function, require_table, whole_number
 from cortado.calls import told
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.optimisation.fitting.bar_slopes import over_the_bars
+from cortado.optimisation.fitting.causes import dear_causes
 from cortado.optimisation.fitting.certainty import Certainty, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.doubts import doubts_of
@@ -81,9 +82,9 @@ def fit(
     coordinates = Coordinates.of(given, positive, {**clocks, **({} if bounds is None else bounds)}, unseen)
     problem = LeastSquares(each, coordinates, on_trial)
     found = _from(problem, coordinates.start, iterations)
-    if starts == 1 or (starts is None and not found.in_doubt):
-        return found
-    return _best(problem, found, iterations, starts)
+    if starts != 1 and (starts is not None or found.in_doubt):
+        found = _best(problem, found, iterations, starts)
+    return _with_causes(problem, found) if found.doubts else found
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
@@ -96,6 +97,13 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
     return _fitted(problem, at, weights, converged if settled is None else settled, start)
+
+
+def _with_causes(problem: LeastSquares, found: Fit) -> Fit:
+    """With causes of its doubts that take runs to be looked at."""
+    assert found.at is not None
+    causes = dear_causes(problem, found.at, [part.weighting for part in found.parts])
+    return replace(found, doubts=(*found.doubts, *causes), runs=problem.runs, tangents=problem.tangents)
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
@@ -113,7 +121,8 @@ def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None
         if starts is None and not (found.in_doubt and elsewhere(found, tried)):
             break
     doubts = (*found.doubts, *other_valleys(found, tried))
-    return replace(found, tried=tuple(tried), doubts=doubts, runs=problem.runs, tangents=problem.tangents)
+    counted = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
+    return replace(counted, tried=tuple(tried), doubts=doubts)
 
 
 def _fitted(
@@ -133,6 +142,7 @@ def _fitted(
         tried=(Tried(start, at.u, misfit(problem, at.residuals)),),
         runs=problem.runs,
         tangents=problem.tangents,
+        refused=problem.refused,
         sum_of_squares=problem.sum_of_squares(at.residuals, weights),
         hessian=found.hessian,
         problem=problem,

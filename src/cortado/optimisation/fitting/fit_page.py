@@ -3,7 +3,7 @@
 from html import escape
 
 from cortado.optimisation.fitting.figures import residual_figure
-from cortado.optimisation.fitting.fitted import Fit, unit_of, with_error
+from cortado.optimisation.fitting.fitted import NOISE_ALONE, Fit, unit_of, with_error
 from cortado.pictures.notebook import picture, table
 
 HEAD = ("parameter", "unit", "start", "found", "95 %, from", "to")
@@ -22,5 +22,5 @@ def fit_page(fitted: Fit) -> str:
         )
         for one in fitted.numbers()
     ]
-    words = "".join(f"<p>{escape(sentence)}</p>" for sentence in fitted.cautions)
+    words = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*fitted.cautions, NOISE_ALONE))
     return table(HEAD, rows) + words + picture(fitted, lambda path: residual_figure(fitted, path))

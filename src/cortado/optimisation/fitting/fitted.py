@@ -12,9 +12,14 @@ from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
 from cortado.optimisation.fitting.search import TINY, search
 from cortado.scene.parameters.values import UNITS
+from cortado.words import counted
 
 ALIKE = 0.9
 """Two numbers whose estimates are correlated by more are not told apart."""
+NOISE_ALONE = (
+    "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
+    "discretisation.spacing shows how much that is."
+)
 NEARLY = 0.01
 """In squared standard errors: a point of a profile ends where a step lowers the sum of squares by less."""
 OF_VIEWS = {
@@ -123,6 +128,8 @@ class Fit:
     """Forward runs, each of one experiment."""
     tangents: int = 0
     """Runs along a tangent, each of one experiment."""
+    refused: int = 0
+    """Points that were tried and whose runs diverged, of which the fit knows nothing."""
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
@@ -251,14 +258,16 @@ class Fit:
         return fit_page(self)
 
     def __str__(self) -> str:
-        return "\n".join([*self.lines(), *self.cautions])
+        return "\n".join([*self.lines(), *self.cautions, NOISE_ALONE])
 
     @property
     def cautions(self) -> list[str]:
-        """Sentences: what is not told apart, whether it ended too early, and the doubts."""
+        """Sentences: what is not told apart, whether it ended too early, what was refused, and the doubts."""
         apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
-        return [*apart, *ended, *self.doubts]
+        lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
+        refused = [f"{lost}: try a smaller solver.time_step, or bounds."] if self.refused else []
+        return [*apart, *ended, *refused, *self.doubts]
 
 
 def with_error(value: float, error: float) -> str:

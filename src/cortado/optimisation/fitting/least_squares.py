@@ -1,6 +1,7 @@
 """The least-squares problem of several experiments: residuals and Jacobian as functions of one vector."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,15 +69,21 @@ class LeastSquares:
             for k, experiment in enumerate(self.experiments)
             for name, one in experiment.observations.items()
         ]
-        self.runs = self.tangents = 0
-        """Forward runs, and passes along a tangent, each of one experiment."""
+        self.runs = self.tangents = self.refused = 0
+        """Forward runs, and passes along a tangent, each of one experiment, and points whose runs diverged."""
+
+    @property
+    def labels(self) -> list[str]:
+        """(free,) of the numbers that are searched."""
+        return self.coordinates.labels
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
         """Of each part; raises `DivergedError`."""
         found = []
         for k, experiment in enumerate(self.experiments):
             self.runs += 1
-            found.append(experiment.predicted(self._values(k, self.coordinates.values(u))))
+            with self._counting():
+                found.append(experiment.predicted(self.values_of(k, self.coordinates.values(u))))
         if self._on_trial is not None:
             self._on_trial()
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
@@ -107,13 +114,14 @@ class LeastSquares:
         directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
         for k, experiment in enumerate(self.experiments):
-            own = {number: self._values(k, direction) for number, direction in directions.items()}
+            own = {number: self.values_of(k, direction) for number, direction in directions.items()}
             run = [number for number, one in own.items() if one]
             self.runs += 1
             self.tangents += len(run)
-            at = self._values(k, values)
+            at = self.values_of(k, values)
             along = [own[number] for number in run]
-            predicted, slopes = experiment.linearised(at, along) if run else (experiment.predicted(at), {})
+            with self._counting():
+                predicted, slopes = experiment.linearised(at, along) if run else (experiment.predicted(at), {})
             for part in self.parts:
                 if part.experiment == k:
                     jacobian = np.zeros((*part.observation.measured.shape, len(u)))
@@ -135,7 +143,16 @@ class LeastSquares:
         each = zip(self.parts, residuals, weights, strict=True)
         return float(sum((weight.of(r, part.observation.times) ** 2).sum() for part, r, weight in each))
 
-    def _values(self, experiment: int, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    @contextmanager
+    def _counting(self) -> Iterator[None]:
+        """Count a run that diverges."""
+        try:
+            yield
+        except DivergedError:
+            self.refused += 1
+            raise
+
+    def values_of(self, experiment: int, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Those that an experiment has: all but those of observations of others."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
