@@ -21,8 +21,9 @@ MOST_KEPT = 0.6
 """Correlation of noise from frame to frame, beyond which it is told from no trend."""
 BY_CHANCE = 1e-3
 """Probability of an effect as large by noise alone, below which it is said."""
-MUCH = 0.5
-"""Of the squares of residuals that are no noise: a density or a slip that explains more is said."""
+LITTLE, MUCH = 0.05, 0.5
+"""Of the squares of residuals: what explains less is not said, and of residuals that are doubted already a density or a
+slip that explains less."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def explained(
         for each in (zip(problem.parts, one.residuals, weights, strict=True) for one in (left, before))
     ]
     share = 1.0 - squares[0] / squares[1]
-    return None if is_doubted and share < MUCH else Explained(sizes, share)
+    return None if share < (MUCH if is_doubted else LITTLE) else Explained(sizes, share)
 
 
 def cheap_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
