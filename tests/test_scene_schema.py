@@ -61,12 +61,13 @@ def test_ranges_in_the_schema_are_the_ranges_that_are_refused(table, name):
             beyond = one[bound] + outwards if one["type"] == "integer" else math.nextafter(one[bound], outwards * 1e99)
             assert refused(table, name, wrap(beyond))
             assert refused(table, name, wrap(one[bound])) == (bound == "exclusiveMinimum")
-    for option in one.get("enum", []):
+    options = one.get("enum", [one["const"]] if "const" in one else [])
+    for option in options:
         assert not refused(table, name, wrap(option)) and refused(table, name, wrap(f"{option}s"))
     if one.get("type") in ("number", "integer", "boolean"):
         assert refused(table, name, wrap("1")) and refused(table, name, wrap(math.nan))
     if schema.get("type") == "array" and entry.get("type", "array") != "array":
-        good = entry.get("maximum", entry.get("enum", [True if entry["type"] == "boolean" else "text"])[0])
+        good = entry.get("maximum", [*options, True if entry["type"] == "boolean" else "text"][0])
         for size in range(5):
             fits = schema.get("minItems", 0) <= size <= schema.get("maxItems", size)
             assert refused(table, name, [good] * size) != fits

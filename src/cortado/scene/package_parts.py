@@ -35,9 +35,10 @@ def guarded(
 ) -> Iterator[None]:
     """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors,
     for an interruption and for what is ``expected``. One that asks for the end of the process does not get it."""
+    kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
         yield
-    except (CortadoError, KeyboardInterrupt, *expected):
+    except kept:
         raise
     except BaseException as problem:
         raise error(f"{what} {_in_words(problem, package)}.") from problem
