@@ -136,7 +136,7 @@ def python_force(text: str, speed: list[float], gain: float | None = None) -> An
 def computed_force(force: Any, speed: list[float]) -> np.ndarray:
     """(2,) what a step makes of it [m/s2], of a particle that nothing else moves."""
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.05, 0.05], "phase": "water", "velocity": speed}
-    tables = {**PLANE, "fluid": [block], "container": {"shape": "none"}}
+    tables = {**PLANE, "fluid": [block], "container": {"shape": "none"}, "solver": {"time_step": STEP}}
     scene = cortado.Scene(**{**tables, "forces": {"gravity": [0.0, 0.0], "pressure": False}})
     end = cortado.Simulation(scene, precision="float64", forces=[force]).run(1)
     return (end.velocities[-1, 0] - end.velocities[0, 0]) / STEP

@@ -150,6 +150,7 @@ SERIES = "time,height\n0.0,1\n0.04,2\n0.02,1\n0.06,1\n"
     ("kind", "text", "words"),
     [
         ("tracks", TRACKS + "0.04,2,0.3,0.2\n", "2 lines for tracer 2 at 0.04 s"),
+        ("tracks", TRACKS + "0.040000000000001,2,0.3,0.2\n", "2 lines for tracer 2 at 0.04 s"),
         ("tracks", TRACKS + "0.08,,0.3,0.2\n", "line 6 has the tracer nan, but must have a number"),
         ("tracks", TRACKS + "nan,1,0.3,0.2\n", "line 6 has the time nan, but must have a number"),
         ("tracks", TRACKS.replace("tracer", "x", 1), "has 2 columns 'x'"),

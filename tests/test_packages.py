@@ -227,6 +227,12 @@ def test_a_part_that_fails_in_use_is_a_sentence_and_no_success(file, tmp_path, c
     assert re.search(rf'"failing" .*: {cause} \(the package toy, .*toy_parts.py, line \d+\)', told), told
 
 
+def test_what_is_no_force_names_the_package_that_made_it(file):
+    said = 'the force float, which "failing" of the package toy made, has no shares, but must have shares, accelerate'
+    with pytest.raises(InputError, match=said):
+        Simulation(file(force('kind = "failing"', 'at = "made"')))
+
+
 @pytest.mark.parametrize("mode", ["tangent", "adjoint"])
 def test_a_part_that_fails_in_a_derivative_is_a_sentence(file, mode):
     judged = problem(Simulation(file(force('kind = "failing"', f'at = "{mode}"')), precision="float64"))

@@ -8,7 +8,7 @@ from inspect import getattr_static, isfunction
 from traceback import extract_tb
 from typing import Any
 
-from cortado.errors import ComputationError, CortadoError, InputError, shown
+from cortado.errors import ComputationError, CortadoError, InputError
 from cortado.scene.parameters.parameter import Parameter
 
 GUARDED = "_guarded_by_cortado"
@@ -83,7 +83,7 @@ class PackageMaker:
         return call
 
     def __repr__(self) -> str:
-        return shown(self._part)
+        return f'"{self._kind}" of {self._package}'
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:

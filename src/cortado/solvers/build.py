@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solids.mass import Mass
 from cortado.discretise.solids.solid import Hollow, Solid
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.particles.arrays import padded
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
@@ -106,24 +107,27 @@ def _forces(
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     replaced = {getattr(maker, "replaces", None) for maker in makers}
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
-    found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
-    forces = sorted((force for force in found if force is not None), key=lambda one: getattr(one, "is_last", False))
+    made = [(maker, maker.force(setting)) for maker in (*map(import_module, modules), *makers)]
+    forces = [force for _, force in made if force is not None]
+    for maker, force in made:
+        if force is not None:
+            _check_force(force, maker)
     for force in forces:
-        _check_force(force)
         if layout.batch is not None and not getattr(force, "batches", False):
             raise InputError(
                 f"batch is {layout.batch}, but must be left out, as the force {type(force).__name__} has no "
                 "`batches = True`, which says that its kernels read the parameters of a particle's own scene."
             )
-    return forces
+    return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
 
 
-def _check_force(force: Force) -> None:
-    """Raises `InputError` for what lacks something of a `Force`, for a force that has methods of a part and is none, as
-    no step would call them, and for a part that would leave its fields unwritten."""
+def _check_force(force: Force, maker: Any) -> None:
+    """Raises `InputError` for what a maker made that lacks something of a `Force`, for a force that has methods of a
+    part and is none, as no step would call them, and for a part that would leave its fields unwritten."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
-        raise InputError(f"the force {name} has no {missing[0]}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
+        made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
+        raise InputError(f"{made}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
     if not isinstance(force, Part):
         found = [method for method in PART_METHODS if hasattr(force, method)]
         if found:

@@ -70,7 +70,7 @@ def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: floa
 def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     path, axes = folder / table.file, ["x", "y", "z"][: simulation.dimension]
     data = _with(read_columns(path), ("time", "tracer", *axes), path)
-    times, when = np.unique(data["time"] + table.start, return_inverse=True)
+    times, when = _instants(data["time"] + table.start, 1e-9 * max(last, 1e-300))
     tracers, who = np.unique(data["tracer"], return_inverse=True)
     once, often = np.unique(np.stack([when, who]), axis=1, return_counts=True)
     if (often > 1).any():
@@ -87,6 +87,13 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
     chosen = _within(times, last) & (times > 0.0)
     clock = table.calibrate, table.start
     return Tracks(simulation, places[begin], times[chosen] - table.start, places[chosen], table.noise, *clock)
+
+
+def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """The times that are further apart than that, in order, and of each time which of them it is."""
+    each, which = np.unique(times, return_inverse=True)
+    begins = np.diff(each, prepend=-np.inf) > apart
+    return each[begins], np.cumsum(begins)[which] - 1
 
 
 def _within(times: np.ndarray, last: float) -> np.ndarray:
