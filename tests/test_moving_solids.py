@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import cortado
 from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
 from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
@@ -12,6 +13,7 @@ from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import greatest_speed
 from cortado.scene.stability import stability_limits
 from cortado.scene.turns import rotation_matrix
+from scenes import jet
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
 ROTOR = {
@@ -256,6 +258,79 @@ def test_steps_that_are_chosen_know_how_fast_solids_are():
     chosen = plane(fast, solver={"kind": "projection", "time_step": "auto"})
     run = Simulation(chosen).run(20)
     assert np.diff(run.times).max() <= 0.2 * 0.05 / speed * (1.0 + 1e-5)
+
+
+RESTING = {
+    "name": "block",
+    "shape": "box",
+    "lower": [0.2, 0.55],
+    "upper": [0.4, 0.75],
+    "motion": "path",
+    "times": [0.0, 0.3, 0.302],
+    "positions": [[0.3, 0.65], [0.3, 0.65], [0.5, 0.65]],
+}
+"""At rest, and then at 100 m/s."""
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_the_fast_part_of_a_path_bounds_the_steps_that_it_is_in(kind, tmp_path):
+    tables = {"solver": {"kind": kind, "time_step": "auto"}}
+    simulation = Simulation(plane(RESTING, **tables))
+    run = simulation.run(time=0.4)
+    still = {**RESTING, "positions": [[0.3, 0.65]] * 3}
+    resting = Simulation(plane(still, **tables)).run(time=0.3)
+    before = np.count_nonzero(run.times < 0.3)
+    np.testing.assert_array_equal(run.times[:before], resting.times[:before])
+    ways = np.diff(np.interp(run.times, RESTING["times"], [0.3, 0.3, 0.5]))
+    assert ways.max() == pytest.approx(0.2 * 0.05, rel=1e-4) and np.count_nonzero(ways) == pytest.approx(20, abs=1)
+    assert run.solids["block"].positions[-1] == pytest.approx([0.5, 0.65]) and run.times[-1] >= 0.4
+    half = before + 8
+    run[: half + 1].save(tmp_path / "first.vtkhdf")
+    rest = simulation.run(10, state=Trajectory.load(tmp_path / "first.vtkhdf").last_state)
+    np.testing.assert_array_equal(rest.positions, run.positions[half : half + 11])
+    np.testing.assert_array_equal(rest.times, run.times[half : half + 11])
+
+
+def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
+    turn = {key: RESTING[key] for key in RESTING if key != "positions"} | {"rotations": [0.0, 0.0, 1.0]}
+    run = Simulation(plane(turn, solver={"kind": "projection", "time_step": "auto"})).run(time=0.4)
+    angles = np.interp(run.times, RESTING["times"], [0.0, 0.0, 1.0])
+    assert np.diff(angles).max() * np.hypot(0.1, 0.1) == pytest.approx(0.2 * 0.05, rel=1e-4)
+    course = {"times": [0.05, 0.051], "values": [[0.3, 0.26], [0.4, 0.26]]}
+    run = Simulation(jet(solver={"time_step": "auto"}, schedule={"nozzle_path": course})).run(time=0.06)
+    ways = np.diff(np.interp(run.times, course["times"], [0.3, 0.4]))
+    assert ways.max() == pytest.approx(0.2 * jet().discretisation.spacing, rel=1e-4)
+    assert np.count_nonzero(run.times < 0.05) < 30
+
+
+def test_scenes_of_a_batch_have_the_steps_of_their_own_paths():
+    """One of them is told where its solid is, step by step, which its path does not bound then."""
+    scene = plane(RESTING, solver={"kind": "projection", "time_step": "auto"})
+    one, several = Simulation(scene), Simulation(scene, batch=2)
+    scales = np.array([1.0, 1.4])
+    for scale, run in zip(scales, several.run(80, {"block.scale": scales}), strict=True):
+        wanted = one.run(80, {"block.scale": scale})
+        np.testing.assert_array_equal(run.times, wanted.times)
+        np.testing.assert_array_equal(run.positions, wanted.positions)
+    still = one.run(80, {"block.displacement": np.zeros(2)})
+    assert still.times[-1] > 0.4 > wanted.times[-1]
+
+
+@pytest.mark.parametrize("length", [1e-6, 1e-15])
+def test_a_path_that_jumps_is_one_step_and_said(length):
+    times = [0.0, 0.1, 0.1 + length]
+    simulation = Simulation(plane({**RESTING, "times": times}, solver={"kind": "projection", "time_step": "auto"}))
+    with pytest.warns(cortado.CortadoWarning, match=r"'block' goes 0\.2 m in .* at 0\.1 s, which is further than"):
+        run = simulation.run(time=0.2)
+    assert len(run.times) < 300 and run.times[-1] >= 0.2
+    with pytest.warns(cortado.CortadoWarning, match=r"'block' goes 0\.3 m in step 2 of this run, which is further"):
+        simulation.run(3, {"block.displacement": [[0.0, 0.0], [0.3, 0.0], [0.3, 0.0]]})
+
+
+def test_a_path_bounds_all_steps_where_nothing_else_does():
+    tables = {"container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}, "solver": {"time_step": "auto"}}
+    scene = plane(RESTING, **tables, forces={"gravity": [0.0, 0.0], "viscosity": "none"})
+    assert Simulation(scene).run(2).times[1] == pytest.approx(0.2 * 0.05 / 100.0)
 
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):

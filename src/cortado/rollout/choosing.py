@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import step_bounds
-from cortado.rollout.step_sizes import ChosenSteps, Fill
+from cortado.rollout.step_sizes import ChosenSteps
+from cortado.rollout.travel import Travel, moved_by
 from cortado.scene.parameters.values import Arrays, stacked
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
@@ -23,17 +24,26 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
         rollout.step_sizes = ChosenSteps(rollout.solver, rollout.parameters, rollout.log, rollout.steps, length)
     least = 1.0 / rollout.solver.layout.precision.greatest
     bounds = np.stack([step_bounds(scene, own, rollout.steps, least) for own in members], axis=1)
-    fill = _fill(rollout, parameters, members) if any(map(parameters.courses, members)) else None
-    rollout.clocks = rollout.step_sizes.begin(rollout.clocks, bounds, fill)
+    scheduled = Courses(rollout, scene, parameters, members) if any(map(parameters.courses, members)) else None
+    rollout.clocks = rollout.step_sizes.begin(rollout.clocks, bounds, scheduled)
     rollout.step_sizes.begin_at(rollout.initial)
 
 
-def _fill(rollout: Rollout, parameters: SceneParameters, members: Sequence[Arrays]) -> Fill:
-    """Writes the rows of what is scheduled, each at its own time."""
+class Courses:
+    """What is scheduled in the scenes of a batch, each at its own time."""
 
-    def fill(step: int, times: NDArray, sizes: NDArray) -> None:
-        each = zip(members, times.tolist(), sizes.tolist(), strict=True)
-        rows = [parameters.scheduled_at(*one) for one in each]
-        rollout.parameters.set_row(step, stacked(rows))
+    def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
+        self._rollout, self._parameters, self._members = rollout, parameters, members
+        self._travels = [
+            Travel.of(scene, own, moved_by(scene, own, parameters.courses(own)).values()) for own in members
+        ]
 
-    return fill
+    def longest(self, times: NDArray) -> NDArray:
+        """See `Scheduled`."""
+        return np.array([travel.longest(time) for travel, time in zip(self._travels, times.tolist(), strict=True)])
+
+    def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
+        """See `Scheduled`."""
+        each = zip(self._members, times.tolist(), sizes.tolist(), strict=True)
+        rows = [self._parameters.scheduled_at(*one) for one in each]
+        self._rollout.parameters.set_row(step, stacked(rows))

@@ -13,8 +13,8 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters, Simulated
 from cortado.rollout.step_bounds import step_bounds
 from cortado.rollout.step_sizes import ChosenSteps
+from cortado.rollout.travel import Travel, moved_by
 from cortado.scene.parameters.values import Arrays
-from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
 from cortado.scene.stability import stability_limits
 
@@ -49,7 +49,7 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
         )
     # a row for each step has no meaning: nobody knows how many there are
     own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
-    return ROOM * expected_steps(simulation.scene, time, own)
+    return ROOM * expected_steps(simulation, time, own)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
@@ -75,12 +75,17 @@ def done_of(rollout: Rollout, step: int, time: float) -> int:
     return min(int(100.0 * (time - begun) / (end - begun)), 100)
 
 
-def expected_steps(scene: Scene, time: float, values: Arrays) -> int:
-    """How many steps fluid would take for a time [s] that falls through the whole container all the time, with
-    parameters that replace the scene's; raises `InputError` where nobody can count them."""
+def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
+    """How many steps fluid would take for a time [s] that falls through the whole container all the time, and what
+    moves along a path beside it, with parameters that replace the scene's; raises `InputError` where nobody can count
+    them."""
+    scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limit = stability_limits(scene, values)["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
-    return _counted_steps(time, time / min(float(step_bounds(scene, values, 1)[0]), limit))
+    longest = min(float(step_bounds(scene, values, 1)[0]), limit)
+    courses = SceneParameters(simulation, 0).courses(values)
+    travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
+    return _counted_steps(time, time / longest + travel.steps(time, longest))
 
 
 def _counted_steps(time: float, steps: float) -> int:

@@ -131,7 +131,8 @@ class ParameterSpace:
             self._one.run({**self._one.scheduled(own, clock), **own})
             for own, clock in zip(members, clocks, strict=True)
         ]
-        self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0]))
+        courses = self._one.courses(members[0])
+        self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0], courses))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         origins = [self._origin(one["rest_density"]) for one in chosen]
         shared = {one: one for one in origins}  # one object where they are equal: a batch has hundreds

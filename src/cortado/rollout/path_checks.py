@@ -1,9 +1,13 @@
 """What to say of solids that are told to go too far in a step, or to be too large or too small."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from cortado.particles.state import State
+from cortado.rollout.travel import Travel, moved_by
 from cortado.scene.motions import displacement_name, position_name, scale_name, told
+from cortado.scene.parameters.parameter import Changing
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.scene.walls import WHOLE
@@ -14,18 +18,39 @@ SCALES = (0.6, 1.5)
 """Between which wall particles hold fluid as they should: twice as large, a disc lets it in by 0.8 spacings."""
 
 
-def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays) -> str | None:
-    """One of those below, with the parameters that were given and all that steps take; None if there is none."""
-    return stretch_sentence(scene, values) or jump_sentence(scene, first, run)
+def path_sentence(
+    scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
+) -> str | None:
+    """One of those below, with the parameters that were given, all that steps take, and what changes by the time; None
+    if there is none."""
+    leap = leap_sentence(scene, values, courses) if scene.solver.chooses else None
+    return stretch_sentence(scene, values) or leap or jump_sentence(scene, first, run, courses)
 
 
-def jump_sentence(scene: Scene, first: State, run: Arrays) -> str | None:
+def leap_sentence(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> str | None:
+    """Of the first path that goes further than a spacing in the shortest step that is chosen for it; None if there is
+    none."""
+    spacing = scene.discretisation.spacing
+    for what, moved in moved_by(scene, values, courses).items():
+        travel = Travel.of(scene, values, [moved])
+        sizes = travel.at(travel.times + travel.least) - travel.lengths
+        if sizes.max() > FURTHEST * spacing * (1.0 + 1e-6):
+            time, size = travel.times[sizes.argmax()], sizes.max()
+            return (
+                f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at {time:g} s, which "
+                f"is further than a spacing, {spacing:g} m: fluid is left behind in it. Give it more time."
+            )
+    return None
+
+
+def jump_sentence(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> str | None:
     """Of the first solid that goes further than a spacing in a step, from where a first state has it, of a batch in its
-    first scene, with the parameters of a run; None if there is none, or where steps are still to be chosen."""
-    if scene.solver.chooses:
-        return None
+    first scene, with the parameters of a run; None if there is none. Where steps are still to be chosen, those count
+    that are told step by step, and have no course."""
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
+        if scene.solver.chooses and displacement_name(table.name) in courses:
+            continue
         position = position_name(table.name)
         begun = first.numpy(scene.dimension, only=[position])[position].reshape(-1, scene.dimension)[:1]
         places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])

@@ -1,6 +1,6 @@
 """How long the steps of a rollout are: fixed, or chosen on the device before each, recorded, and taken again so."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Protocol
@@ -19,8 +19,15 @@ from cortado.solvers.solver import Solver, StepLog
 GROWTH = 1.1
 """A step is at most so many times as long as the one before."""
 
-Fill = Callable[[int, NDArray, NDArray], None]
-"""Writes what is scheduled for a step, given its number, and when it begins and how long it is, (members,) [s]."""
+
+class Scheduled(Protocol):
+    """What is scheduled in the scenes of a batch, by the time."""
+
+    def longest(self, times: NDArray) -> NDArray:
+        """(members,) how long steps may be that begin at times (members,) [s]."""
+
+    def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
+        """Write it for a step, given its number, and when it begins and how long it is, (members,) [s]."""
 
 
 @dataclass(frozen=True)
@@ -142,20 +149,19 @@ class ChosenSteps:
         self._bounds = wp.zeros((max(steps, 1), layout.members), dtype=real, device=device)
         self._first = wp.zeros(layout.members, dtype=real, device=device)
         self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
-        self._fill: Fill | None = None
+        self._scheduled: Scheduled | None = None
         self._retaken = Retaken()
         self.end = inf
         self.longest_chunk = FixedSteps.longest_chunk
 
-    def begin(self, clocks: Sequence[Clock], bounds: NDArray, fill: Fill | None) -> list[Clock]:
-        """Before a run: ``bounds`` (steps, members) of its steps [s]; ``fill`` where something is scheduled, so that
-        the host has to know each step. Returns the clocks of the first states, which know the times of those that
-        will be read."""
+    def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
+        """Before a run: ``bounds`` (steps, members) of its steps [s]; where something is ``scheduled`` the host has to
+        know each step. Returns the clocks of the first states, which know the times of those that will be read."""
         self._bounds.assign(bounds)
         self._first.assign([clock.time_step for clock in clocks])
         self._times[0].assign([clock.time for clock in clocks])
-        self._fill, self._retaken, self.end = fill, Retaken(), inf
-        self.longest_chunk = FixedSteps.longest_chunk if fill is None else 1
+        self._scheduled, self._retaken, self.end = scheduled, Retaken(), inf
+        self.longest_chunk = FixedSteps.longest_chunk if scheduled is None else 1
         found = self._read = RecordedSizes(np.zeros(self._sizes.shape), np.zeros(self._times.shape))
         own = zip(clocks, found.times.T, found.sizes.T, strict=True)
         return [RecordedClock(c.steps, c.time, c.time_step, times, sizes) for c, times, sizes in own]
@@ -174,7 +180,7 @@ class ChosenSteps:
         self._times[:step].assign(times[:, None])
         self._solver.step_number.fill_(step)
         self.choose(state)
-        for first, last in [(0, step)] if self._fill is None else [(n, n) for n in range(step + 1)]:
+        for first, last in [(0, step)] if self._scheduled is None else [(n, n) for n in range(step + 1)]:
             self._look(first, last)
         return self.is_end(step)
 
@@ -228,11 +234,21 @@ class ChosenSteps:
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
-        """Read the lengths of these steps, and when they begin; write what is scheduled for the last."""
+        """Read the lengths of these steps, and when they begin; where something is scheduled, have the last no longer
+        than that allows, and write it."""
         for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
             found[first : last + 1] = array[first : last + 1].numpy()
-        if self._fill is not None and last < len(self._bounds):
-            self._fill(last, self._read.times[last], self._read.sizes[last])
+        if self._scheduled is None:
+            return
+        times, sizes = self._read.times[last], self._read.sizes[last]
+        longest = self._scheduled.longest(times)
+        if (sizes > longest).any():
+            own = self._sizes[last : last + 1]
+            own.assign(np.minimum(sizes, longest)[None])
+            sizes[:] = own.numpy()[0]
+            self.seek(last)
+        if last < len(self._bounds):
+            self._scheduled.fill(last, times, sizes)
 
     def of_step(self, step: int) -> NDArray:
         """See `StepSizes`."""

@@ -103,15 +103,19 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
     """How fast the fastest point of a solid moves at most [m/s], with values of parameters that replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
-        shape, middle = solid.shape_about()
-        reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
-        d = len(middle)
+        d = len(solid.middle())
         shift = values.get(velocity_name(solid.name))
         turn = values.get(angular_velocity_name(solid.name))
         shifts = _course(solid, "positions", "velocity", d) if shift is None else Steady(shift)
         turns = _course(solid, "rotations", "angular_velocity", 2 * d - 3) if turn is None else Steady(turn)
-        found.append(shifts.greatest() + reach * turns.greatest())
+        found.append(shifts.greatest() + reach(solid, values) * turns.greatest())
     return max(found)
+
+
+def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
+    """How far from its middle its furthest point is at most [m], with values of parameters that replace the scene's."""
+    shape, _ = solid.shape_about()
+    return float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:

@@ -1,5 +1,6 @@
 """The largest time step at which an explicit simulation of a scene is likely to be stable."""
 
+from collections.abc import Sequence
 from math import inf, sqrt
 
 import numpy as np
@@ -14,6 +15,7 @@ from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.rheology import greatest_viscosity
 from cortado.scene.room import solids_of
+from cortado.scene.solids import SolidTable
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
@@ -42,11 +44,14 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
     """What bounds the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
     the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself
-    (`gravity_limits`), so that here the scene's counts."""
+    (`gravity_limits`), so that here the scene's counts. So do paths of solids, unless nothing else bounds the steps:
+    the fastest part of a path then bounds them all."""
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
-    found = standing_limits(scene, own)
+    found = standing_limits(scene, own, [solid for solid in scene.solid if solid.times is None])
     greatest = scene.solver.greatest_time_step
-    return found if greatest is None else {**found, "greatest_time_step": greatest}
+    if greatest is not None:
+        return {**found, "greatest_time_step": greatest}
+    return found if min(found.values()) < inf else standing_limits(scene, own, scene.solid)
 
 
 def longest_step(scene: SceneTables) -> float:
@@ -105,14 +110,15 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     gravity, (lower, upper) = np.atleast_2d(values.get("gravity", _gravity(scene))), _extent(scene)
     speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
     courant = 0.4 * scene.discretisation.support_radius / speed if speed > 0.0 else inf
-    return {"speed": courant, **standing_limits(scene, values)}
+    return {"speed": courant, **standing_limits(scene, values, scene.solid)}
 
 
-def standing_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
-    """Those of the `stability_limits` [s] that do not depend on how fast the fluid is."""
+def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
+    """Those of the `stability_limits` [s] that do not depend on how fast the fluid is, with the speed of some of its
+    solids."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
-    if (fastest := greatest_speed(scene.solid, values)) > 0.0:
+    if (fastest := greatest_speed(solids, values)) > 0.0:
         own["the speed of solids"] = SOLID_STEP * scene.discretisation.spacing / fastest
     return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
 
