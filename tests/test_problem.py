@@ -284,6 +284,18 @@ def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
         ),
         (lambda it: cortado.certify(it, nmes=["gravity"]), "certify is called in a wrong way .* 'nmes'"),
         (lambda it: Simulation(), "^Simulation is given no scene, but must be called as Simulation"),
+        (
+            lambda it: cortado.forces.Body(k=1.0),
+            r"^Body is given no function, .* called as Body\(function, name, \*\*param",
+        ),
+        (lambda it: cortado.losses.SensorMatch(3), "^SensorMatch is given no target, but must be called as SensorM"),
+        (lambda it: cortado.sensors.WaveGauge(rad=1.0), "^WaveGauge is given no position, but must be called as Wave"),
+        (lambda it: cortado.measured.Tracks(), "^Tracks is given no simulation, but must be called as Tracks"),
+        (lambda it: cortado.render.Renderer(1), "^Renderer is given no lower, but must be called as Renderer"),
+        (lambda it: cortado.evaluate(it), "^evaluate is given no points, but must be called as evaluate"),
+        (lambda it: it.simulation.run(number=3), "^Simulation.run is called in a wrong way .*'number'"),
+        (lambda it: it.tangent({}), "^Problem.tangent is given no directions, but must be called as Problem.tangent"),
+        (lambda it: cortado.load_scene(), "^load_scene is given no path, but must be called as load_scene"),
     ],
 )
 def test_what_a_call_lacks_is_a_sentence(problem, call, said):

@@ -15,17 +15,19 @@ def told(function: F) -> F:
     Python has a `TypeError`."""
     takes = signature(function)
     needed = [n for n, p in takes.parameters.items() if p.default is Parameter.empty and p.kind.name[:3] != "VAR"]
-    name = function.__qualname__.removesuffix(".__init__")
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         try:
             takes.bind(*arguments, **named)
         except TypeError as problem:
+            makes = function.__name__ == "__init__"
+            name = type(arguments[0]).__name__ if makes else function.__qualname__
             given = [*list(takes.parameters)[: len(arguments)], *named]
             lacking = [one for one in needed if one not in given]
             found = f"is given no {lacking[0]}" if lacking else f"is called in a wrong way ({problem})"
-            wanted = ", ".join(one for one in takes.parameters if one != "self")
+            written = [("**" if p.kind is Parameter.VAR_KEYWORD else "") + n for n, p in takes.parameters.items()]
+            wanted = ", ".join(one for one in written if one != "self")
             raise InputError(f"{name} {found}, but must be called as {name}({wanted}).") from None
         return function(*arguments, **named)
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any, NoReturn, TypeVar
 
+from cortado.calls import told
 from cortado.errors import InputError
 
 T = TypeVar("T")
@@ -15,9 +16,9 @@ def fixed(made: type[T]) -> type[T]:
     """A class whose public attributes stay as its constructor sets them, as what it computes is decided there; others
     are refused too. A class derived from it may have further attributes of its own, and an object methods of its own.
 
-    Raises `InputError` where one is set or deleted.
+    Raises `InputError` where one is set or deleted, and where the class is called with other arguments than it takes.
     """
-    begin: Callable[..., None] = made.__init__
+    begin: Callable[..., None] = told(made.__init__)
 
     @wraps(begin)
     def construct(self: Any, *arguments: Any, **named: Any) -> None:

@@ -59,7 +59,6 @@ class Problem:
     scene lists them.
     """
 
-    @told
     def __init__(
         self,
         simulation: Simulation,
@@ -105,6 +104,7 @@ class Problem:
         """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
+    @told
     def end(self, parameters: Values) -> Any:
         """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
         return self.states(parameters, [self.steps])[self.steps]
@@ -120,6 +120,7 @@ class Problem:
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
+    @told
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch with a
         first axis for the scenes."""

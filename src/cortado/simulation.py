@@ -11,7 +11,6 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.arrays import whole_number
-from cortado.calls import told
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
@@ -66,7 +65,6 @@ class Simulation(Stepping, Measuring, Picturing):
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
     """
 
-    @told
     @WARP
     def __init__(
         self,

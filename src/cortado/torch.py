@@ -8,6 +8,7 @@ differentiation go through all functions, `torch.vmap` too; second derivatives a
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from cortado.calls import told
 from cortado.errors import InputError
 from cortado.gradients import GradientEstimator
 from cortado.optimisation.layers import calls
@@ -31,6 +32,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
+@told
 def state(
     simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, "torch.Tensor"]:
@@ -44,11 +46,13 @@ def state(
     return calls.state(_BRIDGE, simulation, given, parameters)
 
 
+@told
 def restart_state(simulation: Simulation, given: Tensors, parameters: Values | None = None) -> States:
     """The other way round: what `Simulation.run`, files and other processes take."""
     return calls.restart_state(_BRIDGE, simulation, given, parameters)
 
 
+@told
 def step(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1
 ) -> dict[str, "torch.Tensor"]:
@@ -60,6 +64,7 @@ def step(
     return calls.step(_BRIDGE, simulation, given, parameters, steps)
 
 
+@told
 def rollout(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1, record_every: int = 1
 ) -> dict[str, "torch.Tensor"]:
@@ -68,6 +73,7 @@ def rollout(
     return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
 
 
+@told
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "torch.Tensor"]:
     """The loss of a problem as a function ``loss(parameters, state=None)`` of tensors by name, whose result is a tensor
     (), of a batch (batch,).
@@ -78,6 +84,7 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
     return calls.value(_BRIDGE, problem, gradient)
 
 
+@told
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.Tensor"]:
     """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
     function ``reading(state, parameters=None)`` of tensors.
@@ -88,6 +95,7 @@ def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.
     return calls.measure(_BRIDGE, simulation, what)
 
 
+@told
 def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "torch.Tensor":
     """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
 

@@ -13,6 +13,7 @@ from functools import cache, wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 from weakref import WeakSet
 
+from cortado.calls import told
 from cortado.errors import ComputationError
 
 MOST_CORES = 16
@@ -123,14 +124,14 @@ Self = TypeVar("Self", bound=_HasTurn)
 
 
 def in_turn(method: Callable[Concatenate[Self, P], R]) -> Callable[Concatenate[Self, P], R]:
-    """A method that holds the ``turn`` of its object from beginning to end."""
+    """A method that holds the ``turn`` of its object from beginning to end, once its call fits it."""
 
     @wraps(method)
     def held(self: Self, *args: P.args, **options: P.kwargs) -> R:
         with self.turn:
             return method(self, *args, **options)
 
-    return held
+    return told(held)
 
 
 def _begin_in_child() -> None:

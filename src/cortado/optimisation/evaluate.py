@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from cortado.arrays import as_one_number, require_function, require_methods, require_table
+from cortado.calls import told
 from cortado.device.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.errors import InputError, shown, warn
 from cortado.gradients import Estimate, GradientEstimator
@@ -14,6 +15,7 @@ from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
 
+@told
 def evaluate(
     problem: Differentiable,
     points: Iterable[Values],

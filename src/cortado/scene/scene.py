@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import model_validator
 
 from cortado.arrays import as_one_number
+from cortado.calls import told
 from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
@@ -152,6 +153,7 @@ def _given(value: Any) -> Any:
     return [_given(entry) for entry in value] if isinstance(value, list) else value
 
 
+@told
 def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scene:
     """Read a scene from a TOML file.
 
