@@ -485,10 +485,43 @@ def test_a_sensor_that_can_never_see_fluid_is_warned_of_before_the_run(sensor, w
         cortado.measured.Experiment(simulation, {"mine": observed})
 
 
+def within_plates(dimension, gap):
+    """Beside water four plates around a place, one of which ends a gap [m] below the next."""
+    plates = {"left": ([0.2, 0.1], [0.25, 0.4]), "right": ([0.45, 0.1], [0.5, 0.35 - gap])}
+    plates |= {"floor": ([0.2, 0.1], [0.5, 0.15]), "roof": ([0.2, 0.35], [0.5, 0.4])}
+    deep = [0.2] * (dimension - 2)
+    return cortado.Scene(
+        dimension=dimension,
+        discretisation={"spacing": 0.05},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.01}],
+        fluid=[{"shape": "box", "lower": [0.0] * dimension, "upper": [0.2, 0.2, *deep], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0] * dimension, "upper": [0.7, 0.6, *deep]},
+        solid=[
+            {"name": name, "shape": "box", "lower": [*lower, *(0.0 for _ in deep)], "upper": [*upper, *deep]}
+            for name, (lower, upper) in plates.items()
+        ],
+        solver={"time_step": 0.002},
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_sensor_that_solids_shut_off_is_warned_of_but_for_a_gap(dimension, recwarn):
+    probes = {"in": PressureProbe([0.35, 0.25, 0.1][:dimension]), "out": PressureProbe([0.6, 0.5, 0.1][:dimension])}
+    for gap in (0.05, 0.0):
+        assert not [one for one in recwarn if "the sensor" in str(one.message)]
+        simulation = cortado.Simulation(within_plates(dimension, gap))
+        Watch(simulation, simulation.rollout(1), sensors=probes)
+    (found,) = (str(one.message) for one in recwarn if "the sensor" in str(one.message))
+    assert (
+        "'in' is at" in found and "shut off from all fluid by solids: it reads 0, or what is within its radius" in found
+    )
+
+
 def test_sensors_among_fluid_are_not_warned_of(recwarn):
     own = {"corner": PressureProbe([0.0, 0.0]), "edge": FlowRate([0.69, 5.0], [1.0, 0.0])}
     own["beside"] = WaveGauge([0.49, 0.0])
-    for made, sensors in ((plane(solid=[BLOCK]), {**IN_THE_PLANE, **own}), (scene(), IN_SPACE)):
+    low = {**BLOCK, "upper": [0.65, 0.5]}
+    for made, sensors in ((plane(solid=[low]), {**IN_THE_PLANE, **own}), (scene(), IN_SPACE)):
         simulation = cortado.Simulation(made)
         Watch(simulation, simulation.rollout(1), sensors=sensors)
     for dimension in (2, 3):

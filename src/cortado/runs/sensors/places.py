@@ -1,4 +1,4 @@
-"""Sensors where no fluid can be: what to warn of before a run, as they read 0 like dry ones."""
+"""Sensors where no fluid can be: what to warn of before a run, as they read like dry ones."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -9,6 +9,7 @@ from cortado.discretise.shapes import Points
 from cortado.errors import warn
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.pressure_probe import PressureProbe
+from cortado.runs.sensors.shut_off import is_shut_off
 from cortado.runs.sensors.wall_force import WallForce
 from cortado.runs.sensors.wave_gauge import WaveGauge
 from cortado.scene.discrete_scene import Lattice
@@ -33,6 +34,10 @@ class Prepared(Protocol):
         """Constants of the particles at rest."""
 
     @property
+    def positions(self) -> Points:
+        """(n, d) first positions [m]"""
+
+    @property
     def walls(self) -> Points:
         """(b, d) wall particles [m]"""
 
@@ -55,13 +60,14 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     place = sensor.position
     if len(place) != scene.dimension:
         return None  # refused where it is read
-    there = _what_is_at(scene, _looked_at(scene, sensor))
+    there = _what_is_at(simulation, _looked_at(scene, sensor))
+    key = "reach" if isinstance(sensor, FlowRate) else "radius"
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
-        reads = f"its floor, {sensor.floor:g} m," if isinstance(sensor, WaveGauge) else "0"
+        reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
         names = " and ".join(dict.fromkeys(filter(None, there)))
-        return f"{what} {point_in_words(place)} m, {names}: it reads {reads} as without fluid{_in_metres(scene, place)}"
-    key = "reach" if isinstance(sensor, FlowRate) else "radius"
+        reads += f", or what is within its {key}"
+        return f"{what} {point_in_words(place)} m, {names}: it reads {reads}{_in_metres(scene, place)}"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
         return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
@@ -89,8 +95,9 @@ def _product(axes: list[Points]) -> Points:
     return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
-def _what_is_at(scene: Scene, points: Points) -> list[str | None]:
+def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
     """What keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
+    scene = simulation.scene
     d, deep = scene.dimension, DEEP * scene.discretisation.spacing
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
     found: list[str | None] = [None] * len(points)
@@ -104,6 +111,9 @@ def _what_is_at(scene: Scene, points: Points) -> list[str | None]:
         called = f"in the solid {table.name!r}{', where it begins' if table.moves else ''}"
         for k in np.flatnonzero(solid.distance(near) < -deep):
             found[k] = found[k] or called
+    free = np.array([k for k, what in enumerate(found) if what is None], dtype=int)
+    for k in free[is_shut_off(scene, simulation.positions, points[free])]:
+        found[k] = "shut off from all fluid by solids"
     return found
 
 
