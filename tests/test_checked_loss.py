@@ -1,5 +1,8 @@
 """Losses that users write: what their mistakes are called, and that good ones come through unchanged."""
 
+from functools import cache, partial
+from types import MethodType, SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -186,3 +189,27 @@ def test_a_loss_in_warp_is_told_from_one_of_other_code_or_numbers(monkeypatch):
     before = fingerprint(Recorded(heights))
     monkeypatch.setitem(globals(), "GAIN", 3.0)
     assert fingerprint(Recorded(heights)) != before
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda k: partial(lambda x, v, loss, k: None, k=k),
+        lambda k: SimpleNamespace(k=k),
+        lambda k: {"inner": {"k": k}},
+        lambda k: cache(lambda: k),
+        lambda k: MethodType(lambda self: k, 1.0),
+    ],
+)
+def test_numbers_behind_what_a_loss_in_warp_names_tell_it_too(made):
+    def of(k):
+        outside = made(k)
+
+        def function(positions, velocities, loss):
+            return outside
+
+        return function
+
+    assert fingerprint(Recorded(of(1.0))) == fingerprint(Recorded(of(1.0))) != fingerprint(Recorded(of(2.0)))
+    if callable(made(1.0)):
+        assert fingerprint(made(1.0)) == fingerprint(made(1.0)) != fingerprint(made(2.0))

@@ -1,5 +1,6 @@
 """Several fluids: gradients are right in everything they depend on, and what must be kept is kept."""
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -241,6 +242,30 @@ def test_a_free_energy_of_ones_own():
     tangent = problem.tangent(point, directions)
     assert sum((gradient[key] * directions[key]).sum() for key in SIZES) == pytest.approx(tangent, rel=1e-10)
     assert distance(problem.value, point, directions, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
+
+
+def test_free_energies_of_one_name_are_told_from_one_another():
+    """Of one curvature too: by the code of their functions."""
+    other = replace(QUARTIC, functions=lambda precision, phases: quartic_functions(precision, phases))
+    made = [Simulation(two_layers(), precision="float64", free_energy=one) for one in (QUARTIC, QUARTIC, other)]
+    found = [Problem(one, 1, losses.FinalPositions(one.positions)).fingerprint for one in made]
+    assert found[0] == found[1] != found[2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"curvature": np.nan}, "FreeEnergy quartic's curvature is nan, but must be at least 0"),
+        ({"curvature": -1.0}, "FreeEnergy quartic's curvature is -1.0, but must be at least 0"),
+        ({"curvature": "a"}, "FreeEnergy quartic's curvature is 'a', but must be"),
+        ({"functions": 3}, "FreeEnergy quartic's functions is 3, but must be a function"),
+        ({"value": 3}, "FreeEnergy quartic's value is 3, but must be a function"),
+        ({"name": 3}, "FreeEnergy has the name 3, but must have a text"),
+    ],
+)
+def test_what_is_no_free_energy_is_a_sentence(changes, said):
+    with pytest.raises(InputError, match=said):
+        replace(QUARTIC, **changes)
 
 
 def test_a_loss_of_several_frames():

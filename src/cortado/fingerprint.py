@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from cortado.losses import fingerprint
+from cortado.losses.code_words import code_words
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
+from cortado.sph.free_energy import FREE_ENERGIES
 from cortado.sph.makers import fingerprint as parts_fingerprint
 
 
@@ -25,7 +27,8 @@ def fingerprint_of(simulation: Simulation, steps: int, loss: Any, states: Sequen
         fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
         clock = repr(state.clock) + (f" {state.clock.time_step!r}" if state.clock.time_step else "")
         checksums.append(f"state {sha256(fields + clock.encode()).hexdigest()[:16]}")
-    energies = f"free energy {energy.name} {energy.curvature}"
+    code = "" if energy in FREE_ENERGIES.values() else f" {code_words(energy.functions)}"
+    energies = f"free energy {energy.name} {energy.curvature}{code}"
     own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
     told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
     return "; ".join([f"{steps} steps", simulation.precision.name, *checksums, energies, *told])

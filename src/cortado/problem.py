@@ -269,8 +269,8 @@ class Problem:
     @property
     def fingerprint(self) -> str:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
-        may be in a file), free energy (by its name and curvature), forces and solver of one's own, ``fingerprint`` of
-        the loss, or the code of a function; for any other loss only its type is known."""
+        may be in a file), free energy (by its name, curvature and code), forces and solver of one's own,
+        ``fingerprint`` of the loss, or the code of a function; for any other loss only its type is known."""
         return fingerprint_of(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:

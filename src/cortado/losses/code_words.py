@@ -1,7 +1,8 @@
 """What a function of a user's computes, as a text: its code, and the numbers, functions and kernels that it names."""
 
+from functools import partial
 from hashlib import sha256
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, MethodType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,16 @@ def code_words(function: Any) -> str:
 def _words(value: Any, seen: set[int]) -> list[str]:
     if isinstance(value, (wp.Kernel, wp.Function)):
         value = value.func or value.key
+    if isinstance(value, partial):
+        value = [value.func, value.args, value.keywords]
+    if isinstance(value, MethodType):
+        value = value.__func__
+    if isinstance(value, SimpleNamespace):
+        value = vars(value)
+    if not isinstance(value, FunctionType):
+        value = getattr(value, "__wrapped__", value)  # of functools.cache
+    if isinstance(value, dict):
+        value = [entry for key in sorted(value, key=repr) for entry in (key, value[key])]
     if isinstance(value, (bool, int, float, complex, str, bytes, type(None))):
         return [repr(value)]
     if isinstance(value, (list, tuple)):

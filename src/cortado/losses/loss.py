@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from inspect import isfunction
 from typing import Any, Protocol
 
 import numpy as np
@@ -200,4 +199,4 @@ class Frames:
 
 def fingerprint(loss: Any) -> str:
     """A text that tells one loss from another: its own ``fingerprint``, the code of a function, or else the type."""
-    return getattr(loss, "fingerprint", code_words(loss) if isfunction(loss) else type(loss).__qualname__)
+    return getattr(loss, "fingerprint", code_words(loss) if callable(loss) else type(loss).__qualname__)

@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import as_one_number, require_function
 from cortado.device.precision import Precision
+from cortado.errors import InputError, shown
 
 FLOOR = 1e-3
 """delta of the degenerate mobility."""
@@ -40,6 +42,14 @@ class FreeEnergy:
     bounds the time step."""
     functions: Callable[[Precision, int], Any]
     """Warp functions of fractions, for a number of phases: ``gradient`` (grad f) and ``hessian_product`` (H u)."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InputError(f"FreeEnergy has the name {shown(self.name)}, but must have a text.")
+        for what in ("value", "functions"):
+            require_function(f"FreeEnergy {self.name}'s {what}", getattr(self, what))
+        if not 0.0 <= as_one_number(f"FreeEnergy {self.name}'s curvature", self.curvature) < np.inf:
+            raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
 
 
 @dataclass(frozen=True)

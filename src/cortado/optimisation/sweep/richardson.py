@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log
+from math import isclose, log
 
 import numpy as np
 
@@ -11,6 +11,8 @@ LEAST, MOST = 1e-3, 20.0
 LOWEST, HIGHEST = 0.5, 2.0
 """Orders that are believed; the methods have 1 to 2. Values with another one are not in the range where differences
 shrink by a power of the size."""
+ROUND_OFF = 1e-6
+"""Relative: an order that is one of both but for this is believed."""
 SAFE, UNSURE = 1.25, 3.0
 """Safety factors of Roache (1994): of three sizes whose order is believed, and of all others."""
 
@@ -45,7 +47,7 @@ class Extrapolation:
         widest = UNSURE * float(np.ptp([f_1, f_2, f_3]))
         if fine == 0.0:
             return cls(None, f_1, widest, "the two finest are equal")
-        if fine * coarse <= 0.0:
+        if fine * coarse < 0.0:
             return cls(None, None, widest, "it goes up and down")
         ratio, r_21, r_32 = coarse / fine, h_2 / h_1, h_3 / h_2
         if ratio <= log(r_32) / log(r_21):
@@ -60,6 +62,6 @@ class Extrapolation:
 
         order = float(brentq(excess, LEAST, MOST, xtol=1e-12))
         used = min(max(order, LOWEST), HIGHEST)
-        away, is_believed = fine / (r_21**used - 1.0), used == order
+        away, is_believed = fine / (r_21**used - 1.0), isclose(used, order, rel_tol=ROUND_OFF)
         flag = "" if is_believed else f"the order is taken as {used:g}"
         return cls(order, f_1 - away, (SAFE if is_believed else UNSURE) * abs(away), flag)
