@@ -15,12 +15,11 @@ ROUND_OFF = 1e-6
 
 NEARBY = 4
 """By how many cells along an axis the points of a stretched lattice may differ from what fits."""
-EXCESS, MOST_EXCESS = 0.003, 0.005
-"""By which part the points of a stretched lattice are to differ at most in number from what its volume holds, and by
-which they may be more: fluid that is denser than at rest bursts."""
-MOST_STRETCHED = 0.08
-"""Logarithm of how much a lattice is stretched along an axis: up to there the sum of kernels is that of the rest
-lattice within 0.12 %, with the Wendland C4 kernel and a support of two spacings within 0.8 %."""
+EXCESS = 0.003
+"""By which part the points of a stretched lattice may differ in number from what its volume holds."""
+MOST_STRETCHED = 0.03
+"""Logarithm of how much a lattice is stretched along an axis: up to there the density is that of the rest lattice
+within 1 %, beside walls too."""
 
 
 @dataclass(frozen=True)
@@ -63,19 +62,19 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
     """The points ``lower + (i + 1/2) spacing`` of a box whose sides are whole numbers of cells; lower and upper (d,)
-    [m]. In another box they are stretched along some axes and narrowed along others, by a few percent, to be as many as
-    its volume holds, within `EXCESS` where a lattice that is little stretched has such a number."""
+    [m]. In another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be
+    as many as its volume holds, within `EXCESS`; where no lattice has both, they are those whose cells lie within."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    cells = (last - first) / spacing
-    whole = whole_cells(last - first, spacing)
-    if not whole.all() or (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all():
-        return block_between(lower, upper, spacing)
-    counts = grid([np.maximum(n + np.arange(-NEARBY, NEARBY + 1.0), 1.0) for n in whole])
-    errors = np.prod(counts / cells, axis=1) - 1.0
-    counts, errors = counts[errors <= MOST_EXCESS], np.abs(errors[errors <= MOST_EXCESS])
+    cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
+    if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
+        return plain
+    counts = grid([np.maximum(n + np.arange(-NEARBY, NEARBY + 1.0), 1.0) for n in plain.counts])
+    errors = np.abs(np.prod(counts / cells, axis=1) - 1.0)
     stretched = np.abs(np.log(cells / counts)).max(axis=1)
-    off = np.maximum(errors / EXCESS, 1.0) * np.maximum(stretched / MOST_STRETCHED, 1.0) ** 2
-    best = counts[np.lexsort((stretched, off))[0]]
+    fit = np.flatnonzero((errors <= EXCESS) & (stretched <= MOST_STRETCHED))
+    if not len(fit):
+        return plain
+    best = counts[fit[np.argmin(stretched[fit])]]
     spacings = (last - first) / best
     return Block(first + 0.5 * spacings, best, spacings)
 
