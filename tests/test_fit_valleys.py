@@ -33,7 +33,9 @@ class Formula(Experiment):
         measured = function(np.log(true)) + SIZE * np.random.default_rng(seed).standard_normal(len(TIMES))
         gauge = SimpleNamespace(times=TIMES, measured=measured[:, None], noise=noise, unit="m", start={})
         known = {"viscosity": SimpleNamespace(range=Range.POSITIVE)}
-        self.__dict__ |= {"observations": {"gauge": gauge}, "simulation": SimpleNamespace(known=known)}
+        held = SimpleNamespace(container=None)
+        told = {"known": known, "scene": held, "parameters": lambda: {"rest_density": np.ones(1)}}
+        self.__dict__ |= {"observations": {"gauge": gauge}, "simulation": SimpleNamespace(**told)}
 
     def predicted(self, values):
         return {"gauge": self.function(np.log(values["viscosity"]))[:, None]}
@@ -41,7 +43,7 @@ class Formula(Experiment):
     def linearised(self, values, directions):
         u = np.log(values["viscosity"])
         slope = (self.function(u + STEP) - self.function(u - STEP)) / (2.0 * STEP)
-        columns = [slope * one["viscosity"] / values["viscosity"] for one in directions]
+        columns = [slope * one.get("viscosity", 0.0) / values["viscosity"] for one in directions]
         return self.predicted(values), {"gauge": np.stack(columns, axis=-1)[:, None, :]}
 
 

@@ -355,8 +355,9 @@ def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
         ({"velocity": None, "angular_velocity": None}, "given, or times with positions"),
         ({"velocity": [1.0, 0.0, 0.0]}, "a list of 2 components"),
         ({"angular_velocity": [0.0, 0.0, 1.0]}, "one number in 2-D"),
-        ({"times": [0.0, 1.0]}, "left out, as there are times"),
-        ({"velocity": None, "angular_velocity": None, "times": [0.1, 1.0]}, "from 0 on"),
+        ({"times": [0.0, 1.0], "rotations": [0.0, 0.5]}, "left out, as there are times"),
+        ({"velocity": None, "angular_velocity": None, "times": [0.1, 1.0]}, "given, or rotations, as there are times"),
+        ({"velocity": None, "angular_velocity": None, "times": [0.1, 1.0], "rotations": [0.0, 0.5]}, "from 0 on"),
         ({"velocity": None, "angular_velocity": None, "positions": [[0.0, 0.0]]}, "a list of times"),
         (
             {"velocity": None, "angular_velocity": None, "times": [0.0, 1.0], "positions": [[0.0, 0.0], [1.0, 0.0]]},
