@@ -188,11 +188,13 @@ class Promising(Quadratic):
 
 @pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
 @pytest.mark.parametrize(
-    "factor", [lambda x: 1e4 * (2.0 + np.sin(1e5 * x.sum())), lambda x: -1.0], ids=["beyond its horizon", "wrong sign"]
+    "factor",
+    [lambda x: 1e4 * (2.0 + np.sin(1e5 * x.sum())), lambda x: -1.0, lambda x: 1e-3],
+    ids=["beyond its horizon", "wrong sign", "too small"],
 )
 def test_a_gradient_that_disagrees_with_what_steps_do_is_said(optimiser, factor):
     if isinstance(optimiser, GradientDescent):
-        optimiser = GradientDescent(1e-3 if factor(np.zeros(2)) < 0.0 else 1e-5)
+        optimiser = GradientDescent({-1.0: 1e-3, 1e-3: 100.0}.get(factor(np.zeros(2)), 1e-5))
     found = optimise(Promising(factor), {"x": np.zeros(2)}, optimiser, 12)
     assert found.misled and not found.converged
     assert "The gradient disagrees with what steps did" in found.message and "another start" in found.message

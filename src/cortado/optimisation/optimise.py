@@ -103,6 +103,7 @@ def optimise(
         outcome = algorithm.minimise(search)
     best, is_run = min(evaluator.history, key=lambda record: record.loss), hasattr(problem, "simulation")
     doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run)
+    ended = outcome.message.replace(" converged ", " ended ") if doubt.misled else outcome.message
     return Result(
         parameters=_copied(best.parameters),
         loss=best.loss,
@@ -112,7 +113,7 @@ def optimise(
         evaluations=len(evaluator.history),
         refused=evaluator.refused,
         left_out=evaluator.left_out,
-        message=outcome.message + doubt.words + _without_runs_in_words(evaluator.refused, evaluator.left_out),
+        message=ended + doubt.words + _without_runs_in_words(evaluator.refused, evaluator.left_out),
         converged=outcome.converged and not doubt.misled,
         misled=doubt.misled,
         stays=doubt.stays,

@@ -12,7 +12,7 @@ WRONG = 10.0
 """A step contradicts its gradients if it changed the loss by less than the smaller promise of both its ends over this,
 or by more than the greater one times this."""
 FELT = 0.01
-"""Of the range of all losses: smaller promises tell little."""
+"""Of the range of all losses: smaller promises tell little, if the loss has not changed by more."""
 ROUND_OFF = 1e-5
 """Of the greatest loss: smaller promises tell nothing, as losses of runs in float32 are not as precise."""
 MISLED = 0.25
@@ -55,7 +55,7 @@ class Promises:
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
-        tells = (np.sign(first) == np.sign(last)) & (most > felt)
+        tells = (np.sign(first) == np.sign(last)) & (np.maximum(most, np.abs(change)) > felt)
         along = np.sign(first) * change
         broken = (along < least / WRONG) | (along > most * WRONG)
         return int(np.count_nonzero(tells & broken)), int(np.count_nonzero(tells))
