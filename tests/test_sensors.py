@@ -466,6 +466,7 @@ NOWHERE = {
     "a probe that sees nothing": (PressureProbe([0.2, 0.1], 1e-9), "less than half a spacing"),
     "a gauge outside": (WaveGauge([0.9, 0.0], 0.3), "outside of the container.*its floor, 0.3 m"),
     "a gauge in a solid": (WaveGauge([0.58, 0.0]), "in the solid 'block'"),
+    "a floor in millimetres": (WaveGauge([0.3, 0.0], 50.0), "has its floor at 50 m, above the container"),
     "a plane outside": (FlowRate([0.9, 0.0], [1.0, 0.1]), "has its plane through .* outside of the container"),
     "a region without walls": (WallForce([0.3, 0.35], [0.32, 0.37]), "without walls"),
 }

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, corners
 from cortado.errors import warn
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.pressure_probe import PressureProbe
@@ -68,6 +68,11 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
         names = " and ".join(dict.fromkeys(filter(None, there)))
         reads += f", or what is within its {key}"
         return f"{what} {point_in_words(place)} m, {names}: it reads {reads}{_in_metres(scene, place)}"
+    ends = scene.container.extent()
+    if isinstance(sensor, WaveGauge) and ends is not None:
+        top = float((corners(*ends) @ sensor.up).max())
+        if sensor.floor > top:
+            return f"has its floor at {sensor.floor:g} m, above the container, which ends at {top:g} m"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
         return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
@@ -79,11 +84,11 @@ def _looked_at(scene: Scene, sensor: Any) -> Points:
     place, ends = sensor.position, scene.container.extent()
     if isinstance(sensor, PressureProbe) or ends is None:
         return np.array([place])
-    corners = _product([np.array(pair) for pair in zip(*ends, strict=True)])
+    around = corners(*ends)
     if isinstance(sensor, WaveGauge):
-        heights = (corners - place) @ sensor.up
+        heights = (around - place) @ sensor.up
         return np.asarray(place + np.linspace(heights.min(), heights.max(), 4 * MOST)[1:-1, None] * sensor.up)
-    off = (corners - place) @ sensor.normal
+    off = (around - place) @ sensor.normal
     if off.min() > 0.0 or off.max() < 0.0:
         return np.array([place])
     points = _product([np.linspace(a, b, MOST)[1:-1] for a, b in zip(*ends, strict=True)])
