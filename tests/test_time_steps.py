@@ -13,6 +13,7 @@ import cortado
 from cortado import InputError, SceneError, Simulation, Trajectory
 from cortado.rollout import retaking
 from cortado.scene.restart import Clock
+from cortado.scene.solid_shapes import PolygonSolid
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.sensors import PressureProbe
 from scenes import jet, plane, two_layers
@@ -545,3 +546,51 @@ def test_the_fall_through_a_funnel_bounds_the_step():
     )
     fall = np.sqrt(2.0 * 9.81 * 0.6)
     assert stability_limits(scene)["speed"] == pytest.approx(0.4 * scene.discretisation.support_radius / fall)
+
+
+def funnel(thickness, kind, share=1.0):
+    """Two slanted sides, three spacings apart below, that water runs through; a share of the greatest step."""
+    low, high = np.array([0.03, 0.0]), np.array([0.4, 0.5])
+    along = (high - low) / np.linalg.norm(high - low)
+    out = thickness * np.array([along[1], -along[0]])
+    corners = np.array([low, low + out, high + out, high])
+    scene = plane(
+        discretisation={"spacing": 0.02},
+        container={"shape": "none"},
+        forces={"gravity": [0.0, -9.81]},
+        fluid=[{"shape": "box", "lower": [-0.18, 0.275], "upper": [0.18, 0.575], "phase": "water"}],
+        solid=[
+            {"name": name, "shape": "polygon", "corners": (corners * [side, 1.0]).tolist()}
+            for name, side in (("left", -1.0), ("right", 1.0))
+        ],
+        solver={"kind": kind, "time_step": 1e-4},
+    )
+    size = share * min(stability_limits(scene).values())
+    return scene.replaced(f"solver.time_step={size}"), low, along, out / thickness
+
+
+@pytest.mark.parametrize("thickness", [0.03, 0.1])
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_no_water_goes_through_the_walls_of_a_funnel_with_the_greatest_step_there_is(kind, thickness):
+    """At the limit of the speed alone it did: walls may be passed where a step takes fluid half way through."""
+    scene, low, along, out = funnel(thickness, kind)
+    size = scene.solver.time_step
+    assert stability_limits(scene)["solids"] == size < 0.65 * stability_limits(scene)["speed"]
+    run = Simulation(scene).run(round(0.7 / size), record_every=4)
+    places = np.abs(run.positions) * [1.0, 0.0] + run.positions * [0.0, 1.0] - low
+    beside = (places @ along > 0.04) & (places @ along < 0.6)
+    depths = places @ out
+    assert not (beside & (depths > 0.4 * 0.02) & (depths < thickness)).any()
+    assert np.count_nonzero(run.positions[-1][:, 1] < 0.0) > 100  # it runs out below
+
+
+def test_the_thickness_of_a_polygon_is_that_between_sides_that_face_each_other(tmp_path):
+    bar = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.2], [0.0, 0.2]])
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    cup = [[0, 0], [1, 0], [1, 1], [0.9, 1], [0.9, 0.3], [0.1, 0.3], [0.1, 1], [0, 1]]
+    taper, wedge = [[0, 0], [1, 0], [1, 0.2], [0, 0.1]], [[0, 0], [1, 0], [1, 0.05]]
+    for corners, wanted in [(bar @ turn, 0.2), (bar[::-1], 0.2), (cup, 0.1), (taper, 0.1), (wedge, np.inf)]:
+        solid = PolygonSolid(name="one", corners=np.asarray(corners, dtype=float).tolist())
+        assert solid.thinnest() == pytest.approx(wanted)
+    with pytest.raises(SceneError, match=r"only 0\.008 m thick, but must be at least half a spacing, 0\.01 m, thick"):
+        funnel(0.008, "pcisph")

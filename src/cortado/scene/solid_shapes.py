@@ -155,9 +155,10 @@ class PolygonSolid(PolygonShape, SolidTable):
     """A polygon, in 2-D."""
 
     measures: ClassVar = ("corners",)
+    least_thickness: ClassVar = 0.5
 
     def thinnest(self) -> float:
-        return np.inf
+        return Polygon(np.array(self.corners)).thinnest()
 
 
 class MeshSolid(MeshShape, SolidTable):

@@ -22,6 +22,8 @@ class SolidTable(Coloured):
 
     measures: ClassVar[tuple[str, ...]] = ()
     """Fields with which its shape grows."""
+    least_thickness: ClassVar = 1.0
+    """How thick it is at least, in spacings."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
@@ -207,7 +209,8 @@ def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 
 
 def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
-    """A solid is at least one spacing thick, so that there is room for the particles of its walls."""
-    if solid.side == "outside" and solid.thinnest() < spacing * (1.0 - 1e-6):
-        found = Words(f"only {solid.thinnest():g} m thick")
-        raise field_error(path, found, f"at least one spacing, {spacing:g} m, thick")
+    """A solid is so thick that there is room for the particles of its walls."""
+    least = solid.least_thickness * spacing
+    if solid.side == "outside" and solid.thinnest() < least * (1.0 - 1e-6):
+        found, of = Words(f"only {solid.thinnest():g} m thick"), "one spacing" if least == spacing else "half a spacing"
+        raise field_error(path, found, f"at least {of}, {least:g} m, thick")

@@ -17,6 +17,9 @@ from cortado.discretise.solids.faces import (
 from cortado.discretise.solids.moments import Moments, enclosed_moments, revolved_moments
 from cortado.discretise.solids.solid import Solid, Which
 
+FACING = 0.9
+"""Cosine between the normals of two sides of a polygon, one of them turned round, at least, where it is a sheet."""
+
 
 @dataclass(frozen=True)
 class Box(Solid):
@@ -205,6 +208,28 @@ class Polygon(Solid):
         edges = np.stack([self.corners, np.roll(self.corners, -1, axis=0)], axis=1)
         clockwise = enclosed_moments(edges, np.ones(len(edges))).volume < 0.0
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
+
+    def thinnest(self) -> float:
+        """How thick it is at least between sides that are nearly parallel, and share no corner [m]; infinite where no
+        two face each other."""
+        starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
+        lengths = np.linalg.norm(sides, axis=1)
+        along = sides / lengths[:, None]
+        turned = float(np.sum(starts[:, 0] * sides[:, 1] - starts[:, 1] * sides[:, 0]))
+        inward = np.copysign(1.0, turned) * np.stack([-along[:, 1], along[:, 0]], axis=1)
+        found, count = np.inf, len(starts)
+        for k in range(count):
+            others = np.flatnonzero(inward @ inward[k] < -FACING)
+            others = others[~np.isin((others - k) % count, (1, count - 1))]
+            ends = np.stack([starts[others], starts[others] + sides[others]], axis=1) - starts[k]
+            (s, t), depths = (ends @ along[k]).T, ends @ inward[k]
+            first, last = np.clip([np.minimum(s, t), np.maximum(s, t)], 0.0, lengths[k])
+            over = last > first
+            slopes = (depths[:, 1] - depths[:, 0])[over] / (t - s)[over]
+            across = [depths[over, 0] + slopes * (place[over] - s[over]) for place in (first, last)]
+            least = np.minimum(*across)
+            found = min(found, float(least[least > 0.0].min(initial=np.inf)))
+        return found
 
     def _holds(self, points: Points) -> Which:
         """(n,) by the number of sides that a ray along the first axis crosses."""
