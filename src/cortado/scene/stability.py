@@ -36,10 +36,10 @@ SOLID_STEP = 0.2
 """In spacings: how far a solid may move in a step."""
 
 
-BESIDE, THROUGH = 0.5, 0.25
+BESIDE, THROUGH = 0.4, 0.25
 """In spacings, and in parts of the thickness of a solid: how far fluid may move in a step without getting into it. In
-funnels with walls 1.25 to 10 spacings thick steps of 0.6 spacings went wrong with PCISPH and of 0.8 with the projection
-where walls are thicker than 2 spacings, and of 0.4 to 0.65 of the thickness where they are thinner."""
+funnels with walls 3 to 10 spacings thick steps of 0.5 spacings went wrong with PCISPH and of 0.8 with the projection;
+with walls 1.25 to 2 spacings thick those of 0.4 to 0.65 of their thickness."""
 
 
 def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
@@ -97,8 +97,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
     outlet.
-    Solids: with that speed fluid goes no further than half a spacing in a step, nor than a quarter of the thickness of
-    the thinnest.
+    Solids: with that speed fluid goes no further than 0.4 spacings in a step, nor than a quarter of the thickness of the
+    thinnest.
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
