@@ -97,8 +97,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
     outlet.
-    Solids: with that speed fluid goes no further than 0.4 spacings in a step, nor than a quarter of the thickness of the
-    thinnest.
+    Solids: with that speed fluid goes no further than 0.4 spacings in a step, nor than a quarter of the thickness of
+    the thinnest.
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
