@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.errors import CortadoError, CortadoWarning
+from cortado.runs.emitted import is_out
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 
@@ -52,7 +53,9 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
     positions = trajectory.positions.astype(np.float64)
     tolerance = TOLERANCE * spacing + 4.0 * float(precision) * float(np.abs(positions).max())
     region = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
-    lost = [~region.contains(points, tolerance) & ~_waiting(scene, points) for points in positions]
+    emitted = trajectory.others.get("emitted", [None] * len(positions))
+    waiting = (_waiting(scene, *state) for state in zip(positions, emitted, strict=True))
+    lost = [~region.contains(points, tolerance) & ~held for points, held in zip(positions, waiting, strict=True)]
     first = next((k for k, outside in enumerate(lost) if outside.any()), None)
     if first is None:
         return []
@@ -62,14 +65,14 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
     ]
 
 
-def _waiting(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """(n,) whether a particle of the nozzle has not come out yet."""
-    waiting = np.zeros(len(points), dtype=bool)
+def _waiting(scene: Scene, points: np.ndarray, emitted: np.ndarray | None) -> np.ndarray:
+    """(n,) whether a particle of the nozzle has not come out yet, or by less than a spacing."""
+    waiting = ~is_out(scene, emitted, len(points))
     if scene.emitter is not None:
         spacing = scene.discretisation.spacing
         along = (points - scene.emitter.outlet) @ np.array(scene.emitter.direction)
         held = len(scene.emitter.particles(spacing))
-        waiting[-held:] = along[-held:] < spacing
+        waiting[-held:] |= along[-held:] < spacing
     return waiting
 
 

@@ -246,6 +246,7 @@ def test_a_bad_scene_is_refused(cortado_command, folder, old, new, field):
         (["scene.toml", "--record-every", "-2"], "--record-every is -2"),
         (["scene.toml", "--device", "tpu"], "device is 'tpu'"),
         (["scene.toml", "--device", "cuda:99"], "device is 'cuda:99'"),
+        (["scene.toml", "--device", 5000 * "a"], "aaa..., but must be one of"),
         (["scene.toml", "--precision", "float16"], "precision is 'float16'"),
         (["scene.toml", "--set", "solver.time_step"], "not an override"),
         (["scene.toml", "--set", "solver.timestep=0.1"], "did you mean time_step?"),

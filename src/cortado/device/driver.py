@@ -59,4 +59,4 @@ def device_named(name: str) -> Any:
             raise ValueError  # Warp itself would write on stderr
         return wp.get_device(name)
     except (RuntimeError, ValueError) as error:
-        raise InputError(f"device is {name!r}, but must be one of: {found}{none}.") from error
+        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.") from error
