@@ -415,7 +415,7 @@ def test_where_it_is_not_installed_there_is_one_sentence():
         "except (cortado.CortadoError, ImportError) as error: print(error)"
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert "pip install cortado-reference" in found and found.count("\n") == 1
+    assert "pip install ./reference" in found and found.count("\n") == 1
 
 
 def test_both_distributions_have_one_version():
