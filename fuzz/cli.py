@@ -22,7 +22,7 @@ class Options:
     minutes: float | None = None
     """Begin no case after this time; all of them if left out."""
     only: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="FAMILY")] = ()
-    """scenes, tasks, files, kills-run, kills-optimise or environments; may be given again."""
+    """The name of a family, as the table at the end lists them; may be given again."""
     seed: int = 1
     """What all cases are drawn from."""
     jobs: int = 2
