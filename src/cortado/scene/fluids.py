@@ -169,7 +169,8 @@ class BoxFluid(Turnable):
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         if self.cuts_cells(spacing):
             return Region.between(np.array(self.lower), np.array(self.upper)).distance(points)
-        (first, last), half = self.block(spacing).extent, 0.5 * self.block(spacing).spacings
+        lattice = self.block(spacing)
+        (first, last), half = lattice.extent, 0.5 * lattice.spacings
         return Region.between(first - half, last + half).distance(points)
 
     def witnesses(self, spacing: float) -> Points:

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cortado.discretise.shapes import Points, corners
+from cortado.discretise.shapes import Points, corners, grid
 from cortado.errors import warn
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.pressure_probe import PressureProbe
@@ -91,13 +91,8 @@ def _looked_at(scene: Scene, sensor: Any) -> Points:
     off = (around - place) @ sensor.normal
     if off.min() > 0.0 or off.max() < 0.0:
         return np.array([place])
-    points = _product([np.linspace(a, b, MOST)[1:-1] for a, b in zip(*ends, strict=True)])
+    points = grid([np.linspace(a, b, MOST)[1:-1] for a, b in zip(*ends, strict=True)])
     return np.asarray(points - ((points - place) @ sensor.normal)[:, None] * sensor.normal)
-
-
-def _product(axes: list[Points]) -> Points:
-    """(n, d) the points that have one of the coordinates of each axis."""
-    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
