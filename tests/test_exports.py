@@ -16,6 +16,7 @@ from cortado.runs.exports import by_vtk
 from cortado.runs.exports.export import FORMATS
 from cortado.runs.exports.exported import Exported
 from cortado.runs.exports.whole_frames import WholeFrames
+from cortado.runs.marks import Marks
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.shown_run import ShownRun
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
@@ -181,6 +182,80 @@ def test_whole_frames_are_as_many_in_a_second_as_were_asked_for(times, rate, cou
     np.testing.assert_allclose(found.times, times[0] + np.arange(count) / rate)
     np.testing.assert_allclose(times[found.recorded] + found.shifts, found.times)
     assert len(set(found.recorded)) == count  # no state twice, none left out
+
+
+def recorded(step, marks, last):
+    """(frames,) [s] the first states at marks or after them, of a run with steps [s] that ends at the last state."""
+    times = np.append(step * np.arange(round(last / step)), last)
+    due = marks.passed(times)
+    return times[(np.diff(due, prepend=due[0] - 1) > 0) | (times == last)]
+
+
+@pytest.mark.parametrize(
+    ("rate", "step", "every"),
+    [(29.97, 0.0021, 1), (25.0, 0.0021, 1), (24.0, 0.1, 1), (60.0, 0.0021, 3)],
+    ids=["NTSC", "PAL", "steps longer than frames", "every third"],
+)
+def test_usd_has_the_rate_that_was_asked_for(tmp_path, rate, step, every):
+    """At each code all is where it should be: fluid rises evenly, one solid goes there and back, another turns."""
+    usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    knots, way = [0.0, 0.35, 0.8, 1.1], [0.55, 0.9, 0.4, 0.4]
+    solids = [
+        {**ROTOR, "motion": "path", "times": knots, "positions": [[x, 0.15, 0.1] for x in way]},
+        {**ROTOR, "name": "fan", "motion": "path", "angular_velocity": [0.0, 0.0, 25.0]},
+    ]
+    marks, of = Marks(0.0, rate), scene_from_dict({**scene().model_dump(exclude_none=True), "solid": solids})
+    times, first = recorded(step, marks, 1.0), lattice()
+    there = np.stack([np.interp(times, knots, way), *np.outer([0.15, 0.1], np.ones(len(times)))], axis=1)
+    still, turns = np.tile([0.55, 0.15, 0.1], (len(times), 1)), np.outer(times, [0.0, 0.0, 25.0])
+    motions = {"my rotor": SolidMotion(there, 0.0 * turns), "fan": SolidMotion(still, turns)}
+    run = replace(
+        trajectory(),
+        times=times,
+        steps=np.rint(times / step).astype(int),
+        positions=np.array([first + [0.0, 0.1 * t, 0.0] for t in times]),
+        velocities=np.broadcast_to([0.0, 0.1, 0.0], (len(times), *first.shape)),
+        mass_fractions=np.tile(trajectory().mass_fractions[:1], (len(times), 1, 1)),
+        quantities={},
+        solids=SolidMotions(motions),
+        marks=marks,
+    )
+    stage = usd.Stage.Open(str(run[::every].export(tmp_path / "usd", to="usd", scene=of)))
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate / every, rel=1e-15)
+    points = geometry.Points.Get(stage, "/run/particles").GetPointsAttr()
+    codes = np.arange(np.floor(rate / every + 1e-9) + 1)
+    assert points.GetTimeSamples() == codes.tolist()
+    for code in codes:
+        time = code * every / rate
+        np.testing.assert_allclose(points.Get(code)[0], first[0] + [0.0, 0.1 * time, 0.0], atol=1e-6)
+        place, turn = (
+            np.array(geometry.Xform.Get(stage, f"/run/solid_{name}").ComputeLocalToWorldTransform(code))
+            for name in ("my_rotor", "fan")
+        )
+        assert place[3, 0] == pytest.approx(np.interp(time, knots, way), abs=1e-9)
+        np.testing.assert_allclose(turn[0, :2], [np.cos(25.0 * time), np.sin(25.0 * time)], atol=1e-6)
+
+
+def test_files_and_parts_of_a_run_know_its_rate(tmp_path):
+    marks = Marks(0.0, 2.0)
+    run = replace(trajectory(), marks=marks)
+    run.save(tmp_path / "run.vtkhdf")
+    assert Trajectory.load(tmp_path / "run.vtkhdf").marks == marks
+    trajectory().save(tmp_path / "none.vtkhdf")
+    assert Trajectory.load(tmp_path / "none.vtkhdf").marks is None
+    assert run[::2].marks == Marks(0.0, 1.0) and run[1:].marks == Marks(0.5, 2.0) and run[::-1].marks is None
+    path = replace(run, times=np.array([0.0, 0.51, 1.1])).export(tmp_path / "vtp", to="vtp")
+    assert {float(time) for time in re.findall(r'timestep="([^"]+)"', path.read_text())} == {0.0, 0.5, 1.0}
+
+
+@pytest.mark.parametrize("start", [0.0, 0.123])
+def test_frames_are_due_at_marks(start):
+    marks = Marks(start, 25.0)
+    times = start + np.array([0.0, 0.0401, 0.08 - 1e-12, 0.1237, 0.13])
+    assert marks.passed(times).tolist() == [0, 1, 2, 3, 3]
+    np.testing.assert_allclose(marks.due(times) - start, [0.0, 0.04, 0.08, 0.12, 0.13], atol=1e-12)
+    sparse = start + 0.1 * np.arange(5)
+    np.testing.assert_array_equal(marks.due(sparse), sparse)
 
 
 def test_steps_that_grow_are_shown_at_even_times():

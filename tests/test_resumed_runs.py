@@ -9,6 +9,7 @@ import pytest
 import cortado.cli.commands.run_recording as run_recording
 from bad_scenes import assert_one_sentence
 from cortado import InputError, Simulation, Trajectory, load_scene
+from cortado.runs.marks import Marks
 
 SCENE = """
 name = "gauged dam"
@@ -150,6 +151,15 @@ def test_frames_come_at_a_rate(cortado_command):
     assert code == 0 and len(times) == 11
     assert ((times - np.arange(11) / 50 >= -1e-9) & (times - np.arange(11) / 50 < 0.004)).all()
     assert json.loads(Path("dam/environment.json").read_text())["settings"]["fps"] == 50
+
+
+def test_a_rate_is_kept_and_counts_from_where_a_run_begins(cortado_command):
+    cortado_command("run", "scene.toml", "--steps", 5, "--fps", 29.97, "--out", "first")
+    code, _, _ = cortado_command("run", "scene.toml", "--time", 0.1, "--fps", 50, "--out", "rest", "--state", "first")
+    first, rest = (Trajectory.load(f"{run}/trajectory.vtkhdf") for run in ("first", "rest"))
+    assert code == 0 and first.marks == Marks(0.0, 29.97) and rest.marks == Marks(first.times[-1], 50.0)
+    late = rest.times - rest.marks.at(np.arange(6))
+    assert (late >= -1e-9).all() and (late < 0.004).all()
 
 
 @pytest.mark.parametrize(

@@ -406,6 +406,15 @@ def test_the_frames_that_a_film_says_are_enough(span):
     assert frames == pytest.approx(few.enough * span + 1.0, abs=0.6)
 
 
+@pytest.mark.parametrize(("rate", "shown"), [(29.97, 29.97), (24.0, 24.0), (60.0, 30.0), (250.0, 25.0)])
+def test_a_film_in_real_time_has_the_rate_that_was_asked_for(rate, shown):
+    """Or a whole part of it; the last state, which no frame asked for, is in no frame."""
+    times = np.append(np.arange(np.floor(5.0 * rate) + 1) / rate, 5.001)
+    pace = Pace.of(times, speed=1.0, rate=rate)
+    assert pace.frames_per_second == pytest.approx(shown, rel=1e-12)
+    np.testing.assert_allclose(pace.times, np.arange(len(pace.frames)) / shown, atol=1e-12)
+
+
 REAL_TIME = "picture.film_speed=1 is real time"
 
 

@@ -45,6 +45,7 @@ class TrajectoryWriter:
         constants: arrays by name that hold for the whole run.
         diagnostics: the type of each number that `append_steps` will be told of a step, by name.
         origin: what the particles are of, as a text of JSON.
+        marks: from which time on [s] frames are due, and how many in a second, where they are chosen so.
         expected: how many frames are likely to come, which the disk must have room for; all of them if left out.
         kept: so many frames are those of the file that is there, which is replaced when they are written.
 
@@ -68,6 +69,7 @@ class TrajectoryWriter:
         constants: Mapping[str, ArrayLike] | None = None,
         diagnostics: Mapping[str, DTypeLike] | None = None,
         origin: str = "",
+        marks: tuple[float, float] | None = None,
         expected: int | None = None,
         kept: int = 1,
     ) -> None:
@@ -91,6 +93,7 @@ class TrajectoryWriter:
             {name: np.asarray(value) for name, value in (constants or {}).items()},
             {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
             origin,
+            tuple(map(float, marks or ())),
         )
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
@@ -233,7 +236,7 @@ def read(path: str | Path) -> dict[str, Any]:
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
         under its own name every scalar field (frames, n); by name others, further arrays of every frame, constants,
-        what holds for the whole run, and diagnostics, (steps,) each; and origin, a text.
+        what holds for the whole run, and diagnostics, (steps,) each; origin, a text; and marks, None or two numbers.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -280,7 +283,8 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     fields = points | others
     kinds = {name: (field.dtype, field.shape[1:]) for name, field in fields.items()}
     origin = str(own.attrs.get("origin", ""))
-    checksum = frames_seed((particles, dimension), kinds, constants, origin)
+    marks = tuple(map(float, own.attrs.get("marks", ())))
+    checksum = frames_seed((particles, dimension), kinds, constants, origin, marks)
     for k in range(frames):
         checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
     records = _records(diagnostics, record) if record.names else np.zeros(0)
@@ -290,7 +294,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
     arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
     named = {"others": others, "constants": constants, "diagnostics": diagnostics}
-    return arrays | {"times": times, "steps": numbers, "origin": origin, **named}
+    return arrays | {"times": times, "steps": numbers, "origin": origin, "marks": marks or None, **named}
 
 
 def _frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:

@@ -55,6 +55,8 @@ class FileLayout:
     """Numbers of every step."""
     origin: str
     """What the particles are of, in JSON; empty where nothing is known."""
+    marks: tuple[float, ...] = ()
+    """From which time on [s] frames are due, and how many in a second; empty where steps choose them."""
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
@@ -76,7 +78,7 @@ class FileLayout:
         particles = self.shape[0]
         kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
         kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
-        return frames_seed(self.shape, kinds, self.constants, self.origin)
+        return frames_seed(self.shape, kinds, self.constants, self.origin, self.marks)
 
     @property
     def size(self) -> int:
@@ -103,6 +105,8 @@ class FileLayout:
         own.attrs["format"], own.attrs["dimension"] = FORMAT, self.shape[1]
         if self.origin:
             own.attrs["origin"] = self.origin
+        if self.marks:
+            own.attrs["marks"] = np.array(self.marks)
         group = own.create_group("constants")
         for name, array in self.constants.items():
             group[name] = array
@@ -148,12 +152,13 @@ def frames_seed(
     kinds: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]],
     constants: Mapping[str, NDArray[Any]],
     origin: str,
+    marks: tuple[float, ...],
 ) -> int:
     """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
     holds for all of them. ``kinds``: type and shape of each field of a frame."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
-    return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed)).encode()))
+    return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
 
 
 def steps_seed(records: np.dtype[Any]) -> int:

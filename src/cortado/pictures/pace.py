@@ -21,6 +21,8 @@ SMOOTH = 12.0
 """Frames in a second below which a film says how more are recorded."""
 SHORT = 1.5
 """How many times as fast a film goes for want of frames before it says so."""
+EARLY = 1e-6
+"""Of the time between two frames: the last is early if it comes by more before it is due."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 """Speeds that are easy to think of, and these times powers of ten."""
 
@@ -45,11 +47,18 @@ class Pace:
     """Whether the frames are those of a search, which [picture] says the number of, and not those of a run."""
 
     @classmethod
-    def of(cls, times: Sequence[float] | NDArray, count: int | None = None, speed: float | None = None) -> "Pace":
+    def of(
+        cls,
+        times: Sequence[float] | NDArray,
+        count: int | None = None,
+        speed: float | None = None,
+        rate: float | None = None,
+    ) -> "Pace":
         """The pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly chosen; if
         left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows `USUAL` in a
         second, and any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or longer
-        than `LONGEST`."""
+        than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without ``count`` the film has
+        every one of them, or every second, and so on, and no state between two."""
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:
@@ -57,6 +66,8 @@ class Pace:
         most = min(count or round(USUAL * span / speed) + 1, len(times))
         enough = USUAL / full
         chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, most)).astype(int)).tolist()
+        if rate is not None and count is None:
+            chosen = list(range(0, _whole(times, rate), max(round(rate * speed / USUAL), 1)))
         shown = tuple((times[k] - times[0]) / speed for k in chosen)
         return cls(tuple(chosen), shown, speed, len(times), enough, is_asked)
 
@@ -111,15 +122,21 @@ class Pace:
         return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
 
 
-def pace_of(times: Sequence[float] | NDArray, picture: Picture) -> Pace:
-    """That of a run with frames at ``times`` [s] as a picture table asks for; warns where it asks for more frames than
-    there are."""
+def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | None = None) -> Pace:
+    """That of a run with frames at ``times`` [s] as a picture table asks for, ``rate`` as for `Pace.of`; warns where it
+    asks for more frames than there are."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
         advice = "a smaller --record-every or more steps give more"
         warn(f"{found}, as the run has no more; {advice}.")
-    return Pace.of(times, asked, picture.film_speed)
+    return Pace.of(times, asked, picture.film_speed, rate)
+
+
+def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
+    """How many frames there are without a last one that comes before it is due."""
+    is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
+    return len(times) - 1 if is_early else len(times)
 
 
 def _speed(span: float, count: int, easy: float) -> float:

@@ -13,6 +13,7 @@ from cortado.pictures.pace import pace_of
 from cortado.pictures.page import Page
 from cortado.runs.colouring import coloured_by
 from cortado.runs.frame import Frame
+from cortado.runs.marks import common_rate
 from cortado.runs.measuring import Measuring
 from cortado.runs.picture_settings import shown_as
 from cortado.runs.run_pictures import run_page
@@ -57,7 +58,7 @@ def film_of(
     if missing:
         raise InputError(missing)
     page = page_of(trajectory, scene, device, settings, units, simulation)
-    pace = pace_of(trajectory.times, shown.picture or Picture())
+    pace = pace_of(trajectory.due, shown.picture or Picture(), common_rate([trajectory.marks]))
     return film(Path(as_path("path", path)), page, range(len(trajectory)), pace)
 
 

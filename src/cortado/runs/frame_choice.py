@@ -1,7 +1,7 @@
 """Which states of a run become frames of its trajectory: every so many steps, or so many in a simulated second."""
 
 from dataclasses import dataclass
-from math import floor, inf
+from math import inf
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from cortado.errors import InputError
 from cortado.rollout.durations import expected_frames
 from cortado.rollout.rollout import Rollout
+from cortado.runs.marks import Marks
 from cortado.scene.restart import Clock
-
-SAME = 1e-9
-"""Of a frame: a state that comes earlier than a frame is due by less is that frame, as times are rounded."""
 
 
 class FrameChoice(Protocol):
@@ -23,8 +21,13 @@ class FrameChoice(Protocol):
     def settings(self) -> dict[str, Any]:
         """By which one run is told from another."""
 
+    @property
+    def rate(self) -> float | None:
+        """[1/s] frames in a second that is simulated; None where steps are chosen, not times."""
+
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Whether the state after a step is a frame, given the times of the state before and of itself [s]."""
+        """Whether the state after a step is a frame, given how long after the first state [s] the one before and itself
+        are."""
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
         """(frames,) [s] as many as there can be, at the times that are known before the run, others about then."""
@@ -47,6 +50,10 @@ class EverySteps:
     def settings(self) -> dict[str, Any]:
         """See `FrameChoice`."""
         return {"record_every": self.steps}
+
+    @property
+    def rate(self) -> None:
+        """See `FrameChoice`."""
 
     def is_due(self, step: int, before: float, now: float) -> bool:
         """See `FrameChoice`."""
@@ -88,13 +95,14 @@ class FramesPerSecond:
 
     def is_due(self, step: int, before: float, now: float) -> bool:
         """See `FrameChoice`."""
-        return floor(now * self.rate + SAME) > floor(before * self.rate + SAME)
+        passed, due = Marks(0.0, self.rate).passed(np.array([before, now])).tolist()
+        return due > passed
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
         """See `FrameChoice`."""
         start, size = rollout.clocks[0].time, float(rollout.time_steps[0])  # where steps are chosen the longest one
         duration = min(rollout.steps * size, rollout.step_sizes.end - start + size)
-        return start + np.arange(min(rollout.steps, floor(duration * self.rate) + 1) + 2) / self.rate
+        return Marks(start, self.rate).at(np.arange(min(rollout.steps, int(duration * self.rate) + 1) + 2))
 
     def expected(self, rollout: Rollout) -> int:
         """See `FrameChoice`."""
@@ -104,7 +112,7 @@ class FramesPerSecond:
         """See `FrameChoice`."""
         if time is None:
             return None
-        due, before = (floor(end * self.rate + SAME) for end in (time, time - time / steps))
+        before, due = Marks(0.0, self.rate).passed(np.array([time - time / steps, time])).tolist()
         return 1 + min(steps, due if due > before else due + 1)
 
 

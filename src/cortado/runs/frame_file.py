@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.files import vtkhdf
+from cortado.runs.marks import Marks
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Origin
 
@@ -23,13 +24,15 @@ def frame_writer(
     diagnostics: Mapping[str, NDArray[Any]],
     origin: Origin | None,
     quantities: Iterable[str] = (),
+    marks: Marks | None = None,
     expected: int | None = None,
     kept: int = 1,
 ) -> vtkhdf.TrajectoryWriter:
     """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, with
     ``quantities`` of these names, and for what is noted of so many steps, which have the names and types of
-    ``diagnostics``; all of it of particles of an origin. The disk must have room for all frames, or for as many as are
-    ``expected``. A file of that name is replaced once it has all frames that are ``kept`` of it."""
+    ``diagnostics``; all of it of particles of an origin. ``marks``: when frames are due, where times choose them. The
+    disk must have room for all frames, or for as many as are ``expected``. A file of that name is replaced once it has
+    all frames that are ``kept`` of it."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
@@ -47,6 +50,7 @@ def frame_writer(
         constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
         origin="" if origin is None else origin.to_json(),
+        marks=None if marks is None else (marks.start, marks.rate),
         expected=expected,
         kept=kept,
     )

@@ -17,6 +17,7 @@ from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scale import Scale
 from cortado.pictures.scene_view import scene_view
 from cortado.pictures.stage import Stage
+from cortado.runs.marks import common_rate
 from cortado.runs.report import Figures
 from cortado.runs.shown_run import ShownRun
 from cortado.runs.trajectory import Trajectory
@@ -38,7 +39,8 @@ def run_pictures(
     picture = scene.picture or Picture()
     if picture.film_frames == 0 or not last:
         return stills
-    made = film(folder / "film.mp4", page, range(last + 1), pace_of(trajectory.times, picture))
+    pace = pace_of(trajectory.due, picture, common_rate([trajectory.marks]))
+    made = film(folder / "film.mp4", page, range(last + 1), pace)
     announce(str(made))
     return [(f"The run, {made.pace.in_words}.", made.path), *stills]
 

@@ -49,16 +49,22 @@ class ShownRun:
         """Its pictures by the number of the frame, on a stage that is its own but for the camera."""
         return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
 
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """(frames,) [s] of the states that are shown; see `Trajectory.due`."""
+        return self.trajectory.due
+
     @property
     def fingerprint(self) -> str:
         """A checksum of what its pictures are made of."""
         trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
-        for array in (trajectory.times, trajectory.positions[:1], trajectory.positions[-1:]):
+        for array in (trajectory.due, trajectory.positions[:1], trajectory.positions[-1:]):
             found.update(np.ascontiguousarray(array).tobytes())
         return found.hexdigest()
 
     def _state(self, k: int, stage: PlaneStage | Stage, scale: Scale | None) -> State:
-        frame, shown = self.trajectory[k], those(self._out[k])
+        frame = self.trajectory[k].moved(float(self.times[k] - self.trajectory.times[k]))
+        shown = those(self._out[k])
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
         if scale is not None and self.values is not None:
             colours = scale.colours(self.values[k])
@@ -67,7 +73,10 @@ class ShownRun:
 
     @cached_property
     def _motions(self) -> SolidMotions:
-        return solid_motions(self.scene, self.trajectory.others)
+        known = self.trajectory.times
+        return solid_motions(self.scene, self.trajectory.others).at(
+            self.scene, known, np.arange(len(known)), self.times
+        )
 
     @cached_property
     def _out(self) -> list[NDArray[np.bool_]]:
@@ -99,4 +108,4 @@ class ShownRun:
         domain = self.scene.container.domain(self.scene.dimension)
         places = {name: domain.wrapped(place) for name, place in places.items()}
         up = upright(np.asarray(self.scene.forces.gravity))[1]
-        return Moment(k / max(len(self.trajectory) - 1, 1), float(self.trajectory.times[k]), up, places)
+        return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)

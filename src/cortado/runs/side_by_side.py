@@ -23,6 +23,7 @@ from cortado.pictures.scale import Scale
 from cortado.runs.colouring import coloured_by
 from cortado.runs.common_clock import SAME, ShownFrames, common_times, interval_of
 from cortado.runs.differences import labels
+from cortado.runs.marks import common_rate
 from cortado.runs.picture_settings import shown_as
 from cortado.runs.showing import device_of
 from cortado.runs.shown_run import ShownRun
@@ -72,7 +73,7 @@ def film_side_by_side(
         [ShownRun(*one) for one in zip(pictured, each, values, strict=True)], names, device_of(device)
     )
     picture = pictured[0].picture or Picture()
-    pace = pace_of(times, picture)
+    pace = pace_of(times, picture, common_rate(run.marks for run in each))
     return film(Path(as_path("path", path)), page, range(len(times)), pace)
 
 
@@ -113,13 +114,13 @@ def shown_alike(
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
     """Runs of scenes that are `shown_alike`, each with its name and its time; and the times of its frames [s]."""
-    times = common_times([run.trajectory.times for run in runs])
+    times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
     scale = Scale.of(picture.colour, np.concatenate(values)) if values else None
     spare = 0 if scale is None else scale.columns(picture.height)
     stages, across = framed_together([run.stage for run in runs], spare)
-    shown = [ShownFrames(run.trajectory.times, times) for run in runs]
+    shown = [ShownFrames(run.times, times) for run in runs]
     panels = [
         _labelled(run.panel(stage, device, scale), name, frames)
         for run, stage, name, frames in zip(runs, stages, names, shown, strict=True)

@@ -11,15 +11,18 @@ from cortado.errors import InputError, shown
 from cortado.scene.motions import (
     AXES,
     angular_velocity_name,
+    courses,
     moving,
     position_name,
     rotation_name,
     scale_name,
     solids_in,
+    told,
     turn_name,
     velocity_name,
 )
 from cortado.scene.scene import Scene
+from cortado.scene.solids import SolidTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,22 +40,34 @@ class SolidMotion:
     scale: float = 1.0
     """How many times as large as in the scene one is that is told where to go."""
 
-    def __getitem__(self, frames: slice) -> Self:
+    def __getitem__(self, frames: slice | NDArray[np.intp]) -> Self:
         """In some of the frames."""
         velocities, spins = (None if a is None else a[frames] for a in (self.velocities, self.angular_velocities))
         places, turns = self.positions[frames], self.rotations[frames]
         return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
-    def at(self, known: NDArray[Any], times: NDArray[Any]) -> Self:
-        """The motion at ``times`` (k,) [s], between its frames at times ``known`` (frames,) [s]; without velocities."""
-        places = np.stack([np.interp(times, known, x) for x in self.positions.T], axis=1)
+    def carried(self, shifts: NDArray[Any]) -> Self:
+        """A body that is free a short time later in each frame, or earlier, ``shifts`` (frames,) [s]: it goes on at its
+        velocities."""
+        assert self.velocities is not None and self.angular_velocities is not None
+        places, turns = self.positions + shifts[:, None] * self.velocities, (shifts * self.angular_velocities.T).T
+        rotations = self.rotations + turns if turns.ndim == 1 else _product(turns, self.rotations)
+        return replace(self, positions=places, rotations=rotations)
+
+    def between(self, known: NDArray[Any], times: NDArray[Any], table: SolidTable) -> Self:
+        """A solid that is told where to go at ``times`` (k,) [s], with frames at times ``known`` (frames,) [s]: as its
+        ``table`` tells, but for what a run may have changed, which is interpolated."""
+        shift, turn = courses(table)
+        kept = self.positions - shift.at(known)
+        places = np.stack([np.interp(times, known, x) for x in kept.T], axis=1) + shift.at(times)
         if self.rotations.ndim == 1:
-            turns = np.interp(times, known, self.rotations)
+            turns = np.interp(times, known, self.rotations - turn.at(known)) + turn.at(times)
         else:
             from scipy.spatial.transform import Rotation, Slerp
 
-            turns = Slerp(known, Rotation.from_rotvec(self.rotations))(times).as_rotvec()
-        return replace(self, positions=places, rotations=turns, velocities=None, angular_velocities=None)
+            begun = Rotation.from_rotvec(_product(-turn.at(known), self.rotations))
+            turns = _product(turn.at(times), Slerp(known, begun)(times).as_rotvec())
+        return replace(self, positions=places, rotations=turns)
 
 
 class SolidMotions(dict[str, SolidMotion]):
@@ -67,11 +82,19 @@ class SolidMotions(dict[str, SolidMotion]):
         """In some of the frames."""
         return SolidMotions({name: motion[frames] for name, motion in self.items()})
 
-    def at(self, known: NDArray[Any], times: NDArray[Any]) -> "SolidMotions":
-        """At ``times`` [s], between frames at times ``known`` [s]."""
-        if np.array_equal(known, times):
-            return self
-        return SolidMotions({name: motion.at(known, times) for name, motion in self.items()})
+    def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> "SolidMotions":
+        """At ``times`` (k,) [s], each near the frame of a number ``recorded`` (k,), in a run of a scene with frames at
+        times ``known`` (frames,) [s]."""
+        shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
+        if not shifts.any():
+            return SolidMotions({name: motion[recorded] for name, motion in self.items()})
+        return SolidMotions(
+            {
+                name: motion.between(known, times, tables[name]) if name in tables else motion[recorded].carried(shifts)
+                for name, motion in self.items()
+                if name in tables or motion.velocities is not None
+            }
+        )
 
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> SolidMotions:

@@ -17,6 +17,7 @@ from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
+from cortado.runs.marks import Marks
 from cortado.runs.sensors.log import Readings
 from cortado.runs.showing import Showing
 from cortado.runs.solid_motion import SolidMotions, motions_in
@@ -70,6 +71,8 @@ class Trajectory(Showing):
     """where solids that move are, by their names"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
+    marks: Marks | None = None
+    """when frames are due of a run with ``--fps``; None where they come after so many steps"""
     scene: Scene | None = field(default=None, repr=False)
     """of which it is a run; None of a trajectory from a file, which does not hold it"""
 
@@ -140,7 +143,14 @@ class Trajectory(Showing):
         each = {name: getattr(self, name) for name in ("others", "quantities")}
         kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
         kept["solids"] = self.solids.in_frames(frames)
+        kept["marks"] = None if self.marks is None else self.marks.chosen(kept["times"], frames.indices(len(self))[2])
         return replace(self, **kept)
+
+    @property
+    def due(self) -> NDArray[Any]:
+        """(frames,) [s] when pictures and films show each frame: at its whole mark in a run with ``--fps``, to which it
+        is moved along its velocities, and else at its time."""
+        return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
     def dimension(self) -> int:
@@ -215,7 +225,8 @@ class Trajectory(Showing):
         first = {name: array[0] if len(array) else array for name, array in frames.items()}
         steps = len(self.converged)
         own = {name: array[:1] for name, array in self.quantities.items()}
-        with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin, own) as writer:
+        known = self.constants, steps, self.diagnostics, self.origin, own, self.marks
+        with frame_writer(path, self.times, first, *known) as writer:
             writer.append_steps(**self.diagnostics)
             self.write_frames(writer)
 
@@ -279,8 +290,9 @@ class Trajectory(Showing):
             _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
             recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
         solids = motions_in(arrays["others"], arrays["positions"].shape[2])
+        marks = None if arrays["marks"] is None else Marks(*arrays["marks"])
         more: dict[str, Any] = {"mass_fractions": fractions, "origin": origin, "quantities": recorded, "solids": solids}
-        return cls(**{name: arrays[name] for name in names}, **more)
+        return cls(**{name: arrays[name] for name in names}, **more, marks=marks)
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:

@@ -103,11 +103,11 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
     """How fast the fastest point of a solid moves at most [m/s], with values of parameters that replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
-        d = len(solid.middle())
+        shifts, turns = courses(solid)
         shift = values.get(velocity_name(solid.name))
         turn = values.get(angular_velocity_name(solid.name))
-        shifts = _course(solid, "positions", "velocity", d) if shift is None else Steady(shift)
-        turns = _course(solid, "rotations", "angular_velocity", 2 * d - 3) if turn is None else Steady(turn)
+        shifts = shifts if shift is None else Steady(shift)
+        turns = turns if turn is None else Steady(turn)
         found.append(shifts.greatest() + reach(solid, values) * turns.greatest())
     return max(found)
 
@@ -178,6 +178,12 @@ def angular_velocity_name(solid: str) -> str:
 def density_name(solid: str) -> str:
     """Of the parameter of a free body."""
     return f"{solid}.density"
+
+
+def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
+    """How a solid that is told where to go is displaced [m], and turned [rad], over time from where it begins."""
+    d = len(solid.middle())
+    return _course(solid, "positions", "velocity", d), _course(solid, "rotations", "angular_velocity", 2 * d - 3)
 
 
 def _position(solid: SolidTable) -> Parameter:
@@ -273,7 +279,7 @@ def _displacement(solid: SolidTable) -> Parameter:
         change=_change_of_place,
         moment=1.0,
         grows=True,
-        course=_course(solid, "positions", "velocity", len(solid.middle())),
+        course=courses(solid)[0],
     )
 
 
@@ -289,7 +295,7 @@ def _turn(solid: SolidTable) -> Parameter:
         change=lambda source, value: np.full(np.shape(value), RADIAN),
         moment=1.0,
         grows=True,
-        course=_course(solid, "rotations", "angular_velocity", angles),
+        course=courses(solid)[1],
     )
 
 

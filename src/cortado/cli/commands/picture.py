@@ -15,6 +15,7 @@ from cortado.pictures.image_files import write_picture
 from cortado.pictures.pace import pace_of
 from cortado.runs.colouring import coloured_by
 from cortado.runs.differences import labels
+from cortado.runs.marks import common_rate
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_page
 from cortado.runs.showing import device_of
@@ -74,7 +75,7 @@ def draw_runs(
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if len(each) == 1:
         (one,) = each
-        page, times = run_page(one.scene, one.trajectory, device, one.values), one.trajectory.times
+        page, times = run_page(one.scene, one.trajectory, device, one.values), one.times
         place, name = folders[0].figures, "film" if as_film else "picture"
     else:
         page, times = runs_page(each, labels(scenes, _names(folders)), device)
@@ -83,7 +84,8 @@ def draw_runs(
         path = out or place / f"{name}.mp4"
         further = "" if path.suffix == ".webp" else ", and the same command goes on with it"
         with keeping(lambda: f"what is drawn is in {path}{further}"):
-            made = film(path, page, range(len(times)), pace_of(times, picture))
+            pace = pace_of(times, picture, common_rate(run.marks for run in trajectories))
+            made = film(path, page, range(len(times)), pace)
         return f"The film is in {path}: {made.in_words}."
     if frame not in range(-len(times), len(times)):
         of = "the run has" if len(each) == 1 else "together the runs have"

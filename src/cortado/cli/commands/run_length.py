@@ -47,7 +47,7 @@ class RunLength:
         frames = choice.count(count, time)
         film = None
         if frames is not None and time is not None and 1 < frames <= MOST and picture.film_frames != 0:
-            film = Pace.of(np.linspace(0.0, time, frames), picture.film_frames, picture.film_speed)
+            film = Pace.of(np.linspace(0.0, time, frames), picture.film_frames, picture.film_speed, choice.rate)
         numbers = simulation.numbers_in_frame(components=3)  # as in the file
         size = None
         if frames is not None:

@@ -13,6 +13,7 @@ from cortado.rollout.progress import Progress
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_choice import FrameChoice
 from cortado.runs.frame_file import append_frame, frame_writer
+from cortado.runs.marks import Marks
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.simulation import Simulation
@@ -56,11 +57,13 @@ class RunRecording:
         """Take the steps; returns the last state. Raises `DivergedError` with everything before written."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
-        constants, origin = self.simulation.constants(rollout), rollout.origins[0]
+        constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
         noted, expected = rollout.diagnostics, self.frames.expected(rollout)
         kept = 1 if self.kept is None else len(self.kept)
-        file = self.folder.trajectory, times, first, constants, steps, noted, origin, self.watch.names, expected, kept
+        known = first, constants, steps, noted, origin, self.watch.names
+        marks = None if self.frames.rate is None else Marks(start, self.frames.rate)
         whole = (100, "run, % of its time") if ends_at_a_time(rollout) else (rollout.steps, "run")
+        file = self.folder.trajectory, times, *known, marks, expected, kept
         with frame_writer(*file) as writer, track(*whole) as advance:
             notes, done = Notes(self, writer), 0
             if self.kept is None:
@@ -75,7 +78,7 @@ class RunRecording:
             def observe(step: int, state: State) -> None:
                 nonlocal done
                 before, now = (float(rollout.clocks[0].times(np.array(k), size)) for k in (step - 1, step))
-                if self.frames.is_due(step, before, now) or rollout.is_last(step):
+                if self.frames.is_due(step, before - start, now - start) or rollout.is_last(step):
                     number = rollout.clocks[0].steps + step
                     append_frame(writer, self.simulation.frame(state), number, self.watch.frame(step, state), now)
                 self.watch.step(step, state)

@@ -17,6 +17,7 @@ from cortado.rollout.outcome import not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.supply import dry_sentence
 from cortado.runs.colouring import coloured_by
+from cortado.runs.marks import common_rate
 from cortado.runs.report import Figures, Section, write_report
 from cortado.runs.run_figures import density_errors, readings
 from cortado.runs.run_folder import RunFolder
@@ -92,7 +93,7 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     path = images(map(image, shown), titles, folder / "rendered.png")
     figures: Figures = [("The same, rendered.", path)]
     if len(trajectory.times) > 1 and find_spec("av"):
-        pace = Pace.of(trajectory.times)
+        pace = Pace.of(trajectory.due, rate=common_rate([trajectory.marks]))
         path = write_video(folder / "run.mp4", map(image, pace.frames), pace.frames_per_second)
         figures.append((f"The same, {pace.in_words}.", path))
     return figures

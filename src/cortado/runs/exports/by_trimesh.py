@@ -30,7 +30,7 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
     import trimesh
 
     upright = Pose(run.up, np.zeros(3)).matrix
-    for number, frame in enumerate(run.frames()):
+    for number, frame in enumerate(run.frames(run.series)):
         scene = trimesh.Scene()
         if frame.surface is not None:
             scene.add_geometry(_trimesh(frame.surface, _bytes), "surface", "surface", transform=upright)
@@ -46,7 +46,7 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 def _write_series(run: Exported, folder: Path, ending: str, advance: Advance) -> Path:
     """A file for the surface, for the particles and for each solid that moves in each frame, and one for each solid
     at rest; colours are those of sRGB, which programs expect there. Returns the folder."""
-    for number, frame in enumerate(run.frames()):
+    for number, frame in enumerate(run.frames(run.series)):
         found: dict[str, Any] = {numbered("particles", number, ending): _cloud(frame, _srgb)}
         if frame.surface is not None:
             found[numbered("surface", number, ending)] = _trimesh(frame.surface, _srgb)

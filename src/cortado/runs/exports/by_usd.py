@@ -8,10 +8,8 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError, ExtraMissingError
 from cortado.files.atomic import sentences, unfinished
-from cortado.files.progress import announce
 from cortado.runs.exports.by_trimesh import Advance
 from cortado.runs.exports.exported import Exported, ExportedFrame, Mesh, Pose
-from cortado.runs.exports.whole_frames import WholeFrames
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
@@ -19,17 +17,16 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     transform ``/run/solid_NAME`` with a mesh; returns its path.
 
     Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
-    these are, and a line where they are not recorded ones. Lengths are metres, colours linear.
+    these are. Lengths are metres, colours linear.
     """
     pxr = _pxr()
     path = folder / "run.usdc"
-    whole = WholeFrames.of(run.times)
     temporary = unfinished(path).with_suffix(".usdc")
     with sentences(path):
         try:
             stage = pxr.Usd.Stage.CreateNew(str(temporary))
-            writer = _Writer(pxr, stage, run, len(whole.times), whole.rate)
-            for code, frame in enumerate(run.frames(whole)):
+            writer = _Writer(pxr, stage, run, len(run.whole.times), run.whole.rate)
+            for code, frame in enumerate(run.frames(run.whole)):
                 writer.add(float(code), frame)
                 advance()
             stage.GetRootLayer().Save()
@@ -41,8 +38,6 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
             ) from problem
         finally:
             temporary.unlink(missing_ok=True)
-    if whole.in_words:
-        announce(f"{path.name}: {whole.in_words}.")
     return path
 
 

@@ -19,7 +19,7 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
     """The surface, the particles with all their fields and each solid, as a file of its own in each frame, one for a
     solid at rest; returns ``run.pvd``, which has them all at their times."""
     entries = []
-    for number, frame in enumerate(run.frames()):
+    for number, frame in enumerate(run.frames(run.series)):
         parts = {"particles": (numbered("particles", number, "vtp"), _particles(frame))}
         if frame.surface is not None:
             parts["surface"] = numbered("surface", number, "vtp"), _mesh(frame.surface)

@@ -7,7 +7,7 @@ from pathlib import Path
 from cortado.errors import InputError, shown
 from cortado.files.atomic import sentences
 from cortado.files.input_files import as_path
-from cortado.files.progress import track
+from cortado.files.progress import announce, track
 from cortado.runs.exports.by_trimesh import Advance, write_glb, write_obj, write_ply
 from cortado.runs.exports.by_usd import write_usd
 from cortado.runs.exports.by_vtk import write_vtp
@@ -48,8 +48,12 @@ def export(
         into.mkdir(parents=True, exist_ok=True)
         if any(into.iterdir()):
             raise InputError(f"{into} is not empty; choose another folder, in which no other files get in between.")
-    with track(len(trajectory), "export") as advance:
-        return FORMATS[to](run, into, advance)
+    whole = run.whole if to == "usd" else run.series
+    with track(len(trajectory if whole is None else whole.times), "export") as advance:
+        path = FORMATS[to](run, into, advance)
+    if whole is not None and whole.in_words:
+        announce(f"{path.name}: {whole.in_words}.")
+    return path
 
 
 def _phases(trajectory: Trajectory) -> int:

@@ -114,6 +114,16 @@ class Exported:
         """Number of frames."""
         return len(self.times)
 
+    @cached_property
+    def whole(self) -> WholeFrames:
+        """Those of an animation."""
+        return WholeFrames.of(self.times, self._trajectory.marks)
+
+    @property
+    def series(self) -> WholeFrames | None:
+        """Those of a series of files: at the marks of a run that has some, and else all recorded states, None."""
+        return None if self._trajectory.marks is None else self.whole
+
     @property
     def spacing(self) -> float:
         """[m]"""
@@ -125,10 +135,10 @@ class Exported:
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """All recorded states, or those of an animation, one after the other, as surfaces take memory."""
+        """All recorded states, or whole frames, one after the other, as surfaces take memory."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
-        solids = self._trajectory.solids.at(self.times, whole.times)
+        solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
         states = enumerate(zip(whole.recorded.tolist(), whole.shifts.tolist(), strict=True))
         return (self._frame(self._trajectory[k].moved(shift), k, solids, frame) for frame, (k, shift) in states)
 

@@ -6,6 +6,8 @@ from math import floor
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.runs.marks import SAME, Marks
+
 EVEN = 1e-6
 """Recorded frames whose distances in time differ by less than this part are evenly spaced."""
 DIGITS = (0, 1, 2, 3)
@@ -21,16 +23,21 @@ class WholeFrames:
     times: NDArray[np.float64]
     """(frames,) [s]"""
     recorded: NDArray[np.intp]
-    """(frames,) the number of the recorded state that is nearest in time"""
+    """(frames,) the number of the recorded state that it is made of: the nearest in time, or of a run with marks the
+    first one from then on, as a step back along velocities is the way between the states of a step"""
     shifts: NDArray[np.float64]
     """(frames,) [s] from the time of that state to that of the frame; 0 where recorded states are evenly spaced"""
     left_out: float
     """[s] how much later than the last frame the run ends"""
 
     @classmethod
-    def of(cls, times: NDArray[np.float64]) -> "WholeFrames":
-        """The frames for states recorded at ``times`` (m,) [s]. Evenly spaced states are the frames. Others are late
-        by a part of a step, or have other distances: the rate is then a round number near that of the states."""
+    def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
+        """The frames for states recorded at ``times`` (m,) [s]: at the ``marks`` for which they were. Without marks,
+        evenly spaced states are the frames; of others the rate is a round number near that of the states."""
+        if marks is not None:
+            whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
+            recorded = np.searchsorted(times, whole - SAME / marks.rate)
+            return cls(marks.rate, whole, recorded, whole - times[recorded], float(times[-1] - whole[-1]))
         steps = np.diff(times)
         if not len(steps):
             return cls(24.0, times, np.zeros(1, dtype=np.intp), np.zeros(1), 0.0)
