@@ -1,9 +1,12 @@
 """Values of a wrong type, given to whatever a user may call: a sentence each, and never a bare error of Python's."""
 
+import importlib
 import inspect
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -296,3 +299,75 @@ def test_guided_is_named_where_it_is_given_a_batch():
     problem = cortado.Problem(cortado.Simulation(cortado.Scene(**plane()), batch=2), 1, calls()["Problem"][1]["loss"])
     with pytest.raises(InputError, match=r"^Guided is given a problem of a batch"):
         problem.estimate({"gravity": np.zeros((2, 1, 2))}, cortado.gradients.Guided())
+
+
+MODULES = [name for name in cortado.__all__ if isinstance(getattr(cortado, name), ModuleType)]
+PUBLIC = ["cortado", *(f"cortado.{name}" for name in [*MODULES, "environments", "jax"])]
+ODD = {"nothing": None, "a number": 3.5, "a letter": "x", "a function of nothing": lambda: None}
+
+
+@cache
+def by_name():
+    """Good arguments, by the names that functions and classes have for them."""
+    found = {name: value for _, arguments in calls().values() for name, value in arguments.items()}
+    positions = found["problem"].end(found["start"]).positions
+    own = {
+        "path": "run.vtkhdf",
+        "sensor": cortado.sensors.WaveGauge([0.1, 0.0]),
+        "dimension": 2,
+        "position": [0.1, 0.1],
+    }
+    own |= {
+        "position": [0.1, 0.1],
+        "times": 0.001 * np.arange(1, 5),
+        "values": np.zeros(4),
+        "normal": [1.0, 0.0],
+        "noise": 0.1,
+    }
+    own |= {"frames": np.zeros((4, 8, 10, 3)), "time_step": 0.0021, "task": "Carry", "positions": positions}
+    return {**found, **own}
+
+
+def odd_calls(function):
+    """Of a function or a class: without arguments, and with each argument, and all that are needed, of another kind."""
+    takes = inspect.signature(function).parameters
+    named = [name for name, one in takes.items() if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)]
+    needed = [name for name in named if takes[name].default is inspect.Parameter.empty]
+    first = sum(one.kind is one.POSITIONAL_ONLY for one in takes.values())
+    good = {name: by_name().get(name) for name in needed}
+    yield "no arguments", (), {}
+    for words, odd in ODD.items():
+        yield f"all are {words}", [odd] * first, dict.fromkeys(needed, odd)
+        yield from ((f"{name} is {words}", [odd] * first, {**good, name: odd}) for name in named)
+
+
+def objects(kind):
+    """One of a class, where good arguments that have its names make one."""
+    needed = [n for n, one in inspect.signature(kind).parameters.items() if one.default is one.empty]
+    made = [one for one in by_name().values() if type(one) is kind]
+    if not made and by_name().keys() >= set(needed):
+        with suppress(CortadoError):
+            made = [kind(**{name: by_name()[name] for name in needed})]
+    names = [name for name in dir(kind) if not name.startswith("_") and name not in ("film", "run")] if made else []
+    found = [getattr(made[0], name) for name in names if callable(getattr(kind, name))]
+    return [one for one in found if str(getattr(one, "__module__", "")).startswith("cortado")]
+
+
+@pytest.mark.filterwarnings("ignore::cortado.errors.CortadoWarning")
+@pytest.mark.parametrize("module", PUBLIC)
+def test_whatever_is_public_works_or_says_what_is_wrong(module, tmp_path, monkeypatch):
+    """Functions, classes and methods of these: called with too little, and with arguments of another kind."""
+    monkeypatch.chdir(tmp_path)
+    public = importlib.import_module(module)
+    found = [getattr(public, name) for name in public.__all__ if callable(getattr(public, name))]
+    made = [one for one in found if not (inspect.isabstract(one) or getattr(one, "_is_protocol", False))]
+    made = [one for one in made if not (inspect.isclass(one) and issubclass(one, BaseException))]
+    methods = [method for one in made if inspect.isclass(one) for method in objects(one)]
+    for function in [*made, *methods]:
+        for words, arguments, named in odd_calls(function):
+            try:
+                function(*arguments, **named)
+            except CortadoError as error:
+                assert len(str(error)) > 10 and "\n" not in str(error), (function, words)
+            except Exception as error:
+                pytest.fail(f"{function.__qualname__}, where {words}: {type(error).__name__}: {error}")

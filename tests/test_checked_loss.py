@@ -128,6 +128,7 @@ MISTAKES = {
         r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$",
     ),
     "too many arguments": (lambda: as_loss(lambda x, v, c, loss: None), "must take 3: positions, velocities"),
+    "a function that is recorded": (lambda: Recorded(lambda x, v: None), r"arguments '\(x, v\)', but must take 3: pos"),
     "an adjoint without an argument": (lambda: as_loss(Narrow()), "the loss's adjoint takes the arguments"),
     "frames that are a list": (lambda: Frames([Given()]), "losses is .* but must be a table"),
 }

@@ -259,6 +259,10 @@ def test_free_energies_of_one_name_are_told_from_one_another():
         ({"curvature": -1.0}, "FreeEnergy quartic's curvature is -1.0, but must be at least 0"),
         ({"curvature": "a"}, "FreeEnergy quartic's curvature is 'a', but must be"),
         ({"functions": 3}, "FreeEnergy quartic's functions is 3, but must be a function"),
+        (
+            {"functions": lambda precision: 3},
+            r"takes the arguments '\(precision\)', but must take 2: a precision",
+        ),
         ({"value": 3}, "FreeEnergy quartic's value is 3, but must be a function"),
         ({"name": 3}, "FreeEnergy has the name 3, but must have a text"),
     ],
@@ -266,6 +270,27 @@ def test_free_energies_of_one_name_are_told_from_one_another():
 def test_what_is_no_free_energy_is_a_sentence(changes, said):
     with pytest.raises(InputError, match=said):
         replace(QUARTIC, **changes)
+
+
+def no_functions(precision, phases):
+    raise ValueError("not today")
+
+
+def functions_of_three(precision, phases):
+    return quartic_functions(precision, 3)
+
+
+@pytest.mark.parametrize(
+    ("functions", "said"),
+    [
+        (lambda precision, phases: 3, "quartic's functions must return an object .* but its gradient is None"),
+        (no_functions, r"FreeEnergy quartic's functions fail: ValueError: not today\.$"),
+        (functions_of_three, "quartic's functions cannot be compiled: .* and return a vector of 2 fractions"),
+    ],
+)
+def test_functions_that_are_none_of_a_free_energy_are_refused(functions, said):
+    with pytest.raises(InputError, match=said):
+        Simulation(two_layers(), free_energy=replace(QUARTIC, functions=functions))
 
 
 def test_a_loss_of_several_frames():

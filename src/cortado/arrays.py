@@ -1,6 +1,7 @@
 """Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from inspect import signature
 from numbers import Real
 from typing import Any
 
@@ -93,10 +94,28 @@ def whole_number(what: str, value: Any, least: int) -> int:
     return int(value)
 
 
-def require_function(what: str, value: object) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a function or None."""
+def require_function(what: str, value: Any, *arguments: str) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is None or a function of so many
+    arguments, which are described in words."""
     if value is not None and not callable(value):
         raise InputError(f"{what} is {shown(value)}, but must be a function, or be left out.")
+    if value is not None:
+        require_arguments(what, value, arguments)
+
+
+def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
+    """Raises `InputError` where a function does not take so many arguments, if Python can tell; ``other``: what else it
+    could be, in words."""
+    try:
+        takes = signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        takes.bind(*wanted)
+    except TypeError:
+        found = f"{what} takes the arguments {shown(str(takes))}"
+        number = f"{len(wanted)}: {', '.join(wanted)}" if wanted else "none"
+        raise InputError(f"{found}, but must take {number}{other}.") from None
 
 
 def require_truth(what: str, value: object) -> None:

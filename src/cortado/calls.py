@@ -1,25 +1,75 @@
-"""What users call says in a sentence which arguments a call lacks, or has that are none."""
+"""What users call says in a sentence which arguments a call lacks, has that are none, or has of another kind."""
 
-from collections.abc import Callable
-from functools import wraps
-from inspect import Parameter, signature
-from typing import Any, TypeVar
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, wraps
+from inspect import BoundArguments, Parameter, isclass, signature
+from numbers import Integral, Real
+from types import FunctionType, NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from cortado.errors import InputError
+from cortado.errors import CortadoError, InputError, shown
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
+_WORDS: dict[Any, str] = {
+    NoneType: "None",
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    os.PathLike: "a path",
+    Callable: "a function",
+    Mapping: "a table",
+    Iterable: "a list",
+}
+"""What sentences call the types of arguments; of a class that is not here, the first one that it is derived from."""
 
 
+def face(module: dict[str, Any]) -> Callable[[], list[str]]:
+    """The ``__dir__`` of a public module, whose names, in ``__all__``, are `public` from now on."""
+    names: list[str] = module["__all__"]
+    module.update({name: public(module[name]) for name in names})
+    return lambda: names
+
+
+def public(value: T) -> T:
+    """A function or a class of Cortado with its methods, `told`, wherever it is named; anything else as it is. A
+    decorator where public modules import the name late."""
+    if not str(getattr(value, "__module__", "")).startswith("cortado"):
+        return value
+    made: Any = value
+    if isinstance(value, FunctionType):
+        home, name = sys.modules[made.__module__], made.__name__
+        if getattr(home, name, None) is made:
+            setattr(home, name, told(made))
+        made = told(made)
+    for owner in made.__mro__ if isclass(made) and not getattr(made, "_is_protocol", False) else ():
+        if owner.__module__.startswith("cortado"):
+            for name, method in list(vars(owner).items()):
+                if name != "__init__" and name.startswith("_"):
+                    continue
+                if isinstance(method, FunctionType):
+                    setattr(owner, name, told(method))
+                elif isinstance(method, (classmethod, staticmethod)):
+                    setattr(owner, name, type(method)(told(method.__func__)))
+    return made
+
+
+@cache
 def told(function: F) -> F:
     """A function, or the ``__init__`` of a class, that raises an `InputError` for a call that does not fit it, where
-    Python has a `TypeError`."""
+    Python has a `TypeError`, and for an argument of another type than it has where that makes the call fail."""
+    if hasattr(function, "is_told"):
+        return function
     takes = signature(function)
     needed = [n for n, p in takes.parameters.items() if p.default is Parameter.empty and p.kind.name[:3] != "VAR"]
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         try:
-            takes.bind(*arguments, **named)
+            bound = takes.bind(*arguments, **named)
         except TypeError as problem:
             makes = function.__name__ == "__init__"
             name = type(arguments[0]).__name__ if makes else function.__qualname__
@@ -29,6 +79,80 @@ def told(function: F) -> F:
             written = [("**" if p.kind is Parameter.VAR_KEYWORD else "") + n for n, p in takes.parameters.items()]
             wanted = ", ".join(one for one in written if one != "self")
             raise InputError(f"{name} {found}, but must be called as {name}({wanted}).") from None
-        return function(*arguments, **named)
+        try:
+            return function(*arguments, **named)
+        except CortadoError:
+            raise
+        except Exception as problem:
+            if sentence := _misfit(function, bound):
+                raise InputError(sentence) from problem
+            raise
 
+    call.is_told = True  # type: ignore[attr-defined]
     return call  # type: ignore[return-value]
+
+
+def _misfit(function: Any, bound: BoundArguments) -> str | None:
+    """What to say of the first argument that is not of the type that the function has for it."""
+    try:
+        hints = get_type_hints(function)
+    except NameError:  # of types that are imported for the check of types alone
+        return None
+    for name, value in bound.arguments.items():
+        if name in hints and bound.signature.parameters[name].kind.name[:3] != "VAR" and not _fits(value, hints[name]):
+            return f"{name} is {shown(value)}, but must be {_words(hints[name])}."
+    return None
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type, as far as it can be told without going over what may be gone over once only."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return any(_fits(value, one) for one in inner)
+    if kind is Annotated:
+        return _fits(value, inner[0])
+    if kind is Literal:
+        return value in inner
+    if kind in (int, float):
+        return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    if kind is Any or not isclass(kind):  # or a type that a variable stands for
+        return True
+    if getattr(kind, "_is_protocol", False) and kind.__module__.startswith("cortado"):
+        members = [name for one in kind.__mro__ if getattr(one, "_is_protocol", False) for name in _members(one)]
+        return not isclass(value) and all(hasattr(value, name) for name in members)
+    if not isinstance(value, kind) or (isinstance(value, str) and issubclass(kind, Iterable)):
+        return kind is str and isinstance(value, str)
+    if kind is Callable and inner and isinstance(inner[0], list):
+        return _takes(value, len(inner[0]))
+    if inner and isinstance(value, Mapping):
+        return all(_fits(one, inner[-1]) for one in value.values())
+    return not (inner and isinstance(value, (list, tuple))) or all(_fits(one, inner[0]) for one in value)
+
+
+def _takes(function: Any, number: int) -> bool:
+    try:
+        signature(function).bind(*[None] * number)
+    except TypeError:
+        return False
+    except ValueError:  # of functions that Python knows nothing of
+        pass
+    return True
+
+
+def _members(protocol: type) -> list[str]:
+    return [name for name in (*vars(protocol), *protocol.__annotations__) if not name.startswith("_")]
+
+
+def _words(hint: Any) -> str:
+    """What a value of a type is called in a sentence."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return " or ".join(dict.fromkeys(map(_words, inner)))
+    if kind is Literal:
+        return " or ".join(map(repr, inner))
+    if kind is Annotated:
+        return _words(inner[0])
+    if kind is Callable and inner and isinstance(inner[0], list):
+        return f"a function of {len(inner[0])} arguments"
+    found = next((words for one, words in _WORDS.items() if isclass(kind) and issubclass(kind, one)), None)
+    return found or f"an object of the type {kind.__name__}"

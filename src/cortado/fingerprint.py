@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from cortado.code_words import code_words
 from cortado.losses import fingerprint
-from cortado.losses.code_words import code_words
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 from cortado.sph.free_energy import FREE_ENERGIES

@@ -1,5 +1,6 @@
 """Forces of one's own, each one function: given to ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
 
+from cortado.calls import face
 from cortado.sph.body import Body
 from cortado.sph.own_force import OverTime
 from cortado.sph.pair import Pair
@@ -7,6 +8,4 @@ from cortado.sph.rheology import Rheology
 
 __all__ = ["Body", "OverTime", "Pair", "Rheology"]
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

@@ -8,7 +8,7 @@ parameters are dictionaries by the names that `Problem` has. All functions are d
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from cortado.calls import told
+from cortado.calls import face
 from cortado.gradients import GradientEstimator
 from cortado.optimisation.layers import calls
 from cortado.optimisation.layers.with_jax import JaxBridge, jax
@@ -27,11 +27,6 @@ Arrays = Mapping[str, Any]
 _BRIDGE = JaxBridge()
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
-@told
 def state(
     simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, "jax.Array"]:
@@ -45,13 +40,11 @@ def state(
     return calls.state(_BRIDGE, simulation, given, parameters)
 
 
-@told
 def restart_state(simulation: Simulation, given: Arrays, parameters: Values | None = None) -> States:
     """The other way round: what `Simulation.run`, files and other processes take."""
     return calls.restart_state(_BRIDGE, simulation, given, parameters)
 
 
-@told
 def step(
     simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1
 ) -> dict[str, "jax.Array"]:
@@ -64,7 +57,6 @@ def step(
     return calls.step(_BRIDGE, simulation, given, parameters, steps)
 
 
-@told
 def rollout(
     simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1, record_every: int = 1
 ) -> dict[str, "jax.Array"]:
@@ -73,7 +65,6 @@ def rollout(
     return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
 
 
-@told
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "jax.Array"]:
     """The loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name, whose result is an array
     (), of a batch (batch,).
@@ -84,7 +75,6 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
     return calls.value(_BRIDGE, problem, gradient)
 
 
-@told
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Array"]:
     """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
     function ``reading(state, parameters=None)`` of arrays.
@@ -95,7 +85,6 @@ def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Ar
     return calls.measure(_BRIDGE, simulation, what)
 
 
-@told
 def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "jax.Array":
     """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
 
@@ -104,3 +93,6 @@ def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: 
     only. Raises `InputError` for what does not fit.
     """
     return calls.picture(_BRIDGE, renderer, positions, fractions, colours)
+
+
+__dir__ = face(globals())

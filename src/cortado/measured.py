@@ -1,5 +1,6 @@
 """What was measured of an experiment, for `cortado.fit`."""
 
+from cortado.calls import face
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observation import Direction, Observation
 from cortado.optimisation.fitting.sensor_series import SensorSeries
@@ -8,6 +9,4 @@ from cortado.optimisation.fitting.video import Video
 
 __all__ = ["Direction", "Experiment", "Observation", "SensorSeries", "Tracks", "Video"]
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

@@ -5,8 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_step_numbers, check_steps, require_function, require_methods, whole_number
-from cortado.calls import told
+from cortado.arrays import (
+    check_step_numbers,
+    check_steps,
+    require_arguments,
+    require_function,
+    require_methods,
+    whole_number,
+)
+from cortado.calls import public
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError, warn
 from cortado.fingerprint import fingerprint_of
@@ -22,7 +29,7 @@ from cortado.particles.state import State
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import Residual
 from cortado.rollout.restarts import one_for_each
-from cortado.rollout.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
+from cortado.rollout.rollout import MEMORY_BUDGET, OBSERVED, BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.trajectory import noted
@@ -37,6 +44,7 @@ KEPT = 2
 """Batches of a problem, of different sizes, that are kept for the next evaluation."""
 
 
+@public
 @fixed
 class Problem:
     """A simulation of a number of steps, judged by a loss.
@@ -104,7 +112,6 @@ class Problem:
         """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
-    @told
     def end(self, parameters: Values) -> Any:
         """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
         return self.states(parameters, [self.steps])[self.steps]
@@ -120,7 +127,6 @@ class Problem:
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
-    @told
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch with a
         first axis for the scenes."""
@@ -146,7 +152,7 @@ class Problem:
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
         go back through a run; `gradients.AdjointNorms` is such an observer.
         """
-        require_function("observe", observe)
+        require_function("observe", observe, *OBSERVED)
         found = estimate(self, parameters, gradient, observe)
         kept = slice(None) if self._going is None else self._going
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
@@ -202,6 +208,7 @@ class Problem:
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
+            require_arguments("observe", observe, OBSERVED)
             along.append((self._space.checked(directions, "direction"), observe))
         varied = {name for directions, _ in along for name in directions}
         ends = self._ends(values, check_step_numbers(steps, self.steps), keep=False, varied=varied)

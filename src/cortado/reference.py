@@ -1,5 +1,6 @@
 """The reference engine in C++, to judge gradients by: a distribution of its own, ``cortado-reference``."""
 
+from cortado.calls import face
 from cortado.errors import EngineMissingError
 
 try:
@@ -10,6 +11,4 @@ except ModuleNotFoundError as error:
         raise
     raise EngineMissingError from None
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

@@ -11,6 +11,7 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.arrays import whole_number
+from cortado.calls import public
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
@@ -58,6 +59,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Particles of all scenes in one launch, beyond which more of them are no faster."""
 
 
+@public
 @fixed
 class Simulation(Stepping, Measuring, Picturing):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.

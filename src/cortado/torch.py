@@ -8,7 +8,7 @@ differentiation go through all functions, `torch.vmap` too; second derivatives a
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from cortado.calls import told
+from cortado.calls import face
 from cortado.errors import InputError
 from cortado.gradients import GradientEstimator
 from cortado.optimisation.layers import calls
@@ -28,11 +28,6 @@ Tensors = Mapping[str, Any]
 _BRIDGE = TorchBridge()
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
-@told
 def state(
     simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, "torch.Tensor"]:
@@ -46,13 +41,11 @@ def state(
     return calls.state(_BRIDGE, simulation, given, parameters)
 
 
-@told
 def restart_state(simulation: Simulation, given: Tensors, parameters: Values | None = None) -> States:
     """The other way round: what `Simulation.run`, files and other processes take."""
     return calls.restart_state(_BRIDGE, simulation, given, parameters)
 
 
-@told
 def step(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1
 ) -> dict[str, "torch.Tensor"]:
@@ -64,7 +57,6 @@ def step(
     return calls.step(_BRIDGE, simulation, given, parameters, steps)
 
 
-@told
 def rollout(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1, record_every: int = 1
 ) -> dict[str, "torch.Tensor"]:
@@ -73,7 +65,6 @@ def rollout(
     return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
 
 
-@told
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "torch.Tensor"]:
     """The loss of a problem as a function ``loss(parameters, state=None)`` of tensors by name, whose result is a tensor
     (), of a batch (batch,).
@@ -84,7 +75,6 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
     return calls.value(_BRIDGE, problem, gradient)
 
 
-@told
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.Tensor"]:
     """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
     function ``reading(state, parameters=None)`` of tensors.
@@ -95,7 +85,6 @@ def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.
     return calls.measure(_BRIDGE, simulation, what)
 
 
-@told
 def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "torch.Tensor":
     """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
 
@@ -130,3 +119,6 @@ class Steps(torch.nn.Module):
 def _key(name: str) -> str:
     """What PyTorch calls a parameter, whose name may have a point."""
     return name.replace(".", "/")
+
+
+__dir__ = face(globals())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
-from cortado.calls import told
+from cortado.calls import public
 from cortado.certificate.alignment import Alignment, alignment
 from cortado.certificate.consistency import Consistency, balanced, check_consistency
 from cortado.certificate.growth import growth
@@ -139,7 +139,7 @@ class Certificate:
         return _plain(found)
 
 
-@told
+@public
 def certify(
     problem: Problem | Simulation | Scene | str | PathLike[str],
     parameters: Values | Sequence[str] = ("gravity",),

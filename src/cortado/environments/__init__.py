@@ -5,6 +5,7 @@ The import registers them, for ``gymnasium.make("cortado/Carry-v0")`` and ``gymn
 
 from typing import Any
 
+from cortado.calls import face
 from cortado.environments.catalogue import TASKS
 from cortado.environments.fluid_env import FluidEnv
 from cortado.environments.fluid_vector_env import FluidVectorEnv
@@ -13,10 +14,6 @@ from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 
 __all__ = ["FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
@@ -33,3 +30,5 @@ for _name, _task in TASKS.items():
         max_episode_steps=_task.horizon,
         kwargs={"task": _name},
     )
+
+__dir__ = face(globals())

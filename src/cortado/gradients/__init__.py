@@ -8,6 +8,7 @@ runs alone, is the reference that they are compared with.
 """
 
 from cortado.arrays import require_function, require_methods
+from cortado.calls import face
 from cortado.gradients.adjoint_filters import AdjointNorms
 from cortado.gradients.ensemble import EnsembleMean, RandomizedSmoothing
 from cortado.gradients.estimator import (
@@ -24,7 +25,7 @@ from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
 from cortado.gradients.guided import Guided
 from cortado.gradients.implicit import ImplicitPressure
-from cortado.rollout.rollout import Observer
+from cortado.rollout.rollout import OBSERVED, Observer
 from cortado.scene.parameters.values import Values
 
 __all__ = [
@@ -48,10 +49,6 @@ __all__ = [
 ]
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def estimate(
     problem: Differentiable,
     parameters: Values,
@@ -63,6 +60,9 @@ def estimate(
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """
     require_methods("problem", problem, ("value",), "a cortado.Problem")
-    require_function("observe", observe)
+    require_function("observe", observe, *OBSERVED)
     chosen = checked_estimator(Exact() if estimator is None else estimator)
     return checked_estimate(chosen.estimate(problem, parameters, observe), parameters, problem.simulation.batch)
+
+
+__dir__ = face(globals())

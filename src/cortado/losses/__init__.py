@@ -1,5 +1,6 @@
 """What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
 
+from cortado.calls import face
 from cortado.losses.batch import SnapshotBatch
 from cortado.losses.centre_of_mass import CentreOfMass, CentreOfMassAlong
 from cortado.losses.image import Image
@@ -26,6 +27,4 @@ __all__ = [
     "fingerprint",
 ]
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

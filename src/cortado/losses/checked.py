@@ -1,17 +1,17 @@
 """A user's loss, in whatever form it comes, with a sentence where it cannot be used or gives what cannot be used."""
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.arrays import as_numbers, as_one_number
-from cortado.errors import InputError, shown
+from cortado.arrays import as_numbers, as_one_number, require_arguments
+from cortado.errors import InputError
 from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.losses.batch import BatchedLoss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
+from cortado.losses.recorded import LAUNCHED
 from cortado.particles.state import State
 from cortado.scene.quantities import check_readable
 
@@ -73,28 +73,13 @@ def as_loss(loss: Any) -> Loss:
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
     if derivative is not None and hasattr(loss, "value"):
         for name in ("value", derivative):
-            _require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
+            require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
         return CheckedBatchedLoss(loss) if isinstance(loss, BatchedLoss) else CheckedLoss(loss)
     if not callable(loss):
         raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
-    arguments = ("positions", "velocities", "an array for the loss")
     other = ", of Warp arrays; a loss of the end of a trajectory is an object with value(end) and adjoint(end)"
-    _require_arguments("loss", loss, arguments, other)
+    require_arguments("loss", loss, LAUNCHED, other)
     return CheckedLoss(Recorded(loss))
-
-
-def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """An `InputError` where a function does not take so many arguments, if Python can tell; ``other``: what else the
-    loss could be, in words."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return
-    try:
-        signature.bind(*wanted)
-    except TypeError:
-        found = f"{what} takes the arguments {shown(str(signature))}"
-        raise InputError(f"{found}, but must take {len(wanted)}: {', '.join(wanted)}{other}.") from None
 
 
 def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:

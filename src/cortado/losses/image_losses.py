@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.arrays import as_numbers, require_whole
+from cortado.calls import face
 from cortado.errors import InputError
 
 __all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
@@ -169,5 +170,4 @@ def _difference(image: ArrayLike, target: ArrayLike) -> Image:
     return image - target
 
 
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

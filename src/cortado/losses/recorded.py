@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import require_methods
+from cortado.arrays import require_arguments, require_methods
+from cortado.code_words import code_words
 from cortado.device.threads import WARP
 from cortado.fixed import fixed
-from cortado.losses.code_words import code_words
 from cortado.losses.loss import Adjoint, Snapshot
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
+LAUNCHED = "positions", "velocities", "an array for the loss"
+"""Its arguments, in words."""
 
 
 @fixed
@@ -26,6 +28,7 @@ class Recorded:
 
     def __init__(self, function: WarpFunction):
         require_methods("function", function, ("__call__",), "a function of positions, velocities and a loss")
+        require_arguments("function", function, LAUNCHED)
         self.function = function
 
     @property

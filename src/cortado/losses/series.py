@@ -22,9 +22,9 @@ class SensorMatch:
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
         """``target`` (k,), a number for each column of the sensor, NaN for one that does not count; ``weight`` of the
         sum; ``scale``, a number or (k,)."""
-        self.sensor, self.weight = checked_sensor(sensor), float(weight)
-        self.target = np.atleast_1d(np.array(target, dtype=np.float64))
-        self.scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), self.target.shape)
+        self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
+        self.target = np.atleast_1d(read_only("target", target))
+        self.scale = np.broadcast_to(as_numbers("scale", scale), self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
         self.fingerprint = sha256(f"{sensor!r} {self.weight!r}".encode() + arrays).hexdigest()
         """Tells one target from another, for checkpoints."""

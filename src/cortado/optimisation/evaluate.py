@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from cortado.arrays import as_one_number, require_function, require_methods, require_table
-from cortado.calls import told
+from cortado.calls import public
 from cortado.device.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.errors import InputError, shown, warn
 from cortado.gradients import Estimate, GradientEstimator
@@ -15,7 +15,7 @@ from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
 
-@told
+@public
 def evaluate(
     problem: Differentiable,
     points: Iterable[Values],
@@ -41,7 +41,7 @@ def evaluate(
     Raises the error of the first point that has another one; and that of the first point where no point has a run,
     unless they are given a loss.
     """
-    require_function("on_result", on_result)
+    require_function("on_result", on_result, "the number of a point", "its Estimate")
     require_methods("problem", problem, ("value",), "a cortado.Problem")
     if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import require_function, require_truth
-from cortado.calls import told
+from cortado.calls import public
 from cortado.errors import InputError
 from cortado.files.input_files import as_path
 from cortado.gradients.left_out import tallied
@@ -27,7 +27,7 @@ from cortado.optimisation.start import checked_bounds, checked_start, require_co
 from cortado.words import counted
 
 
-@told
+@public
 def optimise(
     problem: Optimisable | LossFunction,
     start: Mapping[str, Any],
@@ -72,7 +72,7 @@ def optimise(
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)
-    require_function("on_iteration", on_iteration)
+    require_function("on_iteration", on_iteration, "a record of the iteration")
     require_truth("resume", resume)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)

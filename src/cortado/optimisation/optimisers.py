@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
+from cortado.calls import face
 from cortado.device.memory import require
 from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
@@ -259,5 +260,4 @@ def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vect
     return float(np.max(np.abs(np.where(outwards, 0.0, scale * gradient))))
 
 
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

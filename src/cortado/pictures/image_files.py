@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.calls import public
 from cortado.device.memory import require
 from cortado.errors import InputError, warn
 from cortado.files.atomic import write_atomically
@@ -50,6 +51,7 @@ LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
 """Linear light of every value in a file."""
 
 
+@public
 def heart(
     resolution: Resolution,
     *,
@@ -71,6 +73,7 @@ def heart(
     return _drawn(_in_heart, resolution, cup, size, (milk, coffee, background))
 
 
+@public
 def rosetta(
     resolution: Resolution,
     *,
@@ -87,6 +90,7 @@ def rosetta(
     return _drawn(_in_rosetta, resolution, cup, size, (milk, coffee, background))
 
 
+@public
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
     """The picture of a file of one of `FORMATS`, transparent parts on white.
 
@@ -163,6 +167,7 @@ def _too_many(path: str | Path, found: str, most: int) -> InputError:
     return InputError(f"The picture {path} has {found}, but must have at most {most} of them; save it smaller.")
 
 
+@public
 def write_picture(path: str | Path, image: ArrayLike) -> Path:
     """Writes a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and returns its path.
 

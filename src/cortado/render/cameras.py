@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number, is_whole
+from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 
@@ -92,6 +93,7 @@ class Camera:
         return replace(self, position=tuple(position), look_at=tuple(look_at), up=tuple(turn @ self.up))
 
 
+@public
 @dataclass(frozen=True)
 class Orthographic(Camera):
     """Parallel rays."""
@@ -108,6 +110,7 @@ class Orthographic(Camera):
         return 0.5 * self.width, 0.0
 
 
+@public
 @dataclass(frozen=True)
 class Perspective(Camera):
     """Rays from one point."""

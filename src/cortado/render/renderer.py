@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
+from cortado.calls import public
 from cortado.device.kernel_cache import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
@@ -40,6 +41,7 @@ class RenderAdjoint:
     """(3,) with respect to a rotation vector that turns the camera about its position [1 / rad]."""
 
 
+@public
 @fixed
 class Renderer:
     """Renders a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.

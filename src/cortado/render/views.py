@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from cortado.arrays import is_whole
+from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 from cortado.render.cameras import Camera, Orthographic, Vector, check_resolution, positive, vector
@@ -31,6 +32,7 @@ class View(Protocol):
         ...
 
 
+@public
 @dataclass(frozen=True)
 class Volume:
     """Fluid that one can look into, from any camera."""
@@ -46,6 +48,7 @@ class Volume:
         object.__setattr__(self, "background", vector("background", self.background))
 
 
+@public
 @dataclass(frozen=True)
 class TopView:
     """The colour at the free surface from above, as who pours latte art sees it.

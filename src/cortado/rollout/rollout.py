@@ -35,6 +35,8 @@ MEMORY_BUDGET = 8 * 2**30
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
+OBSERVED = "a number of steps", "a state"
+"""Its arguments, in words."""
 
 
 class BackwardStep(Protocol):

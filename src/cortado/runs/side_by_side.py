@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.calls import told
+from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
 from cortado.files.input_files import as_path
@@ -32,7 +32,7 @@ from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
 
 
-@told
+@public
 def film_side_by_side(
     runs: Mapping[str, Trajectory] | Iterable[Trajectory],
     path: str | Path,

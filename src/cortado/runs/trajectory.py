@@ -12,6 +12,7 @@ from typing import Any, Self, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
@@ -30,6 +31,7 @@ SUFFIXES = (".vtkhdf", ".hdf")
 """By which ParaView knows a trajectory."""
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Trajectory(Showing):
     """What a run leaves: recorded frames, and what the solver noted of every step.

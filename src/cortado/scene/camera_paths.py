@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.scene.fields import FieldPath, Length, Text, field_error, quantity
 from cortado.scene.tables import Table
@@ -58,6 +59,7 @@ class CameraPath(Table):
         """Raise the error of this table, at a path, if no solid of these names is the one that it names."""
 
 
+@public
 class Orbit(CameraPath):
     """Around what it looks at, at its height and its distance."""
 
@@ -74,6 +76,7 @@ class Orbit(CameraPath):
         return View(home.look_at + turn.apply(home.eye - home.look_at), home.look_at)
 
 
+@public
 class Dolly(CameraPath):
     """Straight towards what it looks at, or away from it, beginning and ending gently."""
 
@@ -87,6 +90,7 @@ class Dolly(CameraPath):
         return View(home.look_at + factor * (home.eye - home.look_at), home.look_at)
 
 
+@public
 class Keyframes(CameraPath):
     """Through places at given times of the run, on a smooth curve."""
 
@@ -120,6 +124,7 @@ class Keyframes(CameraPath):
         return np.asarray(PchipInterpolator(self.times, rows)(np.clip(time, self.times[0], self.times[-1])))
 
 
+@public
 class Follow(CameraPath):
     """Beside a solid, in its middle the picture's, as far off as the camera is at home."""
 

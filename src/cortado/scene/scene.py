@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import model_validator
 
 from cortado.arrays import as_one_number
-from cortado.calls import told
+from cortado.calls import public
 from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
@@ -32,6 +32,7 @@ HEAVIEST = {2: 3e5, 3: 3e6}
 """By the dimension, the mass of fluid above which a scene warns [kg]: that of water 30 m x 10 m, and 10 m deep."""
 
 
+@public
 class Scene(SceneTables):
     """Everything that a simulation starts from: `SceneTables` that fit each other."""
 
@@ -153,7 +154,7 @@ def _given(value: Any) -> Any:
     return [_given(entry) for entry in value] if isinstance(value, list) else value
 
 
-@told
+@public
 def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scene:
     """Read a scene from a TOML file.
 

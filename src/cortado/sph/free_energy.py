@@ -22,8 +22,11 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_one_number, require_function
+from cortado.code_words import code_words
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
+from cortado.sph.formula import compiled
 
 FLOOR = 1e-3
 """delta of the degenerate mobility."""
@@ -46,10 +49,32 @@ class FreeEnergy:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise InputError(f"FreeEnergy has the name {shown(self.name)}, but must have a text.")
-        for what in ("value", "functions"):
-            require_function(f"FreeEnergy {self.name}'s {what}", getattr(self, what))
+        require_function(f"FreeEnergy {self.name}'s value", self.value, "fractions (n, phases)")
+        require_function(f"FreeEnergy {self.name}'s functions", self.functions, "a precision", "a number of phases")
         if not 0.0 <= as_one_number(f"FreeEnergy {self.name}'s curvature", self.curvature) < np.inf:
             raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
+
+    def check(self, precision: Precision, phases: int, device: Any) -> None:
+        """Raises `InputError` where its ``functions`` fail, or return no functions of so many fractions."""
+        what = f"FreeEnergy {self.name}'s functions"
+        try:
+            found = self.functions(precision, phases)
+        except Exception as problem:
+            reason = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
+            raise InputError(f"{what} fail: {reason}.") from problem
+        for name in ("gradient", "hessian_product"):
+            if not isinstance(given := getattr(found, name, None), wp.Function):
+                wanted = "an object whose gradient and hessian_product are functions under wp.func"
+                raise InputError(f"{what} must return {wanted}, but its {name} is {shown(given)}.")
+        fractions, module = precision.fractions(phases), kernel_module(f"free_energy_{code_words(self.functions)}")
+        gradient, hessian_product = found.gradient, found.hessian_product
+
+        @wp.kernel(module=module)
+        def trial(c: wp.array(dtype=fractions), found: wp.array(dtype=fractions)):
+            i = wp.tid()
+            found[i] = gradient(c[i]) + hessian_product(c[i], c[i])
+
+        compiled(what, module, device, f"vector of {phases} fractions")
 
 
 @dataclass(frozen=True)

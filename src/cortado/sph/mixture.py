@@ -11,6 +11,7 @@ import warp as wp
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.state import Layout, State
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
+from cortado.sph.free_energy import FREE_ENERGIES
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -42,6 +43,8 @@ class Mixture(Part):
         self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
         """What it carries from step to step: one phase stays what it is."""
         self.kernels = mixture_kernels(layout.precision, phases.count, requires_grad)
+        if phases.diffusion and phases.diffusion.energy not in FREE_ENERGIES.values():
+            phases.diffusion.energy.check(layout.precision, phases.count, layout.device)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
         """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""

@@ -4,12 +4,11 @@
 any number of machines; `local_workers` starts some on this one, such as one for each GPU.
 """
 
+from cortado.calls import face
 from cortado.device.executors.distributed import Distributed
 from cortado.device.executors.executor import Executor, InProcess
 from cortado.device.executors.local import local_workers
 
 __all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import require_function, require_table, whole_number
-from cortado.calls import told
+from cortado.calls import public
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.optimisation.fitting.bar_slopes import over_the_bars
 from cortado.optimisation.fitting.causes import dear_causes
@@ -28,7 +28,7 @@ ROUGHLY = 1e-3
 """Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
 
 
-@told
+@public
 def fit(
     experiments: Experiment | Sequence[Experiment],
     start: Mapping[str, Any],

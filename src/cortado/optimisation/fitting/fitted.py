@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_one_number
+from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
@@ -103,6 +104,7 @@ class Tried:
     """The logarithm of the size of the residuals there, the mean over all numbers that were measured."""
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters that were fitted to experiments, with their error bars."""

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cortado.arrays import as_one_number, read_only
+from cortado.arrays import as_numbers, as_one_number, read_only
 from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
 from cortado.scene.parameters.values import Arrays
@@ -136,9 +136,10 @@ class Measurement:
     noise: float | None = field(default=None)
 
     @classmethod
-    def of(cls, times: Any, measured: Any, noise: Any) -> "Measurement":
-        """Raises `InputError` for what cannot be fitted."""
-        moments, values = read_only("times", times), read_only("measured", measured)
+    def of(cls, times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> "Measurement":
+        """Raises `InputError` for what cannot be fitted. ``clock`` [s] is added to the times."""
+        moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
+        values = read_only("measured", measured)
         if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
             found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
             raise InputError(

@@ -46,7 +46,7 @@ class SensorSeries:
         if len({known[name] for name in names}) > 1:
             raise InputError(f"columns are {', '.join(names)}, but must be of one unit: give each unit a series.")
         self.start = clock_of(calibrate, clock)
-        own = Measurement.of(np.asarray(times) + clock, array, noise)
+        own = Measurement.of(times, array, noise, clock)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
         self.unit, self.columns = known[names[0]], tuple(names)
         self._picked = np.array([list(known).index(name) for name in names])

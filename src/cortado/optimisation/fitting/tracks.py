@@ -52,7 +52,7 @@ class Tracks:
         if places.shape[1:] != begun.shape:
             raise InputError(f"positions has shape {places.shape}, but must be (frames, {tracers}, {d}).")
         self.start = clock_of(calibrate, clock)
-        own = Measurement.of(np.asarray(times) + clock, places.reshape(len(places), -1), noise)
+        own = Measurement.of(times, places.reshape(len(places), -1), noise, clock)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
         x, domain = simulation.positions, simulation.lattice.domain
         support, period = simulation.scene.discretisation.support_radius, np.array(domain.lengths)

@@ -47,7 +47,7 @@ class Video:
         if inside.shape != (rows, columns) or not inside.any():
             raise InputError(f"mask has shape {inside.shape}, but must be {(rows, columns)} and true somewhere.")
         self.renderer, self.mask = renderer, inside
-        own = Measurement.of(np.asarray(times) + clock, pictures[:, inside].reshape(len(pictures), -1), noise)
+        own = Measurement.of(times, pictures[:, inside].reshape(len(pictures), -1), noise, clock)
         self.times, self.measured, self.noise = own.times, own.measured, own.noise
         self.calibration = Calibration(renderer.view, tuple(name for name in calibrate if name != CLOCK))
         self._clock = clock_of(calibrate, clock)

@@ -1,5 +1,6 @@
 """What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid."""
 
+from cortado.calls import face
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.log import Readings
 from cortado.runs.sensors.pressure_probe import PressureProbe
@@ -10,6 +11,4 @@ from cortado.runs.sensors.wave_gauge import WaveGauge
 
 __all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "WallForce", "WaveGauge"]
 
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = face(globals())
