@@ -82,6 +82,14 @@ MISTAKES = {
     "no value": (lambda: as_loss(Given(None)).value(END), "the loss's value is None"),
     "an array as value": (lambda: as_loss(Given(np.ones(3))).value(END), r"shape \(3,\), but must be one number"),
     "a complex value": (lambda: as_loss(Given(1j)).value(END), "the loss's value is 1j"),
+    "an adjoint that is not finite": (
+        lambda: adjoint_of(a_pair(np.diag([1.0, np.nan, 1.0, 1.0, 1.0])[:, :2])),
+        r"adjoint of positions has a value in row 1 that is not finite, but must be made of numbers\.$",
+    ),
+    "one of a quantity": (
+        lambda: adjoint_of({"velocities": np.full((N, 2), np.inf)}),
+        "of velocities has a value in row 0",
+    ),
     "no adjoint": (lambda: adjoint_of(None), "is a NoneType"),
     "one array": (lambda: adjoint_of(np.ones((N, 2))), "is a ndarray"),
     "one array in a tuple": (

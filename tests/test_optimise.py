@@ -240,6 +240,22 @@ def test_a_loss_that_stays_may_be_in_a_wrong_valley(optimiser):
     assert not right.stays and "valley" not in right.message
 
 
+@pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
+def test_a_search_that_ends_at_its_bound_names_the_bound(optimiser):
+    """And no valley; one that only began there, or that bounds do not hold, says nothing of bounds."""
+
+    def far(parameters):
+        x, y = parameters["x"], parameters["y"]
+        return float(((x - 9.0) ** 2).sum() + y**2), {"x": 2.0 * (x - 9.0), "y": 2.0 * y}
+
+    bounds = {"x": (-1.0, 1.0), "y": (0.0, 5.0)}
+    held = optimise(far, {"x": np.zeros(2), "y": 4.0}, optimiser, 60, bounds=bounds)
+    assert "x is at a bound, beyond which the loss falls further: widen" in held.message
+    assert not held.stays and "valley" not in held.message
+    free = optimise(far, {"x": np.full(2, -1.0), "y": 4.0}, optimiser, 60, bounds={**bounds, "x": (-1.0, 20.0)})
+    assert "bound" not in free.message
+
+
 def test_lbfgs_converges_only_where_its_gradient_is_small():
     def stairs(parameters):
         return float(np.round(parameters["x"])) + 1.0, {"x": 1.0}

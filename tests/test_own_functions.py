@@ -346,9 +346,47 @@ def helped_part(x, v, k):
     return k * flattened(x)
 
 
+def again(x, v):
+    return again(x, v)
+
+
+@wp.func
+def helping_itself(r: wp.float64):
+    return helping_itself(r)
+
+
+def with_helping_itself(x, v):
+    return helping_itself(x[0]) * v
+
+
+async def waiting(x, v):
+    return x
+
+
+def yielding(x, v):
+    yield x
+
+
+def slower(x, v):
+    if v < x:
+        return v
+    return x
+
+
+def away(x, v, centre):
+    d = centre - x
+    return v if d else x
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
+        (lambda: Body(again), "Body function again calls itself, which Warp cannot"),
+        (lambda: Body(with_helping_itself), "helping_itself that Body function with_helping_itself calls calls itself"),
+        (lambda: Body(waiting), "Body function waiting waits or yields, but must be made by def"),
+        (lambda: Body(yielding), "Body function yielding waits or yields, but must be made by def"),
+        (lambda: Body(slower), "Body function slower compares v, which is a vector, but must compare numbers"),
+        (lambda: Body(away, centre=AWAY), "Body function away compares d, which is a vector"),
         (lambda: Body(3.0), "Body has 3.0, but must have a function, made by def"),
         (
             lambda: Body(lambda x, v, k: -k * v, k=1.0),

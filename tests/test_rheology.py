@@ -11,6 +11,7 @@ import warp as wp
 
 import cortado
 from cortado import InputError, Problem, SceneError, Simulation, losses
+from cortado.errors import OutOfRangeError
 from cortado.forces import OverTime, Rheology
 from cortado.sph.laws import LAWS, bingham, carreau, herschel_bulkley, power_law
 from scenes import HONEY, plane
@@ -212,6 +213,43 @@ def in_time(shear_rate, viscosity, t, slope):
 def test_a_law_that_is_negative_or_not_finite_is_refused(law, said):
     with pytest.raises(InputError, match=said):
         Simulation(thick(), precision="float64", forces=[law()])
+
+
+def swirled(shear_rate, viscosity, t, swirl, slope):
+    return viscosity + swirl[0] + swirl[1] - slope * t
+
+
+BENT = {"swirl": [0.1, 0.2], "slope": OverTime([0.0, 1.0], [0.0, 0.0])}
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            {"beyond.slope": 1e-4},
+            r"beyond returns -\d.* Pa s at a shear rate of 1\.\d*e\+04 1/s, for the viscosity of h",
+        ),
+        ({"viscosity": 1e-9, "beyond.slope": 1e-9}, r"beyond returns -\d.* for the viscosity of honey, 1e-09 Pa s"),
+        ({"swirled.swirl": [-2.0, 0.0]}, "swirled returns -0.5 Pa s"),
+        ({"swirled.slope": np.array([0.0] * 4 + [1e3] * 4)}, r"swirled returns -\d"),
+    ],
+)
+def test_values_that_come_later_make_a_law_that_is_tried(values, said):
+    """Of a run, and in a search, whose trial steps with them are refused; those of a batch say which scene."""
+    name = next(one for one in values if "." in one)
+    made = Rheology(beyond, slope=0.0) if name.startswith("beyond") else Rheology(swirled, **BENT)
+    judged = problem(thick(), forces=[made])
+    assert np.isfinite(judged.value({name: judged.simulation.parameters()[name]}))
+    with pytest.raises(OutOfRangeError, match=said):
+        judged.simulation.run(STEPS, values)
+    with pytest.raises(OutOfRangeError, match=said):
+        judged.value(values)
+
+
+def test_a_search_refuses_a_law_that_is_none_and_goes_on():
+    judged = problem(thick(), forces=[Rheology(swirled, swirl=[0.0, 0.0], slope=0.0)])
+    found = cortado.optimise(judged, {"swirled.swirl": [0.0, 0.0]}, "adam", 3, learning_rate=2.0)
+    assert found.refused and np.isfinite(found.loss)
 
 
 def test_a_law_that_a_scene_names_is_tried_too():

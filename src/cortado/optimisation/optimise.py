@@ -102,7 +102,8 @@ def optimise(
         )
         outcome = algorithm.minimise(search)
     best, is_run = min(evaluator.history, key=lambda record: record.loss), hasattr(problem, "simulation")
-    doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run)
+    held = evaluator.promises.held(lower, upper, layout)
+    doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run, held)
     ended = outcome.message.replace(" converged ", " ended ") if doubt.misled else outcome.message
     return Result(
         parameters=_copied(best.parameters),

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.gradients import Exact
 from cortado.optimisation.line_search import LineSearch
-from cortado.optimisation.replay_log import LoggedEvaluation
+from cortado.optimisation.replay_log import LoggedEvaluation, ParameterLayout, Vector
 
 WRONG = 10.0
 """A step contradicts its gradients if it changed the loss by less than the smaller promise of both its ends over this,
@@ -38,6 +38,7 @@ class Promises:
     steps: list[tuple[float, float, float]] = field(default_factory=list, repr=False)
     """Of each step the change of the loss by the slope at its first end, by that at its last, and the change."""
     _last: LoggedEvaluation | None = field(default=None, repr=False)
+    _best: LoggedEvaluation | None = field(default=None, repr=False)
 
     def note(self, evaluation: LoggedEvaluation) -> None:
         """The next evaluation."""
@@ -48,6 +49,18 @@ class Promises:
             self.steps.append((*promised, evaluation.loss - self._last.loss))
         self.losses.append(evaluation.loss)
         self._last = evaluation
+        if self._best is None or evaluation.loss < self._best.loss:
+            self._best = evaluation
+
+    def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
+        """A sentence that names parameters whose bounds keep the lowest loss from falling further; empty without."""
+        if self._best is None:
+            return ""
+        best, gradient = self._best.parameters, self._best.gradient
+        outwards = ((best <= lower) & (gradient > 0.0)) | ((best >= upper) & (gradient < 0.0))
+        names = [name for name, marks in layout.unravel(np.where(outwards, 1.0, 0.0)).items() if marks.any()]
+        found = " and ".join(names) + (" is at a bound" if len(names) == 1 else " are at bounds")
+        return f" {found}, beyond which the loss falls further: widen them, if that makes sense." if names else ""
 
     @property
     def kept(self) -> tuple[int, int]:
@@ -72,11 +85,12 @@ class Promises:
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
 
-    def doubt(self, estimator: object, optimiser: object, converged: bool, is_run: bool) -> "Doubt":
+    def doubt(self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str = "") -> "Doubt":
         """Of a search by an ``estimator``, None for that of the problem, and an ``optimiser`` whose own test may be
-        met; ``is_run``: of runs of a simulation. A line search bears estimators whose sizes are wrong."""
+        met; ``is_run``: of runs of a simulation; ``held``: what `held` says. A line search bears estimators whose sizes
+        are wrong."""
         by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
-        misled, stays = self.misled and (is_exact or not by_direction), self.stays(converged)
+        misled, stays = self.misled and (is_exact or not by_direction), not held and self.stays(converged)
         to_try = ["another start"]
         if misled:
             broken, told = self.kept
@@ -95,7 +109,7 @@ class Promises:
                 said += f" Try {', or '.join(to_try)}; or {pair}, where certify says that the exact one is of no use."
                 return Doubt(misled, stays, said)
         else:
-            return Doubt(misled, stays, "")
+            return Doubt(misled, stays, held)
         to_try += [] if by_direction else ["the optimiser LineSearch, which steps over dents"]
         return Doubt(misled, stays, f"{said} Try {', or '.join(to_try)}.")
 

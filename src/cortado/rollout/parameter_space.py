@@ -309,6 +309,9 @@ class ParameterSpace:
         try:
             check_places(values, simulation.scene, simulation.free_particles)
             crowded = self._first_positions.check(values, number)
+            for maker in simulation.forces:
+                if hasattr(maker, "check"):
+                    maker.check(values, simulation)
         except InputError as error:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error

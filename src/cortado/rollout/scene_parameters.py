@@ -3,6 +3,7 @@
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
 """
 
+from collections.abc import Sequence
 from typing import Protocol
 from weakref import WeakSet
 
@@ -26,6 +27,7 @@ from cortado.scene.parameters.reference_density import (
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays, scene_values
 from cortado.scene.restart import Clock, RestartState
+from cortado.sph.makers import ForceMaker
 
 DENSITY = "reference_density"
 """The field of a state that the first mass fractions and the rest densities decide."""
@@ -39,6 +41,8 @@ class Simulated(Source, Protocol):
     """The first state, on the device."""
     known: Known
     """Its parameters."""
+    forces: Sequence[ForceMaker]
+    """What makes the forces that are not Cortado's own."""
     judged_states: WeakSet[RestartState]
     """Those that need not be judged again, as nobody can change them."""
     batch: int | None

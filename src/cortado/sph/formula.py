@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import FunctionType, MappingProxyType
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
@@ -15,7 +16,7 @@ from cortado.sph.frozen import Frozen
 from cortado.sph.function_source import definition
 from cortado.sph.function_text import DerivativeCheck, check_names, check_returns
 from cortado.sph.in_precision import REAL, VECTOR, InPrecision
-from cortado.sph.meaning_checks import check_calls, check_helper, check_truths
+from cortado.sph.meaning_checks import check_calls, check_helper, check_truths, check_vectors
 from cortado.sph.python_meaning import meanings
 
 
@@ -90,6 +91,8 @@ def formula(
     check_names(what, written, own, frozen.scope)
     check_calls(what, written, own, frozen.scope)
     check_truths(what, written)
+    given = inputs[:2] if INPUTS[kind].kind == "vector" else ()
+    check_vectors(what, written, {*given, *(name for name, value in values.items() if np.ndim(value))})
     rewritten = InPrecision(what, frozen.scope, own).visit(ast.Module([written], []))
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
     scope = MappingProxyType(frozen.scope)

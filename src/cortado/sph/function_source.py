@@ -25,6 +25,8 @@ def plain_function(kind: str, function: Any) -> FunctionType:
     if not isinstance(plain, FunctionType):
         raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
     check_bare(f"{kind} function {plain.__name__}", plain)
+    if plain.__code__.co_flags & (inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR):
+        raise InputError(f"{kind} function {plain.__name__} waits or yields, but must be made by def, and return.")
     return plain
 
 
@@ -65,6 +67,8 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
         found.args.defaults, found.args.kw_defaults = [], [None] * len(found.args.kwonlyargs)
         for argument in found.args.args:
             argument.annotation = None
+        if any(isinstance(one, ast.Call) and ast.unparse(one.func) == found.name for one in ast.walk(found)):
+            raise InputError(f"{what} calls itself, which Warp cannot, but must have its result without that.")
         if found.name == function.__code__.co_name and _same(_compiled(found, function.__code__), function.__code__):
             return found
     raise InputError(

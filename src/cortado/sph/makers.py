@@ -19,7 +19,8 @@ class ForceMaker(Protocol):
     """Makes a force for each solver of a simulation that is given it, and says which parameters the force has.
 
     It is pickled with the simulation. A ``fingerprint``, a text, tells it from others, so that a search is not resumed
-    with another force; without one its type and its attributes do.
+    with another force; without one its type and its attributes do. A method ``check(values, simulation)`` raises an
+    `InputError` for values of parameters, by name, with which there can be no run.
     """
 
     parameters: Sequence[Parameter]

@@ -1,9 +1,13 @@
 """Generalised Newtonian fluids: viscosity as a stress with a law that is one function of a user's."""
 
+from typing import Any
+
 import numpy as np
 
+from cortado.device.precision import Precision
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
+from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.law_trial import check_law
@@ -26,22 +30,45 @@ class Rheology(OwnFunction):
         """The viscous force with this law; raises `InputError` for a function that Warp cannot compile, or that returns
         a viscosity that is negative or not finite."""
         check_form(setting.scene)
-        ranks = tuple(p.rank for p in self.parameters)
-        law = Law(self._formula, ranks, topic("rheology", self._formula, ranks, setting.scene.dimension) + "_")
-        made = stress_of(setting.scene)(setting, law, self.parameters)
-        what, layout = f"{self.kind} function {self._formula.name}", setting.layout
-        made.compile(what)
-        viscosities = {phase.name: phase.viscosity for phase in setting.scene.phase}
-        check_law(what, law, viscosities, self._thetas(), layout.precision, layout.device)
+        made = stress_of(setting.scene)(setting, self._law(setting.scene), self.parameters)
+        made.compile(self._what)
+        self._try({}, setting.scene, setting.layout.precision, setting.layout.device)
         return made
 
-    def _thetas(self) -> np.ndarray:
-        """(k, numbers) what the function's parameters are, at every time at which one of them changes."""
-        times = np.unique([0.0, *(t for v in self._values.values() if isinstance(v, OverTime) for t in v.times)])
+    def check(self, values: Arrays, simulation: Any) -> None:
+        """Raises `InputError` where the law returns what is no viscosity with these values of parameters, by name."""
+        if "viscosity" in values or any(one.name in values for one in self.parameters):
+            self._try(values, simulation.scene, simulation.precision, simulation.device)
+
+    @property
+    def _what(self) -> str:
+        return f"{self.kind} function {self._formula.name}"
+
+    def _law(self, scene: Scene) -> Law:
+        ranks = tuple(p.rank for p in self.parameters)
+        return Law(self._formula, ranks, topic("rheology", self._formula, ranks, scene.dimension) + "_")
+
+    def _try(self, values: Arrays, scene: Scene, precision: Precision, device: Any) -> None:
+        own = np.broadcast_to(values.get("viscosity", [phase.viscosity for phase in scene.phase]), len(scene.phase))
+        viscosities = {phase.name: float(value) for phase, value in zip(scene.phase, own, strict=True)}
+        size = values.get("time_step", scene.solver.time_step)
+        thetas = self._thetas(values, 0.0 if isinstance(size, str) else float(size))
+        check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
+
+    def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
+        """(k, numbers) what the function's parameters are, with these values, at every time at which one of them
+        changes: with a row for each step, at the beginning of each."""
+        known = {one.name: one for one in self.parameters}
+        own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
+        steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)
+        changes = [t for v in own.values() if isinstance(v, OverTime) for t in v.times]
+        times = time_step * np.arange(steps) if steps else np.unique([0.0, *changes])
         columns = [times] if len(self._formula.inputs) == 3 else []
-        for value in self._values.values():
-            rows = value.at(times) if isinstance(value, OverTime) else np.stack([value] * len(times))
-            columns += [padded(rows)] if rows.ndim == 2 else [rows]
+        for name, value in own.items():
+            found = value.at(times) if isinstance(value, OverTime) else value
+            is_vector = known[f"{self.name}.{name}"].rank
+            rows = np.broadcast_to(found, (len(times), *found.shape[-1:] * is_vector))
+            columns += [padded(rows) if is_vector else rows]
         return np.column_stack([np.zeros((len(times), 0)), *columns])
 
 
