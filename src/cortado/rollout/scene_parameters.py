@@ -3,7 +3,6 @@
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
 """
 
-from collections.abc import Sequence
 from typing import Protocol
 from weakref import WeakSet
 
@@ -41,7 +40,7 @@ class Simulated(Source, Protocol):
     """The first state, on the device."""
     known: Known
     """Its parameters."""
-    forces: Sequence[ForceMaker]
+    forces: tuple[ForceMaker, ...]
     """What makes the forces that are not Cortado's own."""
     judged_states: WeakSet[RestartState]
     """Those that need not be judged again, as nobody can change them."""
