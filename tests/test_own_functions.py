@@ -134,7 +134,7 @@ def test_a_pair_force_is_the_weighted_sum_over_neighbours():
     np.fill_diagonal(weights, 0.0)
     away = x[:, None] - x[None]
     force = 40.0 * np.stack([away[..., 0] + 0.01, -2.0 * away[..., 1]], axis=-1)
-    acceleration = (weights[..., None] * force).sum(axis=1) / (1000.0 * simulation.lattice.volume)
+    acceleration = (weights[..., None] * force).sum(axis=1) / (1000.0 * spacing**2)
     np.testing.assert_allclose(simulation.run(1).velocities[-1], 0.0021 * acceleration, rtol=1e-12, atol=1e-15)
 
 

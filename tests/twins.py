@@ -62,7 +62,7 @@ def tension_twin(simulation):
     if not any(isinstance(force, SurfaceTension) for force in solver.forces):
         return None
     lattice = solver.lattice
-    constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
+    constants = tension_constants(scene.discretisation.spacing, lattice.support, scene.dimension)
     return reference.SurfaceTension(lattice.support, *constants)
 
 

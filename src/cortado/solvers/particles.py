@@ -198,7 +198,7 @@ class ParticleSolver(Staying):
     def context(self, parameters: Parameters) -> StepContext:
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
-            own = (self.launch, particles, self._neighbourhood, order, step, self.fields)
+            own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell, self.fields)
             self._context = StepContext(*own, parameters)
         return self._context
 

@@ -1,10 +1,11 @@
 """A force between neighbours that is one function of a user's: the force [N], in 2-D per metre, on a particle from each
 neighbour within the support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
 
-a_i = 1 / (m_i V) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)
+a_i = 1 / (m_i s^d) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)
 
-ends smoothly at the support. Momentum is kept where f is odd, f(-x, -v) = -f(x, v), and angular momentum where f is
-along x too. A particle exerts none on itself, and walls have no part in it.
+ends smoothly at the support; m_i s^d is the mass of a particle, with the spacing s. Momentum is kept where f is odd,
+f(-x, -v) = -f(x, v), and angular momentum where f is along x too. A particle exerts none on itself, and walls have no
+part in it.
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from cortado.sph.packed import theta_of
 def term(
     discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
 ) -> Callable[..., Any]:
-    """What a pair adds to the acceleration, in a Warp module."""
+    """What a pair adds to the acceleration times the volume of a particle, in a Warp module."""
     precision = discretisation.precision
     real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
     neighbourhood, weight = neighbourhood_type(precision), pair_functions(discretisation).weight
@@ -36,7 +37,7 @@ def term(
     def pair(x_ij: vector, v_ij: vector, m_i: real, theta: theta_type, i: int, j: int, s: neighbourhood) -> vector:
         acceleration = vector()
         if i != j:
-            acceleration = (weight(x_ij, s) / (s.self_weight * s.volume * m_i)) * force(x_ij, v_ij, theta)
+            acceleration = (weight(x_ij, s) / (s.self_weight * m_i)) * force(x_ij, v_ij, theta)
         return acceleration
 
     return pair
@@ -65,6 +66,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
+        cell: real,
         acceleration_in: wp.array(dtype=vector),
         # out
         acceleration: wp.array(dtype=vector),
@@ -73,7 +75,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         total = accelerations(i, x, v, m, theta[i // s.particles], s)
         if lane() > 0:
             return
-        acceleration[i] = acceleration_in[i] + total
+        acceleration[i] = acceleration_in[i] + total / cell
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def pair_tangent(
@@ -86,6 +88,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         v_dot: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
+        cell: real,
         acceleration_in_dot: wp.array(dtype=vector),
         # out
         acceleration_dot: wp.array(dtype=vector),
@@ -95,7 +98,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         total = tangents(i, x, x_dot, v, v_dot, m, m_dot, theta[member], theta_dot[member], s)
         if lane() > 0:
             return
-        acceleration_dot[i] = acceleration_in_dot[i] + total
+        acceleration_dot[i] = acceleration_in_dot[i] + total / cell
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def pair_adjoint(
@@ -104,6 +107,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
+        cell: real,
         acceleration_bar: wp.array(dtype=vector),
         # in and out
         x_bar: wp.array(dtype=vector),
@@ -116,10 +120,10 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         x_sum, v_sum, m_sum, theta_sum = adjoints(i, x, v, m, acceleration_bar, theta[i // s.particles], s)
         if lane() > 0:
             return
-        x_bar[i] = x_bar[i] + x_sum
-        v_bar[i] = v_bar[i] + v_sum
-        m_bar[i] = m_bar[i] + m_sum
-        theta_bar[i] = theta_sum
+        x_bar[i] = x_bar[i] + x_sum / cell
+        v_bar[i] = v_bar[i] + v_sum / cell
+        m_bar[i] = m_bar[i] + m_sum / cell
+        theta_bar[i] = theta_sum / cell
 
     return Kernels(pair_force, pair_tangent, pair_adjoint)
 

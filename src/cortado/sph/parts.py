@@ -27,21 +27,23 @@ from cortado.scene.scene import Scene
 @dataclass(frozen=True)
 class StepContext:
     """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
-    lies around each particle), ``order`` (sorted -> scene), ``step`` (members,), the number of the step, and
-    ``particles``, how many a scene has: particle i belongs to scene i // particles of a batch."""
+    lies around each particle), ``order`` (sorted -> scene), ``step`` (members,), the number of the step,
+    ``particles``, how many a scene has: particle i belongs to scene i // particles of a batch; and ``cell``, the volume
+    of a particle [m^d]."""
 
     launcher: KernelLauncher
     particles: int
     neighbourhood: Any
     order: wp.array
     step: wp.array
+    cell: float
     fields: Fields
     parameters: Parameters
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
         own = {"s": self.neighbourhood, "particles": self.particles, "order": self.order, "step": self.step}
-        return own, self.fields.named(), self.parameters.named()
+        return {**own, "cell": self.cell}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
         """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's.

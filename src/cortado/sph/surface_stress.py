@@ -3,10 +3,10 @@ particles):
 
     n_i = (1 / N) sum_j (1 - s)^2 x_ij,   s = |x|^2 / h^2
     S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
-    m_i V a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
+    m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
 
-m is the mass over the rest volume V. n points out of the fluid; its size is 1 in the outermost layer of a lattice that
-is cut, and about 0 inside. S pulls along the surface, and with PART below 1 also a little across it: a stress along the
+m_i s^d is the mass of a particle, with the spacing s of the lattice at rest. n points out of the fluid; its size is 1
+in the outermost layer of a lattice that is cut, and about 0 inside. S pulls along the surface, and with PART below 1 also a little across it: a stress along the
 surface alone lets particles go, and one that is the same in all directions makes a solid. The force of a pair grows
 with its distance up to 0.65 h, so that particles of the surface do not clump. N and Gamma: see
 `cortado.sph.surface_tension`.
@@ -83,7 +83,7 @@ def tension_functions(discretisation: Discretisation) -> TensionFunctions:
 
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
-    """The kernels of the acceleration; ``scale`` is 1 / (Gamma V)."""
+    """The kernels of the acceleration; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     functions = tension_functions(discretisation)

@@ -66,8 +66,8 @@ class SurfaceTension:
         step.launch(self._normal.adjoint, *bar.named, inverse=self._inverse, normals_bar=self._change)
 
 
-def tension_constants(spacing: float, support: float, volume: float, dimension: int) -> tuple[float, float]:
-    """1 / N [1 / m] and 1 / (Gamma V) [1 / m^(d + 2)] of a lattice that is cut along an axis."""
+def tension_constants(spacing: float, support: float, dimension: int) -> tuple[float, float]:
+    """1 / N [1 / m] and 1 / (Gamma s^d) [1 / m^(d + 2)] of a lattice of spacing s that is cut along an axis."""
     offsets = lattice_offsets(spacing, support, dimension)
     s = (offsets**2).sum(axis=1) / support**2
     outwards = np.rint(offsets[:, 0] / spacing).astype(int)
@@ -83,7 +83,7 @@ def tension_constants(spacing: float, support: float, volume: float, dimension: 
         inside = outwards <= depth
         both = along[depth] + along[np.where(inside, depth - outwards, 0)]
         tension += 0.5 * float((pulls * both)[inside].sum()) / spacing ** (dimension - 1)
-    return 1.0 / float(sums[0]), 1.0 / (RELAXED[dimension] * tension * volume)
+    return 1.0 / float(sums[0]), 1.0 / (RELAXED[dimension] * tension * spacing**dimension)
 
 
 def force(setting: Setting) -> Force:
@@ -96,7 +96,7 @@ def force(setting: Setting) -> Force:
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
         known = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
         return CurvatureTension(setting.discretisation, scene.dimension, known, setting.layout)
-    constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
+    constants = tension_constants(scene.discretisation.spacing, lattice.support, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
 
 
