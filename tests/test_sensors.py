@@ -27,12 +27,15 @@ IN_THE_PLANE = {
     "probe": PressureProbe([0.21, 0.13], 0.12),
     "gauge": WaveGauge([0.19, 0.0], radius=0.15),
     "flow": FlowRate([0.33, 0.0], [1.0, 0.2]),
+    "close": WaveGauge([0.19, 0.0], radius=0.07),
+    "thin": FlowRate([0.33, 0.0], [1.0, 0.2], 0.06),
     "force": WallForce(upper=[0.35, 2.0], about=[0.1, 0.05]),
 }
 IN_SPACE = {
     "probe": PressureProbe([0.12, 0.1, 0.11]),
     "gauge": WaveGauge([0.11, 0.0, 0.13]),
     "flow": FlowRate([0.2, 0.0, 0.0], [1.0, 0.1, 0.2]),
+    "close": WaveGauge([0.11, 0.0, 0.13], radius=0.08),
     "force": WallForce(about=[0.1, 0.0, 0.2]),
 }
 CASES = [(make, name, own) for make, each in ((plane, IN_THE_PLANE), (scene, IN_SPACE)) for name, own in each.items()]
@@ -75,7 +78,7 @@ def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor
     """With respect to the fields and quantities that it reads, taken as free."""
 
     class Fields(dict):
-        dimension, lattice = make().dimension, cortado.Simulation(make()).lattice
+        dimension, lattice, solids = make().dimension, cortado.Simulation(make()).lattice, ()
 
     end = cortado.Problem(cortado.Simulation(make(), precision="float64"), 5, SensorMatch(sensor, 0.0)).end({})
     names = ("positions", "velocities", "pressure", "wall_force")
@@ -140,6 +143,7 @@ class Basin:
     support: float
     dimension: int
     spacing: float = 0.05
+    solids: tuple = ()
 
     @property
     def lattice(self):
@@ -165,6 +169,19 @@ def test_a_basin_is_as_deep_as_it_is_with_every_kernel(kernel, support, dimensio
     across = 1.0 if dimension == 2 else 2.0
     flow = value_of(FlowRate(middle, np.eye(dimension)[0]), basin)[0]
     assert flow == pytest.approx(2.0 * 0.5 * across, rel=1e-3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_basin_is_as_deep_as_it_is_with_every_reach(dimension):
+    """Down to half a spacing, and through planes that are slanted."""
+    basin, across = Basin("cubic_spline", 2.0, dimension), 1.0 if dimension == 2 else 2.0
+    for reach in (0.025, 0.04, 0.06, 0.075, 0.1, 0.13, 0.2, 0.25):
+        for place in (1.0, 1.013, 1.025):
+            middle = [place, 0.2, 0.987][:dimension]
+            assert value_of(WaveGauge(middle, radius=reach), basin)[0] == pytest.approx(0.5, rel=1e-3)
+            for normal in ([1.0, 0.0, 0.0], [1.0, 0.3, 0.0]):
+                flow = FlowRate(middle, normal[:dimension], reach)
+                assert value_of(flow, basin)[0] == pytest.approx(across, rel=1e-3)
 
 
 def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():

@@ -17,6 +17,7 @@ from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.quantities import check_readable
+from cortado.scene.solids import SolidTable
 from cortado.words import counted
 
 
@@ -77,6 +78,11 @@ class Snapshot:
     def lattice(self) -> Lattice:
         """Constants of the particles at rest, such as their volume."""
         return moment_of(self).lattice
+
+    @property
+    def solids(self) -> tuple[SolidTable, ...]:
+        """Those of the scene, as they begin; where one that moves is now, fields of the state say."""
+        return moment_of(self).solids
 
     def _quantity(self, name: str) -> np.ndarray:
         return moment_of(self).value(name)

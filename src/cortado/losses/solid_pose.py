@@ -4,13 +4,13 @@ from hashlib import sha256
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.arrays import read_only
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Snapshot
-from cortado.scene.motions import AXES, position_name, rotation_name, solids_in, turn_name
+from cortado.scene.motions import AXES, position_name, solids_in
+from cortado.scene.poses import Pose, matrix
 
 
 @fixed
@@ -58,54 +58,9 @@ class SolidPose:
         return value, bars
 
     def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
-        """The part of the rotation R = Q R(w), and its adjoint; t is that of a further turn of R."""
-        name, flat, weight = self.name, end.dimension == 2, self.length**2
+        """The part of the rotation, and its adjoint; t is that of a further turn of R."""
         assert self.rotation is not None
-        w, wanted = end[rotation_name(name)][0], _matrix(self.rotation)
-        begun, is_free = _matrix(w), f"{name}.{AXES[0]}" in end.state.names
-        if is_free:
-            columns = np.array([_in_space(end[f"{name}.{axis}"][0]) for axis in AXES]).T
-            Q = np.eye(3) + columns
-        else:
-            turn = end[turn_name(name)][0]
-            Q = _matrix(turn)
-        R = Q @ begun
+        pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
+        R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
         t = -weight * np.cross(R, wanted, axis=0).sum(axis=1)
-        bars = {rotation_name(name): _angles(_jacobian(w).T @ Q.T @ t, flat)}
-        if is_free:
-            bars |= {f"{name}.{axis}": 0.5 * np.cross(t, Q[:, k])[None, : end.dimension] for k, axis in enumerate(AXES)}
-        else:
-            bars[turn_name(name)] = _angles(_jacobian(turn).T @ t, flat)
-        return weight * float(3.0 - np.trace(wanted.T @ R)), bars
-
-
-def _in_space(vector: NDArray) -> NDArray[np.float64]:
-    """(3,) of a vector, or the rotation vector of an angle."""
-    found = np.zeros(3)
-    if np.ndim(vector) == 0 or len(vector) == 1:
-        found[2] = np.reshape(vector, ())
-    else:
-        found[: len(vector)] = vector
-    return found
-
-
-def _angles(w: NDArray, flat: bool) -> NDArray[np.float64]:
-    """As a field of a state has it."""
-    return w[2:] if flat else w[None]
-
-
-def _matrix(w: NDArray) -> NDArray[np.float64]:
-    """(3, 3) of a rotation vector, or an angle."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(_in_space(w)).as_matrix())
-
-
-def _jacobian(w: NDArray) -> NDArray[np.float64]:
-    """J of `cortado.sph.rotations`."""
-    w = _in_space(w)
-    size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
-    if size < 1e-4:
-        return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)
-    a, b = (1.0 - np.cos(size)) / size**2, (size - np.sin(size)) / size**3
-    return np.asarray(np.eye(3) + a * cross + b * cross @ cross)
+        return weight * float(3.0 - np.trace(wanted.T @ R)), pose.turning_bars(t)

@@ -50,9 +50,8 @@ class Measuring:
         if made is None:
             own = cast(Measured, self)
             scene, lattice = own.scene, own.lattice
-            spacing, dimension = scene.discretisation.spacing, scene.dimension
-            factor = circulation_factor(own.smoothing, spacing, lattice.support, dimension)
-            made = self.__dict__["_evaluator"] = QuantityEvaluator(own.solver, dimension, factor)
+            factor = circulation_factor(own.smoothing, scene.discretisation.spacing, lattice.support, scene.dimension)
+            made = self.__dict__["_evaluator"] = QuantityEvaluator(own.solver, scene, factor)
         return made
 
     def quantity(

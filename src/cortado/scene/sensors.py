@@ -46,14 +46,15 @@ class PressureProbeTable(SensorTable):
 
 
 class WaveGaugeTable(SensorTable):
-    """How high the fluid stands at a place: its volume in a column over the column's cross-section."""
+    """How high the surface of the fluid is at a place: the level to which its volume in a column fills the room that
+    solids leave there."""
 
     kind: Literal["wave_gauge"]
     """Which sensor it is."""
     position: Vector[Length]
     """(d,) a point of the middle of the column [m]; its height does not matter."""
     floor: Length = 0.0
-    """Where the fluid stands on [m], against gravity: above a solid, which the gauge does not count, its upper end."""
+    """From where on the column is filled [m], against gravity: the bottom of the container as a rule."""
     radius: Reach = None
     """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
 

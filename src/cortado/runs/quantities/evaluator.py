@@ -18,6 +18,8 @@ from cortado.runs.quantities.moment import Moment
 from cortado.runs.quantities.particles import OnDevice, Particles, Pressures, Sums
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import LOAD, check_quantity, is_load
+from cortado.scene.scene import Scene
+from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver, WithinBar
@@ -44,15 +46,17 @@ class QuantityEvaluator:
     """Computes quantities of states, their tangents and adjoints, in the arrays of one solver, which no run may use
     meanwhile. What it is given and returns is in the scene's order, of a batch with a first axis for the scenes."""
 
-    def __init__(self, solver: Solver, dimension: int, circulation_factor: float):
+    def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         """``circulation_factor``: that of `cortado.discretise.calibration`. Raises `InputError` for a solver that has
         no particles to look at."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")
-        self._solver, self._dimension = solver, dimension
+        self._solver, self._dimension = solver, scene.dimension
         self.lattice = solver.lattice
         """Constants of the lattice of particles at rest."""
-        self._formulas = formulas(solver, dimension, circulation_factor)
+        self.solids: tuple[SolidTable, ...] = scene.solid
+        """As they begin."""
+        self._formulas = formulas(solver, scene.dimension, circulation_factor)
         self._counts: Counts = ()
         """Of the step that was solved last."""
         self._rounds: list[int] = []

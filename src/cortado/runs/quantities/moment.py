@@ -11,12 +11,14 @@ from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters.values import Arrays
+from cortado.scene.solids import SolidTable
 
 
 class Evaluates(Protocol):
     """What computes quantities: see `cortado.runs.quantities.evaluator.QuantityEvaluator`."""
 
     lattice: Lattice
+    solids: tuple[SolidTable, ...]
 
     def values(self, names: Iterable[str], moment: "Moment") -> Arrays: ...
 
@@ -58,6 +60,11 @@ class Moment:
     def lattice(self) -> Lattice:
         """Constants of the lattice of particles at rest."""
         return self.evaluator().lattice
+
+    @property
+    def solids(self) -> tuple[SolidTable, ...]:
+        """Those of the scene, as they begin."""
+        return self.evaluator().solids
 
     def value(self, name: str) -> NDArray:
         """A quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""

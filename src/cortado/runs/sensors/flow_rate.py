@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, point, positive, reach_of
+from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, parts_of, point, positive, reach_of
 
 
 @fixed
@@ -50,4 +50,8 @@ class FlowRate:
 
     def _around(self, at: Reading) -> Seen:
         """By the distances (n, 1) from the plane along its normal."""
-        return Seen.of(at, self.position, reach_of(self.reach, at), lambda way: (way @ self.normal)[:, None])
+        reach = reach_of(self.reach, at)
+        return Seen.of(at, self.position, reach, self._along, parts_of(reach, at, self._along, 1))
+
+    def _along(self, way: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray((way @ self.normal)[:, None])

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
+from cortado.discretise.shapes import grid
 from cortado.errors import InputError
 from cortado.scene.discrete_scene import Lattice
+from cortado.scene.solids import SolidTable
 
 
 class Reading(Protocol):
@@ -22,6 +24,10 @@ class Reading(Protocol):
     @property
     def lattice(self) -> Lattice:
         """Constants of the particles at rest, such as their volume, and along which axes they repeat."""
+
+    @property
+    def solids(self) -> tuple[SolidTable, ...]:
+        """Those of the scene, as they begin."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of the state or a quantity of its particles, float64."""
@@ -56,32 +62,66 @@ class Weights:
         return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
 
 
+Across = Callable[[NDArray[Any]], NDArray[Any]]
+"""How a sensor sees ways (n, d): a linear function to ways (n, k)."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """Those of all particles, or of all their parts in one place of their cells, that weigh something."""
+
+    near: NDArray[np.int_]
+    """(m,) their numbers"""
+    ways: NDArray[Any]
+    """(m, k) from the place to them [m]"""
+    weights: Weights
+    """(m,) each"""
+
+
 @dataclass(frozen=True)
 class Seen:
     """Particles around a place, along periodic axes with all of their images that are near."""
 
-    images: list[tuple[NDArray[Any], Weights]]
-    """The ways (n, k) from the place to an image of each particle [m], and the weights of these images."""
+    images: list[Image]
+    """Of each of the parts that a particle is divided into, and each of its images."""
+    particles: int
+    """n"""
+    parts: int
+    """How many parts a particle is divided into."""
     reach: float
     """From where on they weigh nothing [m]."""
 
     @classmethod
     def of(
-        cls, at: Reading, place: NDArray[Any], reach: float, across: Callable[[NDArray[Any]], NDArray[Any]]
+        cls, at: Reading, place: NDArray[Any], reach: float, across: Across, parts: NDArray[Any] | None = None
     ) -> "Seen":
-        """From a place (d,), as ``across`` shows ways (n, d): a linear function to ways (n, k)."""
-        ways = at.lattice.domain.ways(at["positions"], in_dimension("position", place, at.dimension), reach, across)
-        return cls([(way, Weights.of(np.linalg.norm(way, axis=1) / reach)) for way in ways], reach)
+        """From a place (d,) as ``across`` shows it. ``parts`` (m, d) are where the parts of a particle lie from it [m],
+        which weigh the same; a particle is one point if they are left out."""
+        shifts = np.zeros((1, at.dimension)) if parts is None else parts
+        seen, widest = across(shifts), reach + float(np.linalg.norm(across(shifts), axis=1).max())
+        ways = at.lattice.domain.ways(at["positions"], in_dimension("position", place, at.dimension), widest, across)
+        images = []
+        for way in ways:
+            close = np.flatnonzero(np.linalg.norm(way, axis=1) < widest)
+            for shift in seen:
+                own = way[close] + shift
+                images.append(Image(close, own, Weights.of(np.linalg.norm(own, axis=1) / reach)))
+        return cls(images, len(at["positions"]), len(shifts), reach)
 
     @property
     def weights(self) -> NDArray[Any]:
-        """(n,) of particles, those of their images added up."""
-        return np.asarray(sum(weights.values for _, weights in self.images))
+        """(n,) of particles, the mean of their parts, those of their images added up."""
+        found = np.zeros(self.particles)
+        for image in self.images:
+            found[image.near] += image.weights.values
+        return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
         """(n, k) the derivative with respect to the ways, from that with respect to the weights, (n,)."""
-        each = ((factors * weights.slopes / self.reach**2)[:, None] * way for way, weights in self.images)
-        return np.asarray(sum(each))
+        each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
+        for image in self.images:
+            found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
+        return found / self.parts
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
@@ -89,6 +129,8 @@ ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 
 LEAST_REACH = 5.0
 """In spacings: with it the weights of a lattice add up to 1 within 0.1 %, wherever a plane or a column lies in it."""
+MOST_PARTS = 40
+"""Along an axis: enough for a reach of half a spacing, and less is warned of."""
 
 
 def reach_of(given: float | None, at: Reading) -> float:
@@ -97,6 +139,16 @@ def reach_of(given: float | None, at: Reading) -> float:
     if given is not None:
         return given
     return max(2.0 * at.lattice.support, LEAST_REACH * at.lattice.cell ** (1.0 / at.dimension))
+
+
+def parts_of(reach: float, at: Reading, across: Across, axes: int) -> NDArray[Any]:
+    """(m, d) where parts of a particle lie from it [m]: evenly in its cell along so many axes, those that are seen
+    best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
+    spacing = at.lattice.cell ** (1.0 / at.dimension)
+    count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
+    best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
+    along = spacing * ((np.arange(count) + 0.5) / count - 0.5)
+    return grid([along if axis in best else np.zeros(1) for axis in range(at.dimension)])
 
 
 def load_columns(dimension: int) -> dict[str, str]:
