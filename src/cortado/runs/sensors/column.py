@@ -100,7 +100,8 @@ class Axis:
         """(c, d) the points of the floor from its foot [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         across = np.linalg.svd(np.array([self.up]))[2][1:]
-        places = grid([self.step * np.arange(-count, count + 1)] * (d - 1))
+        along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
+        places = grid([along] * (d - 1))
         weights = Weights.of(np.linalg.norm(places, axis=1) / self.reach).values
         return places[weights > 0.0] @ across, weights[weights > 0.0] / weights.sum()
 
