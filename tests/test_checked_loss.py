@@ -200,6 +200,24 @@ def test_a_loss_in_warp_is_told_from_one_of_other_code_or_numbers(monkeypatch):
     assert fingerprint(Recorded(heights)) != before
 
 
+class Settings:
+    def __init__(self, gain):
+        self.gain = gain
+
+    def twice(self):
+        return 2.0 * self.gain
+
+
+@pytest.mark.parametrize("reads_by_method", [False, True])
+def test_what_a_loss_in_warp_reads_of_an_object_tells_it_too(reads_by_method):
+    def made(gain):
+        settings = Settings(gain)
+        by_method = lambda positions, velocities, loss: settings.twice()  # noqa: E731
+        return by_method if reads_by_method else lambda positions, velocities, loss: settings.gain
+
+    assert fingerprint(made(1.0)) == fingerprint(made(1.0)) != fingerprint(made(2.0))
+
+
 @pytest.mark.parametrize(
     "made",
     [

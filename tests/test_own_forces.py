@@ -112,7 +112,8 @@ class Gusts(Breeze):
 
 
 def test_another_force_is_another_problem():
-    different = ([], [Breeze()], [Breeze(2.0)], [Gusts(1)], [Gusts(2)])
+    of_functions = [Gusts(lambda t: 1.0 * t)], [Gusts(lambda t: 2.0 * t)]
+    different = ([], [Breeze()], [Breeze(2.0)], [Gusts(1)], [Gusts(2)], *of_functions)
     texts = {problem(forces).fingerprint for forces in different}
     assert len(texts) == len(different)
 

@@ -1,18 +1,15 @@
 """What a user's function names that is not its own: as it is when the force is made, and in words."""
 
-from collections.abc import Mapping
 from copy import deepcopy
 from inspect import isclass, ismodule
-from types import CellType, CodeType, FunctionType, ModuleType
+from types import CellType, FunctionType, ModuleType
 from typing import Any
 
 import warp as wp
 
+from cortado.code_words import KEPT, SNIPPETS, names_in, package_of, read_by, words
 from cortado.device.modules import kernel_module
 from cortado.sph.function_source import check_bare, definition
-
-KEPT = ("builtins", "math", "numpy", "warp")
-"""Modules that do not change."""
 
 
 class Frozen:
@@ -26,24 +23,16 @@ class Frozen:
         """The copies of functions of Warp's users, in each of their forms."""
         self.scope = self._scope(function)
         """What names stand for."""
-        texts = [f"{one.adj.source}\n{_told(one.func.__globals__)}" for one in self.helpers]
-        self.words = "\n".join([_told(self.scope), *texts])
+        self.words = "\n".join(words(self.scope))
         """All of it as a text, which other processes have too."""
 
     def _scope(self, function: FunctionType) -> dict[str, Any]:
-        names, given = _names(function.__code__), dict[str, Any]()
-        for name in names:
-            if name in function.__globals__:
-                given[name] = function.__globals__[name]
-        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-            if cell != CellType():
-                given[name] = cell.cell_contents
-        return {name: self._value(value, names) for name, value in sorted(given.items())}
+        return {name: self._value(value, names_in(function)) for name, value in read_by(function).items()}
 
     def _value(self, value: Any, names: tuple[str, ...]) -> Any:
         if isinstance(value, wp.Function):
             return self._helper(value) if value.func else value
-        if _package(value) in KEPT:
+        if package_of(value) in KEPT:
             return value if ismodule(value) or callable(value) else deepcopy(value)
         if callable(value) and not isclass(value):
             return value
@@ -66,7 +55,7 @@ class Frozen:
 
     def _copy(self, helper: Any) -> Any:
         own = self._function(helper)
-        snippets = {name: getattr(helper, name) for name in ("native_snippet", "adj_native_snippet", "replay_snippet")}
+        snippets = {name: getattr(helper, name) for name in SNIPPETS}
         known = {"module": kernel_module("helpers"), "source": helper.adj.source, "inline_hint": helper.inline_hint}
         made = wp.Function(func=own, key=helper.key, namespace="", **known, **snippets, scope_locals={})
         for other, decorate in ((helper.custom_grad_func, wp.func_grad), (helper.custom_replay_func, wp.func_replay)):
@@ -85,31 +74,3 @@ class Frozen:
         made: Any = FunctionType(code, scope, function.__name__, function.__defaults__, cells)
         made.__annotations__, made.__module__ = dict(helper.adj.arg_types), function.__module__
         return made
-
-
-def _names(code: CodeType) -> tuple[str, ...]:
-    """All that a code may read from outside of it, or of what it finds there."""
-    inner = [name for one in code.co_consts if isinstance(one, CodeType) for name in _names(one)]
-    return tuple(dict.fromkeys([*code.co_names, *inner]))
-
-
-def _package(value: Any) -> str:
-    """Of a module or class, or of the class of an object."""
-    name: str = value.__name__ if ismodule(value) else (value if isclass(value) else type(value)).__module__
-    return name.partition(".")[0]
-
-
-def _told(scope: Mapping[str, Any]) -> str:
-    """What is named in a scope, in words; of functions and types their names, as the texts of helpers stand beside."""
-    kept = {name: value for name, value in scope.items() if not name.startswith("__")}
-    return "\n".join(f"{name} = {_words(value)}" for name, value in sorted(kept.items()))
-
-
-def _words(value: Any) -> str:
-    if ismodule(value) and value.__name__ == "frozen":
-        return f"({_told(vars(value))})"
-    if isinstance(value, wp.Function):
-        return str(value.key)
-    if ismodule(value) or callable(value):
-        return str(getattr(value, "__qualname__", getattr(value, "__name__", type(value).__qualname__)))
-    return repr(value.tolist() if hasattr(value, "tolist") else list(value) if _package(value) == "warp" else value)

@@ -1,11 +1,12 @@
 """Forces from outside: what `Simulation` takes in ``forces``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from hashlib import sha256
 from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.code_words import code_words
 from cortado.errors import InputError, shown
 from cortado.scene.motions import motion_parameters
 from cortado.scene.parameters.known import Known
@@ -82,19 +83,5 @@ def fingerprint(makers: Sequence[Any], source: Source) -> str:
     for maker in makers:
         parameters = getattr(maker, "parameters", ())
         values = [(p.name, np.asarray(p.value(source), dtype=np.float64).tolist()) for p in parameters]
-        words.append(f"{getattr(maker, 'fingerprint', None) or _told(maker)} {values}")
+        words.append(f"{getattr(maker, 'fingerprint', None) or code_words(maker)} {values}")
     return sha256("\n".join(words).encode()).hexdigest()[:16] if words else ""
-
-
-def _told(value: Any) -> str:
-    """What an object consists of, as far as it can be told in the same words by another process."""
-    if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
-        return repr(value)
-    if isinstance(value, (np.ndarray, np.generic)):
-        return f"{value.dtype} {value.shape} {sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_told, value))}]"
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key!r}: {_told(entry)}' for key, entry in value.items())}}}"
-    own = "" if callable(value) else _told(dict(getattr(value, "__dict__", {})))
-    return f"{getattr(value, '__qualname__', type(value).__qualname__)} {own}"
