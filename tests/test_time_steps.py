@@ -96,6 +96,35 @@ def test_each_row_of_a_gravity_bounds_its_own_step():
     assert sizes_of(simulation.run(2, {"gravity": [0.0, 0.0]}))[0] == 0.004
 
 
+@pytest.mark.parametrize("rest", [[0.0, -9.81], [0.0, -1.0], [0.0, 0.0]])
+def test_a_scheduled_gravity_bounds_the_steps_that_it_acts_in(rest):
+    """A knock of 5 ms leaves the steps before it as they are, but for the last, which ends at it."""
+    knock = {"times": [0.0, 0.1, 0.1001, 0.105, 0.1051], "values": [rest, rest, [0.0, -900.0], [0.0, -900.0], rest]}
+    forces = {"gravity": rest, "viscosity": "none"}
+    still, knocked = (
+        plane(solver={**CHOSEN, "greatest_time_step": 0.008}, forces=forces, schedule=schedule)
+        for schedule in ({}, {"gravity": knock})
+    )
+    plain, run = (Simulation(one, precision="float64").run(time=0.12) for one in (still, knocked))
+    before, sizes = np.flatnonzero(run.times <= 0.1)[-1], sizes_of(run)
+    assert plain.positions[:before].tobytes() == run.positions[:before].tobytes()
+    strong = plane(solver=CHOSEN, forces={"gravity": [0.0, -900.0]})
+    bound = min(min(chosen_limits(strong).values()), 0.008)
+    during = (run.times[1:] > 0.1001 + 1e-9) & (run.times[:-1] < 0.105 - 1e-9)
+    assert during.any() and sizes[during].max() <= bound < 0.3 * sizes[:before].max()
+    assert run.times[before] >= 0.1 - 0.008 and (sizes > 0.0).all()
+
+
+def test_a_scheduled_tilt_bounds_each_step_by_the_depth_that_it_makes():
+    column = [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.1, 0.6], "phase": "water"}]
+    made = {"solver": CHOSEN, "fluid": column}
+    lying = {"times": [0.0, 0.05, 0.06], "values": [[90.0], [90.0], [0.0]]}
+    upright, along = (plane(**made, forces={"gravity": g}) for g in ([0.0, -9.81], [9.81, 0.0]))
+    sizes = sizes_of(Simulation(plane(**made, schedule={"tilt": lying}), precision="float64").run(2))
+    found, least = (min(chosen_limits(one).values()) for one in (along, upright))
+    assert sizes[0] == pytest.approx(found) and found > 1.2 * least
+
+
 # ---- the same bits -----------------------------------------------------------------------------------------------
 
 

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.rollout.pull import Pull
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
-from cortado.rollout.step_bounds import step_bounds
+from cortado.rollout.step_bounds import greatest_step, step_bounds
 from cortado.rollout.step_sizes import ChosenSteps
 from cortado.rollout.travel import Travel, moved_by
 from cortado.scene.parameters.values import Arrays, stacked
@@ -29,18 +30,24 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
     rollout.step_sizes.begin_at(rollout.initial)
 
 
+def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
+    """What changes by the time and bounds each step by itself, in words, with parameters that replace the scene's."""
+    courses = parameters.courses(values)
+    travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
+    return {"the speed along paths": travel, **Pull.of(scene, courses, greatest_step(scene, values))}
+
+
 class Courses:
     """What is scheduled in the scenes of a batch, each at its own time."""
 
     def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
         self._rollout, self._parameters, self._members = rollout, parameters, members
-        self._travels = [
-            Travel.of(scene, own, moved_by(scene, own, parameters.courses(own)).values()) for own in members
-        ]
+        self._bounds = [scheduled_bounds(scene, own, parameters) for own in members]
 
     def longest(self, times: NDArray) -> NDArray:
         """See `Scheduled`."""
-        return np.array([travel.longest(time) for travel, time in zip(self._travels, times.tolist(), strict=True)])
+        each = zip(self._bounds, times.tolist(), strict=True)
+        return np.array([min(bound.longest(time) for bound in bounds.values()) for bounds, time in each])
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
         """See `Scheduled`."""

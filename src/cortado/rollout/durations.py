@@ -81,8 +81,9 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
     them."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
-    limit = stability_limits(scene, values)["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
-    longest = min(float(step_bounds(scene, values, 1)[0]), limit)
+    limits = stability_limits(scene, values)
+    limit = limits["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
+    longest = min(float(step_bounds(scene, values, 1)[0]), limit, limits["gravity"], limits["depth"])
     courses = SceneParameters(simulation, 0).courses(values)
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
     return _counted_steps(time, time / longest + travel.steps(time, longest))

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from cortado.errors import InputError
 from cortado.scene.model import SceneTables
 from cortado.scene.parameters.values import Arrays
-from cortado.scene.stability import chosen_limits, gravity_limits
+from cortado.scene.stability import chosen_limits, gravity_limits, stability_limits
 
 
 def greatest_step(scene: SceneTables, values: Arrays) -> float:
@@ -22,13 +22,14 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
 
 
 def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
-    """(steps,) that of each step [s]: a gravity that is given bounds each by its own row. Raises `InputError` where one
-    is below the ``least`` [s] that a precision bears."""
+    """(steps,) that of each step [s]: a gravity that is given bounds each by its own row. Raises `InputError` where
+    one, or one of a scheduled gravity, is below the ``least`` [s] that a precision bears."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
         bounds = np.minimum(bounds, np.minimum.reduce(list(limits)))
-    if (shortest := float(bounds.min())) < least:
+    strongest = stability_limits(scene, values)  # which a schedule has at some time
+    if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
         raise InputError(
             f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision: "
             "make solver.greatest_time_step, or what else bounds it, larger."

@@ -50,10 +50,13 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
     """What bounds the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
     the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself
-    (`gravity_limits`), so that here the scene's counts. So do paths of solids, unless nothing else bounds the steps:
-    the fastest part of a path then bounds them all."""
+    (`gravity_limits`), so that here the scene's counts, or the weakest of a schedule, whose others bound the steps in
+    which they act. So do paths of solids. Where nothing else bounds the steps, the strongest gravity and the fastest
+    part of a path bound them all."""
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
     found = standing_limits(scene, own, [solid for solid in scene.solid if solid.times is None])
+    if scene.schedule.leads_gravity:
+        found |= {name: float(limits.max()) for name, limits in gravity_limits(scene, _gravity(scene)).items()}
     greatest = scene.solver.greatest_time_step
     if greatest is not None:
         return {**found, "greatest_time_step": greatest}

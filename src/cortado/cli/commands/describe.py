@@ -25,9 +25,9 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of
 from cortado.pictures.plan import plan
+from cortado.rollout.choosing import scheduled_bounds
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
 from cortado.rollout.scene_parameters import SceneParameters
-from cortado.rollout.travel import Travel, moved_by
 from cortado.runs.frame_choice import FrameChoice
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
@@ -158,8 +158,8 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
     first = simulation.rollout(1).step_sizes.of_step(0)
     assert first is not None
     size, limits = float(first[0]), chosen_limits(scene)
-    moved = moved_by(scene, {}, SceneParameters(simulation, 1).courses({}))
-    limits["the speed along paths"] = Travel.of(scene, {}, moved.values()).longest(0.0)
+    scheduled = scheduled_bounds(scene, {}, SceneParameters(simulation, 1))
+    limits |= {name: bound.longest(0.0) for name, bound in scheduled.items()}
     if size < min(limits.values()) * (1.0 - SAME):
         limits["speed"] = size
     return size, limits, min(limits, key=lambda name: limits[name])
