@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation
+from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.calibration import rest_volume
 from cortado.discretise.pairs import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
@@ -326,3 +326,53 @@ def test_positions_in_a_solid_are_refused():
 def test_a_polygon_needs_three_corners(count):
     with pytest.raises(SceneError, match="but must be a list of at least 3 entries, each a list"):
         PolygonSolid(name="a", corners=[[0.1 * k, 0.3] for k in range(count)])
+
+
+# ---- thin walls ----------------------------------------------------------------------------------------------------
+
+
+def wall(thickness):
+    """From floor to lid beside the column, so many spacings thick."""
+    return {"shape": "box", "lower": [0.4, -0.1], "upper": [0.4 + 0.05 * thickness, 1.1]}
+
+
+SHEET_OF_CORNERS = {"shape": "polygon", "corners": [[0.5, 0.2], [0.9, 0.2], [0.9, 0.27], [0.5, 0.27]]}
+MOVED = {"motion": "path", "velocity": [0.0, 0.1]}
+THIN = {
+    "wall": wall(1.45),
+    "polygon": SHEET_OF_CORNERS,
+    "cup": {"shape": "cup", "base": [0.7, 0.2], "radius": 0.15, "height": 0.3, "thickness": 0.06},
+    "capsule": {"shape": "capsule", "start": [0.5, 0.3], "end": [0.9, 0.5], "radius": 0.03},
+    "moving": {"shape": "box", "lower": [0.6, 0.2], "upper": [0.66, 0.6], **MOVED},
+}
+THICK = {
+    "wall": wall(1.5),
+    "on the floor": {"shape": "box", "lower": [0.5, 0.0], "upper": [0.9, 0.06]},
+    "ramp": RAMP,
+    "tank": TURNED_TANK,
+    "disc": DISC,
+    "moving": {"shape": "box", "lower": [0.6, 0.2], "upper": [0.675, 0.6], **MOVED},
+}
+
+
+@pytest.mark.parametrize("name", THIN)
+def test_a_solid_that_is_too_thin_to_hold_fluid_is_warned_of(name):
+    with pytest.warns(
+        CortadoWarning, match=r"the solid 'solid 0' is thinner than 0\.075 m, 1\.5 times the spacing, at"
+    ):
+        discretise(scene([THIN[name]]))
+
+
+@pytest.mark.parametrize("name", THICK)
+@pytest.mark.filterwarnings("error::cortado.CortadoWarning")
+def test_one_that_is_thick_enough_or_has_fluid_on_one_side_is_not(name):
+    discretise(scene([THICK[name]]))
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_walls_hold_water_from_the_thickness_on_that_is_said():
+    auto = {"kind": "projection", "time_step": "auto"}
+    run = Simulation(scene([wall(1.5)], solver=auto)).run(80, record_every=10)
+    assert run.positions[..., 0].max() < 0.4 + 0.2 * 0.05
+    with pytest.raises(DivergedError, match="entered the solid 'solid 0'"):
+        Simulation(scene([wall(1.0)], solver=auto)).run(80)

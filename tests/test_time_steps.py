@@ -621,6 +621,6 @@ def test_the_thickness_of_a_polygon_is_that_between_sides_that_face_each_other(t
     taper, wedge = [[0, 0], [1, 0], [1, 0.2], [0, 0.1]], [[0, 0], [1, 0], [1, 0.05]]
     for corners, wanted in [(bar @ turn, 0.2), (bar[::-1], 0.2), (cup, 0.1), (taper, 0.1), (wedge, np.inf)]:
         solid = PolygonSolid(name="one", corners=np.asarray(corners, dtype=float).tolist())
-        assert solid.thinnest() == pytest.approx(wanted)
+        assert solid.thinnest(0.01) == pytest.approx(wanted)
     with pytest.raises(SceneError, match=r"only 0\.008 m thick, but must be at least half a spacing, 0\.01 m, thick"):
         funnel(0.008, "pcisph")

@@ -30,7 +30,10 @@ class Pull:
     @classmethod
     def of(cls, scene: Scene, courses: Mapping[str, Changing], greatest: float) -> "dict[str, Pull]":
         """Those among the courses of parameters in a scene, by what they are in words."""
-        upright = {"gravity": np.asarray, "tilt": Tilt(scene.forces.gravity).gravity}
+        upright: dict[str, Callable[[NDArray], NDArray]] = {
+            "gravity": np.asarray,
+            "tilt": Tilt(scene.forces.gravity).gravity,
+        }
         return {
             f"the scheduled {name}": cls(scene, one, upright[name], greatest)
             for name, one in courses.items()

@@ -27,6 +27,7 @@ from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.sampling import FluidSample, fluid_particles, period
 from cortado.scene.scene import Scene
+from cortado.scene.thin_walls import thin_sentences
 from cortado.scene.walls import Walls, walls_of
 
 
@@ -103,6 +104,8 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = fluid_particles(scene)
     at_rest = RestLattice(kernel, spacing, support)
     walls = walls_of(scene, layers, at_rest)
+    for sentence in thin_sentences(scene):
+        warn(sentence)
     fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
     if scene.discretisation.jitter:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))

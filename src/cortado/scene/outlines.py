@@ -10,11 +10,15 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_checks import FoundMesh
 from cortado.discretise.solids.mesh_files import mesh_in_file
+from cortado.discretise.solids.mesh_fit import thickness_of
 from cortado.discretise.solids.primitives import Polygon
 from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, field_error, quantity
 from cortado.scene.fluids import beside_scene
 from cortado.scene.tables import Table
+
+THIN = 2.5
+"""In spacings: sheets of meshes that are thicker are thick."""
 
 
 class PolygonShape(Table):
@@ -70,12 +74,23 @@ class MeshShape(Table):
         """The mesh about its centroid, and where that is (3,) [m]."""
         return _about_middle(mesh_in_file(self.file), self.scale)
 
+    def thinnest_sheet(self, spacing: float) -> float:
+        """How thick its thinnest sheet is [m]; infinite where all are thicker than `THIN` spacings [m]."""
+        return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
+
 
 @lru_cache(maxsize=8)
 def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
     """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
     middle = found.mesh.moments().centre
     return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
+
+
+@lru_cache(maxsize=8)
+def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
+    """Of a mesh times a scale [m]; infinite where all are thicker than a reach [m]. Once, as it takes thousands of
+    points."""
+    return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:

@@ -63,7 +63,7 @@ class PlaneSolid(SolidTable):
         lower, upper = np.array(self._ends or (position - 1.0, position + 1.0))
         return HalfSpace(unit, 0.0, lower - position, upper - position), position
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return np.inf
 
     def _unit(self) -> Points:

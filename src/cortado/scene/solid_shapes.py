@@ -36,7 +36,7 @@ class BoxSolid(SolidTable):
     def shape_about(self) -> tuple[Solid, Points]:
         return box_about(self.lower, self.upper)
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return float(np.subtract(self.upper, self.lower).min())
 
 
@@ -54,7 +54,7 @@ class SphereSolid(SolidTable):
         centre = np.array(self.centre)
         return Round(np.zeros_like(centre), self.radius), centre
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return 2.0 * self.radius
 
 
@@ -74,7 +74,7 @@ class CapsuleSolid(SolidTable):
         start, end = np.array(self.start), np.array(self.end)
         return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return 2.0 * self.radius
 
 
@@ -99,7 +99,7 @@ class CylinderSolid(SolidTable):
     def shape_about(self) -> tuple[Solid, Points]:
         return cylinder_about(self.base, self.radius, self.height, self.axis)
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return min(2.0 * self.radius, self.height)
 
 
@@ -139,7 +139,7 @@ class CupSolid(SolidTable):
         shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
         return shape, np.array(self.base) + middle * up
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return self.thickness
 
     def _middle(self) -> float:
@@ -157,7 +157,7 @@ class PolygonSolid(PolygonShape, SolidTable):
     measures: ClassVar = ("corners",)
     least_thickness: ClassVar = 0.5
 
-    def thinnest(self) -> float:
+    def thinnest(self, spacing: float) -> float:
         return Polygon(np.array(self.corners)).thinnest()
 
 
@@ -165,9 +165,10 @@ class MeshSolid(MeshShape, SolidTable):
     """What a mesh of triangles holds, in 3-D."""
 
     measures: ClassVar = ("scale",)
+    least_thickness: ClassVar = 0.5
 
-    def thinnest(self) -> float:
-        return np.inf
+    def thinnest(self, spacing: float) -> float:
+        return self.thinnest_sheet(spacing)
 
 
 AnySolid = Annotated[

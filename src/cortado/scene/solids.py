@@ -102,8 +102,9 @@ class SolidTable(Coloured):
         return self.model_copy(update={**grown, "position": tuple(self.middle().tolist())})
 
     @abstractmethod
-    def thinnest(self) -> float:
-        """Of its thinnest part [m]; infinite where that is not known."""
+    def thinnest(self, spacing: float) -> float:
+        """Of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets are all thicker than a
+        few spacings [m]."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
         """This table, at a path, as it is in a container, which shapes without an end need to know."""
@@ -211,6 +212,6 @@ def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
     """A solid is so thick that there is room for the particles of its walls."""
     least = solid.least_thickness * spacing
-    if solid.side == "outside" and solid.thinnest() < least * (1.0 - 1e-6):
-        found, of = Words(f"only {solid.thinnest():g} m thick"), "one spacing" if least == spacing else "half a spacing"
+    if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
+        found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
         raise field_error(path, found, f"at least {of}, {least:g} m, thick")

@@ -209,8 +209,9 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
 
 def _step_beside_solids(scene: SceneTables) -> float:
     """How far fluid may move in a step beside its solids [m]; infinite beside those alone that it is inside of."""
-    around = [THROUGH * solid.thinnest() for solid in scene.solid if solid.side == "outside"]
-    return min(*around, BESIDE * scene.discretisation.spacing) if around else inf
+    spacing = scene.discretisation.spacing
+    around = [THROUGH * solid.thinnest(spacing) for solid in scene.solid if solid.side == "outside"]
+    return min(*around, BESIDE * spacing) if around else inf
 
 
 def _depth_limits(scene: SceneTables, gravity: Points) -> Points:

@@ -174,7 +174,7 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
     bodies = [number for number, table in enumerate(moved) if table.motion == "free"]
     sides = scene.container.solids(scene.dimension, discrete.lattice.support)
     still = [Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides]
-    still += [_obstacle(table, table.solid()) for table in scene.solid if not table.moves]
+    still += [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
     found = []
     for body, number in enumerate(bodies):
         table, own = moved[number], walls.solid == number
@@ -185,7 +185,7 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
         for against, one in enumerate(moved):
             if against != number:
                 other = bodies.index(against) if against in bodies else -1
-                found.append(Touching(body, against, other, [_obstacle(one, one.own_solid())], points))
+                found.append(Touching(body, against, other, [_obstacle(one, one.own_solid(), spacing)], points))
     return found
 
 
@@ -225,10 +225,11 @@ def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     """Where particles may go. Walls act through the pressure: without it they hold nothing."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)
-    still = [_obstacle(table, table.solid()) for table in scene.solid if not table.moves]
-    moved = [_obstacle(table, table.own_solid()) for table in moving(scene.solid)]
+    spacing = scene.discretisation.spacing
+    still = [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
+    moved = [_obstacle(table, table.own_solid(), spacing) for table in moving(scene.solid)]
     solids = (tuple(still), tuple(moved)) if scene.forces.pressure else ((), ())
-    return Walled(region, discrete.near, scene.discretisation.spacing, *solids, discrete.periods)
+    return Walled(region, discrete.near, spacing, *solids, discrete.periods)
 
 
 def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
@@ -237,5 +238,5 @@ def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
     return {table.name: NamedSolid(numbers[table.name], padded(table.middle()[None])[0]) for table in scene.solid}
 
 
-def _obstacle(table: SolidTable, solid: Solid) -> Obstacle:
-    return Obstacle(table.name, solid, table.side == "inside", table.thinnest())
+def _obstacle(table: SolidTable, solid: Solid, spacing: float) -> Obstacle:
+    return Obstacle(table.name, solid, table.side == "inside", table.thinnest(spacing))
