@@ -11,6 +11,7 @@ import trimesh
 
 import cortado
 from cortado import ComputationError, InputError, Trajectory
+from cortado.pictures import held_volume
 from cortado.pictures.scale import Scale
 from cortado.runs.exports import by_vtk
 from cortado.runs.exports.export import FORMATS
@@ -145,7 +146,7 @@ def test_usd_has_a_surface_that_encloses_the_fluid_and_solids_in_motion(tmp_path
         corners = np.array(surface.GetFaceVertexIndicesAttr().Get(code)).reshape(-1, 3)
         mesh = trimesh.Trimesh(np.array(surface.GetPointsAttr().Get(code)), corners, process=False)
         assert mesh.is_watertight  # with rounded edges, and flat where the fluid touches walls
-        assert 0.85 < mesh.volume / (0.2**2 * 0.4) < 1.0
+        assert mesh.volume == pytest.approx(0.2**2 * 0.4, rel=0.01)
         assert mesh.bounds[:, 2].tolist() == pytest.approx([0.0, 0.2])
         assert mesh.center_mass[1] == pytest.approx(0.1 + 0.05 * code, abs=0.01)
         np.testing.assert_allclose(surface.GetVelocitiesAttr().Get(code)[0], [0.0, 0.1, 0.0], atol=1e-6)
@@ -298,6 +299,16 @@ def test_usd_moves_late_states_to_whole_time_codes(tmp_path, capsys):
         assert same_points(np.c_[own, np.ones(len(own))] @ matrix[:, :3], wanted)
     told = capsys.readouterr().out
     assert "by at most 2 ms; the last state, 10 ms after the last whole frame, is left out" in told
+
+
+def test_a_surface_that_does_not_enclose_the_fluid_is_told(tmp_path, capsys, monkeypatch):
+    trajectory()[2:].export(tmp_path / "held", to="ply")
+    assert "encloses" not in capsys.readouterr().out
+    monkeypatch.setattr(held_volume, "MOST", 0.0)
+    trajectory()[2:].export(tmp_path / "cut", to="ply")
+    told = re.search(r"cut: at 1 s the surface encloses (\S+) m³, where there are 0.016 m³", capsys.readouterr().out)
+    mesh = trimesh.load(tmp_path / "cut/surface_00000.ply", process=False)
+    assert told and float(told[1]) == pytest.approx(mesh.volume, rel=1e-3)
 
 
 # ---- for series --------------------------------------------------------------------------------------------------

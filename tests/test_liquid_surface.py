@@ -12,6 +12,7 @@ from cortado.device.bands import BandLauncher
 from cortado.errors import ComputationError
 from cortado.pictures import liquid as liquid_module
 from cortado.pictures.contained_liquid import contained_liquid
+from cortado.pictures.held_volume import enclosed, with_volume
 from cortado.pictures.liquid import liquid_surface
 from cortado.pictures.painter import stage_of
 from cortado.pictures.particles import Particles
@@ -145,7 +146,7 @@ def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
     positions = simulation.positions
     found = contained_liquid(stage_of(simulation.scene, positions), positions, np.ones_like(positions))
     mesh = mesh_of(found)
-    assert mesh.is_watertight and mesh.volume == pytest.approx(len(positions) * simulation.lattice.cell, rel=0.03)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(len(positions) * simulation.lattice.cell, rel=0.002)
     size = SPACING * np.array(shape)
     if container == "cylinder":
         np.testing.assert_allclose(np.linalg.norm(found.points[:, ::2], axis=1).max(), 0.5 * size[0], rtol=1e-5)
@@ -156,6 +157,65 @@ def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
     on_floor = np.abs(found.points[:, 1]) < 1e-6
     np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-5)
     assert np.median(found.normals[on_floor, 1]) == pytest.approx(-1.0, abs=1e-6)
+
+
+def lattice(*counts):
+    """(n, 3) [m]"""
+    axes = [SPACING * (np.arange(count) + 0.13) for count in counts]
+    return np.stack([one.ravel() for one in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+
+RANDOM = np.random.default_rng(0)
+APART = 11.3 * lattice(4, 4, 4) + RANDOM.uniform(0.0, 2.0 * SPACING, (64, 3))
+FLUIDS = {
+    "drops of one particle": APART,
+    "drops of two": np.concatenate([APART, APART + [0.7 * SPACING, 0.0, SPACING]]),
+    "thread": lattice(20, 1, 1),
+    "sheet": lattice(12, 12, 1),
+    "sheet out of order": lattice(14, 14, 1) + 0.02 * RANDOM.standard_normal((196, 3)),
+    "cube": lattice(8, 8, 8),
+    "spray in a twentieth of space": RANDOM.uniform(0.0, 16.0 * SPACING, (200, 3)),
+    "spray in half of space": RANDOM.uniform(0.0, 12.0 * SPACING, (864, 3)),
+    "slab and spray": np.concatenate([lattice(12, 4, 12), RANDOM.uniform([0, 0.5, 0], [1.2, 1.5, 1.2], (200, 3))]),
+}
+
+
+@pytest.mark.parametrize("fluid", FLUIDS)
+def test_exported_surfaces_enclose_the_volume_of_the_fluid(fluid):
+    positions = FLUIDS[fluid] - 2.0
+    box = {"shape": "box", "lower": [-9.0, -9.0, -9.0], "upper": [9.0, 9.0, 9.0]}
+    stage = stage_of(scene(discretisation={"spacing": SPACING}, container=box), positions)
+    found = contained_liquid(stage, positions, np.ones_like(positions))
+    mesh, wanted = mesh_of(found), SPACING**3
+    assert mesh.volume == pytest.approx(len(positions) * wanted, rel=0.01)
+    assert enclosed(found.points, found.triangles) == pytest.approx(mesh.volume, rel=1e-6)
+    if "drops" in fluid:
+        each = [part.volume for part in mesh.split()]
+        np.testing.assert_allclose(each, len(positions) / 64 * wanted, rtol=0.01)
+
+
+def test_bodies_of_fluid_are_moved_each_by_its_own_distance():
+    """A ball around 100 particles, a block with a hollow, and a flat side that stays; in closed forms."""
+    ball = trimesh.creation.icosphere(4, 0.35)
+    outer, inner = trimesh.creation.box((1.0, 1.0, 1.0)), trimesh.creation.box((0.4, 0.4, 0.4))
+    inner.invert()
+    middles = lattice(10, 10, 10) + 0.037 - 0.5
+    solid = middles[np.abs(middles).max(axis=1) > 0.25]
+    within = middles[np.linalg.norm(middles, axis=1) < 0.3][:100]
+    parts = [(ball, [9.0, 0.0, 0.0]), (outer, [0.0, 0.0, 0.0]), (inner, [0.0, 0.0, 0.0])]
+    points = np.concatenate([mesh.vertices + shift for mesh, shift in parts])
+    ways = np.concatenate([mesh.vertex_normals for mesh, _ in parts])
+    ways[-8:] = 0.0
+    ways[-16:-8] *= np.sqrt(3.0)  # each side by the same
+    begins = np.cumsum([0, len(ball.vertices), 8])
+    triangles = np.concatenate([mesh.faces + begin for (mesh, _), begin in zip(parts, begins, strict=True)])
+    moved = with_volume(points, triangles, ways, np.concatenate([within + [9.0, 0.0, 0.0], solid]), SPACING)
+    radius = (len(within) * SPACING**3 / (ball.volume / 0.35**3)) ** (1.0 / 3.0)
+    away = np.linalg.norm(moved[: len(ball.vertices)] - [9.0, 0.0, 0.0], axis=1)
+    np.testing.assert_allclose(away, radius, rtol=2e-3)
+    side = (len(solid) * SPACING**3 + 0.4**3) ** (1.0 / 3.0)
+    np.testing.assert_allclose(np.abs(moved[-16:-8]), 0.5 * side, rtol=1e-9)
+    np.testing.assert_array_equal(moved[-8:], points[-8:])
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2, 5])

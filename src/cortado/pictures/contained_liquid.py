@@ -10,16 +10,21 @@ from cortado.device.bands import BandLauncher
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.pictures.environment import environment_of
-from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.held_volume import with_volume
+from cortado.pictures.liquid import liquid_surface, sized_level
 from cortado.pictures.stage import Stage
 from cortado.pictures.surface import Surface
 from cortado.pictures.wetting import particles_of, wetting
 from cortado.scene.containers import CylinderContainer
 
+PASSES = 3
+"""Of moving points out, some beyond a wall, and back to it."""
+
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
     """The surface of what particles at positions (n, 3) [m] with colours (n, 3) fill, see `liquid_surface`, in the axes
     of the scene. Where fluid touches walls it is extended behind them, and its points there are then moved to the wall.
+    The others are moved until the surface encloses the volume of the particles; see `with_volume`.
 
     Raises:
         ComputationError: there is no surface.
@@ -27,20 +32,26 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
     launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
     with WARP:
         own = particles_of(stage, positions, colours, launch)
-        found = liquid_surface(wetting(stage, environment_of(stage), own, launch), stage.spacing, launch)
+        fluid = wetting(stage, environment_of(stage), own, launch)
+        found = liquid_surface(fluid, stage.spacing, launch, sized_level(fluid, stage.spacing, launch))
+        places = own.places.numpy().astype(np.float64)
         points, normals = (one.numpy().astype(np.float64) for one in (found.points, found.normals))
         triangles, colours = found.triangles.numpy().reshape(-1, 3), found.colours.numpy()
-    if stage.cuts:
-        kept = _in_room(stage, points)
-        beyond = np.linalg.norm(points - kept, axis=1)
-        is_moved = beyond > 0.0
-        normals[is_moved] = (points - kept)[is_moved] / beyond[is_moved, None]
-        points = kept
+    kept = _in_room(stage, points)
+    beyond = np.linalg.norm(points - kept, axis=1)
+    is_free = beyond == 0.0
+    normals[~is_free] = (points - kept)[~is_free] / beyond[~is_free, None]
+    points, ways = kept, np.where(is_free[:, None], normals, 0.0)
+    for _ in range(PASSES):
+        points = _in_room(stage, with_volume(points, triangles, ways, places, stage.spacing))
     return Surface(points @ stage.frame + stage.origin, triangles, normals @ stage.frame, colours)
 
 
 def _in_room(stage: Stage, points: Points) -> Points:
-    """(p, 3) the points of the container that are nearest to points (p, 3) [m], in the frame of the picture."""
+    """(p, 3) the points of the container, where it cuts fluid, that are nearest to points (p, 3) [m], in the frame of
+    the picture."""
+    if not stage.cuts:
+        return points
     lower, upper = stage.room
     places = points @ stage.glass_frame.T
     if isinstance(stage.container, CylinderContainer):

@@ -29,6 +29,15 @@ MOST_CELLS = 1 << 26
 """One spacing wide, in which particles are looked for."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
 """[1/m] of scattering and of absorption, which cannot be seen."""
+WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
+"""Sum of the bumps of all particles around one within a lattice; on a side, an edge or a corner of the lattice it is
+less by exp(-1.93 a²), where the mean place of these particles is a spacings aside."""
+DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
+"""Parts of the level that particles have which are alone, and which are in a sheet, or in a spray that fills half of
+space."""
+FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
+"""Parts of space that are filled: up to the first the level goes from that of a drop to that of a sheet, and from the
+second to the third from there to that within fluid."""
 FULL = wp.constant(wp.float32(2.84))
 """Sum of the bumps of others near a particle from which on it is not in a thin sheet."""
 
@@ -106,6 +115,28 @@ def find_looks(
     media[v] = wp.vec2(wp.exp(near[3] / weight) - CLEAREST, wp.exp(near[4] / weight) - CLEAREST)
 
 
+@wp.func
+def place(s: NearParticles, j: wp.int32):
+    """Places add up to their mean, and how many they are."""
+    x = s.places[j] - s.lower
+    return wp.vec4(x[0], x[1], x[2], 1.0)
+
+
+place_near = sum_near(place, wp.vec4)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: wp.array(dtype=wp.float32)):
+    """Less volume where space is not filled, such as in drops and sheets: their level is around what they fill."""
+    i = first + wp.tid()
+    near = place_near(s, s.places[i], reach)
+    off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing
+    fill = near[3] / WITHIN * wp.exp(ASIDE * wp.dot(off, off))
+    thin = wp.lerp(DROP, SHEET, wp.min(fill / FILLED[0], 1.0))
+    dense = wp.clamp((fill - FILLED[1]) / (FILLED[2] - FILLED[1]), 0.0, 1.0)
+    volumes[i] = s.volumes[i] * wp.lerp(thin, 1.0, dense)
+
+
 Level = tuple[Any, wp.array]
 """Of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
 
@@ -115,6 +146,16 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> 
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     s = near_particles(particles, ends, spacing, reach, launch)
     return level_blocks(s, ends, _cube(particles) * spacing, reach, launch), s
+
+
+def sized_level(particles: Particles, spacing: float, launch: BandLauncher) -> Level:
+    """As `liquid_level`, but that drops, sheets and spray have about the volume of their particles."""
+    reach, ends = REACH * spacing, _shown(particles, spacing, launch)
+    s = near_particles(particles, ends, spacing, reach, launch)
+    volumes = wp.empty_like(s.volumes)
+    launch(find_sizes, len(volumes), s=s, reach=reach, volumes=volumes)
+    s.volumes = volumes
+    return level_blocks(s, ends, _cube(particles) * spacing, reach, launch)
 
 
 def liquid_surface(

@@ -51,8 +51,9 @@ def export(
     whole = run.whole if to == "usd" else run.series
     with track(len(trajectory if whole is None else whole.times), "export") as advance:
         path = FORMATS[to](run, into, advance)
-    if whole is not None and whole.in_words:
-        announce(f"{path.name}: {whole.in_words}.")
+    for said in ("" if whole is None else whole.in_words, run.in_words):
+        if said:
+            announce(f"{path.name}: {said}.")
     return path
 
 

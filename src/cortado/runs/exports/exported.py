@@ -10,6 +10,7 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.pictures.contained_liquid import contained_liquid
+from cortado.pictures.held_volume import enclosed
 from cortado.pictures.painter import colours_of
 from cortado.pictures.scale import Scale
 from cortado.pictures.shown_solids import ShownSolid, shown_solids
@@ -26,6 +27,8 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 
+UNLIKE = 0.05
+"""Of the volume of the fluid: by how much that of a surface differs before it is said."""
 ROUND = 0.05
 """How wide faces of round solids are, in sizes of the solid."""
 
@@ -109,6 +112,8 @@ class Exported:
         parts = _part_names(shown)
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
         self._trajectory = trajectory
+        self._held = (0.0, 1.0)
+        """[s] the frame whose surface is farthest from the volume of the fluid, and the part of it that it encloses."""
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -142,6 +147,15 @@ class Exported:
         states = enumerate(zip(whole.recorded.tolist(), whole.shifts.tolist(), strict=True))
         return (self._frame(self._trajectory[k].moved(shift), k, solids, frame) for frame, (k, shift) in states)
 
+    @property
+    def in_words(self) -> str:
+        """How far surfaces of frames that were made are from the volume of the fluid; empty where they are near."""
+        time, part = self._held
+        if abs(part - 1.0) <= UNLIKE:
+            return ""
+        whole = self.spacing**3 * self._trajectory.particles
+        return f"at {time:.4g} s the surface encloses {part * whole:.4g} m³, where there are {whole:.4g} m³ of fluid"
+
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
         """A state near one that was recorded, with the solids where they are in a frame of their motion."""
         within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions)
@@ -154,6 +168,9 @@ class Exported:
         placed = _first_of_each(posed(self.scene, solids, number))
         poses = {name: Pose(_turn_in_space(one.turn), in_space(one.position[None])[0]) for name, one in placed.items()}
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
+        if surface is not None and self._stage.picture.surface != "spheres":
+            part = enclosed(surface.points, surface.triangles) / (self.spacing**3 * len(positions))
+            self._held = max(self._held, (frame.time, part), key=lambda one: abs(one[1] - 1.0))
         return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
 
     @cached_property

@@ -37,7 +37,9 @@ class WholeFrames:
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
-            return cls(marks.rate, whole, recorded, whole - times[recorded], float(times[-1] - whole[-1]))
+            shifts = whole - times[recorded]
+            shifts[np.abs(shifts) < EVEN / marks.rate] = 0.0
+            return cls(marks.rate, whole, recorded, shifts, float(times[-1] - whole[-1]))
         steps = np.diff(times)
         if not len(steps):
             return cls(24.0, times, np.zeros(1, dtype=np.intp), np.zeros(1), 0.0)

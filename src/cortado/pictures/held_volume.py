@@ -1,0 +1,85 @@
+"""Surfaces that enclose the volume of their particles: around each body of fluid that is apart from others, all points
+are moved in or out by the same distance."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cortado.device.cores import usable_cores
+from cortado.discretise.shapes import Points
+
+LINKED = 1.25
+"""In spacings: particles that are nearer to each other are of one body."""
+NEAR = 2.0
+"""In spacings: particles that link to no surface are of the body of the nearest one, unless it is farther away."""
+MOST = 1.0
+"""In spacings, by which points are moved at most."""
+ROUNDS = 20
+"""Of Newton's method, each by a fifth of a spacing at most."""
+
+
+def enclosed(points: Points, triangles: np.ndarray) -> float:
+    """The volume [m³] within triangles (t, 3) of points (p, 3) [m]."""
+    a, b, c = (points[corner] - points[0] for corner in triangles.T)
+    return float(_sixth(a, b, c).sum())
+
+
+def with_volume(points: Points, triangles: np.ndarray, ways: Points, places: Points, spacing: float) -> Points:
+    """The points (p, 3) [m] of a surface with triangles (t, 3), moved along ``ways`` (p, 3), unit vectors outwards or 0
+    where points stay, until each body of fluid has ``spacing``³ for each of its particles at ``places`` (n, 3) [m]."""
+    of_points, of_particles = _bodies(points, triangles, places, spacing)
+    count = max(of_points.max(), of_particles.max(initial=-1)) + 1
+    wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
+    polynomial = _volumes(points - points[0], ways, triangles, of_points, count)
+    shift = np.zeros(count)
+    for _ in range(ROUNDS):
+        volume, slope = polynomial(shift)
+        step = np.divide(wanted - volume, slope, out=np.zeros(count), where=slope > 0.0)
+        shift = np.clip(shift + np.clip(step, -0.2 * spacing, 0.2 * spacing), -MOST * spacing, MOST * spacing)
+    return points + shift[of_points][:, None] * ways
+
+
+def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of the bodies of fluid that points (p,) and particles (n,) belong to; -1 of particles without one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    def parts(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        links = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+        return np.asarray(connected_components(links, directed=False)[1])
+
+    sheets = parts(len(points), triangles[:, :2].T.ravel(), triangles[:, 1:].T.ravel())
+    tree, n = cKDTree(places), len(places)
+    near = tree.query(points, workers=usable_cores())[1]
+    pairs = tree.query_pairs(LINKED * spacing, output_type="ndarray")
+    first, second = np.append(pairs[:, 0], near), np.append(pairs[:, 1], n + sheets)
+    found = parts(n + sheets.max() + 1, first, second)
+    of_points, of_particles = found[n + sheets], found[:n]
+    alone = np.flatnonzero(~np.isin(of_particles, of_points))
+    if len(alone):
+        distances, nearest = cKDTree(points).query(places[alone], workers=usable_cores())
+        of_particles[alone] = np.where(distances < NEAR * spacing, of_points[nearest], -1)
+    return of_points, of_particles
+
+
+def _volumes(
+    points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
+) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """The function that gives the volumes (bodies,) [m³] and their slopes [m²] where points of bodies (p,) are moved
+    along their ways by distances (bodies,) [m]: a volume is a cubic polynomial of its distance."""
+    (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
+    own = bodies[triangles[:, 0]]
+    terms = (
+        _sixth(a, b, c),
+        _sixth(x, b, c) + _sixth(a, y, c) + _sixth(a, b, z),
+        _sixth(x, y, c) + _sixth(x, b, z) + _sixth(a, y, z),
+        _sixth(x, y, z),
+    )
+    c0, c1, c2, c3 = (np.bincount(own, term, count) for term in terms)
+    return lambda d: (c0 + d * (c1 + d * (c2 + d * c3)), c1 + d * (2.0 * c2 + 3.0 * d * c3))
+
+
+def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
+    """(t,) a sixth of the determinants of vectors (t, 3)."""
+    return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
