@@ -209,7 +209,8 @@ def test_bodies_of_fluid_are_moved_each_by_its_own_distance():
     ways[-16:-8] *= np.sqrt(3.0)  # each side by the same
     begins = np.cumsum([0, len(ball.vertices), 8])
     triangles = np.concatenate([mesh.faces + begin for (mesh, _), begin in zip(parts, begins, strict=True)])
-    moved = with_volume(points, triangles, ways, np.concatenate([within + [9.0, 0.0, 0.0], solid]), SPACING)
+    places = np.concatenate([within + [9.0, 0.0, 0.0], solid])
+    moved = with_volume(points, triangles, ways, places, SPACING, lambda points: points)
     radius = (len(within) * SPACING**3 / (ball.volume / 0.35**3)) ** (1.0 / 3.0)
     away = np.linalg.norm(moved[: len(ball.vertices)] - [9.0, 0.0, 0.0], axis=1)
     np.testing.assert_allclose(away, radius, rtol=2e-3)

@@ -1,6 +1,7 @@
 """The surface of a fluid that ends at the walls of its container, as other programs need it: pictures are cut there."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from cortado.pictures.surface import Surface
 from cortado.pictures.wetting import particles_of, wetting
 from cortado.scene.containers import CylinderContainer
 
-PASSES = 3
-"""Of moving points out, some beyond a wall, and back to it."""
+SAME = 1e-6
+"""In spacings: points that a turn into the axes of the container and back moves by less are where they were."""
 
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
@@ -39,11 +40,10 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
         triangles, colours = found.triangles.numpy().reshape(-1, 3), found.colours.numpy()
     kept = _in_room(stage, points)
     beyond = np.linalg.norm(points - kept, axis=1)
-    is_free = beyond == 0.0
+    is_free = beyond <= SAME * stage.spacing
     normals[~is_free] = (points - kept)[~is_free] / beyond[~is_free, None]
-    points, ways = kept, np.where(is_free[:, None], normals, 0.0)
-    for _ in range(PASSES):
-        points = _in_room(stage, with_volume(points, triangles, ways, places, stage.spacing))
+    ways, in_room = np.where(is_free[:, None], normals, 0.0), partial(_in_room, stage)
+    points = with_volume(kept, triangles, ways, places, stage.spacing, in_room)
     return Surface(points @ stage.frame + stage.origin, triangles, normals @ stage.frame, colours)
 
 

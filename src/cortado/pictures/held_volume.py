@@ -13,7 +13,9 @@ LINKED = 1.25
 NEAR = 2.0
 """In spacings: particles that link to no surface are of the body of the nearest one, unless it is farther away."""
 MOST = 1.0
-"""In spacings, by which points are moved at most."""
+"""In spacings, by which points are moved at most in a pass."""
+PASSES = 2
+"""Of moving points out, some beyond a wall, and back to it."""
 ROUNDS = 20
 """Of Newton's method, each by a fifth of a spacing at most."""
 
@@ -24,19 +26,28 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
     return float(_sixth(a, b, c).sum())
 
 
-def with_volume(points: Points, triangles: np.ndarray, ways: Points, places: Points, spacing: float) -> Points:
+def with_volume(
+    points: Points,
+    triangles: np.ndarray,
+    ways: Points,
+    places: Points,
+    spacing: float,
+    kept: Callable[[Points], Points],
+) -> Points:
     """The points (p, 3) [m] of a surface with triangles (t, 3), moved along ``ways`` (p, 3), unit vectors outwards or 0
-    where points stay, until each body of fluid has ``spacing``³ for each of its particles at ``places`` (n, 3) [m]."""
+    where points stay, until each body of fluid has ``spacing``³ for each of its particles at ``places`` (n, 3) [m].
+    ``kept``: brings points back to a wall that were moved beyond it."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
-    polynomial = _volumes(points - points[0], ways, triangles, of_points, count)
-    shift = np.zeros(count)
-    for _ in range(ROUNDS):
-        volume, slope = polynomial(shift)
-        step = np.divide(wanted - volume, slope, out=np.zeros(count), where=slope > 0.0)
-        shift = np.clip(shift + np.clip(step, -0.2 * spacing, 0.2 * spacing), -MOST * spacing, MOST * spacing)
-    return points + shift[of_points][:, None] * ways
+    for _ in range(PASSES):
+        volumes, shift = _volumes(points - points[0], ways, triangles, of_points, count), np.zeros(count)
+        for _ in range(ROUNDS):
+            volume, slope = volumes(shift)
+            step = np.divide(wanted - volume, slope, out=np.zeros(count), where=slope > 0.0)
+            shift = np.clip(shift + np.clip(step, -0.2 * spacing, 0.2 * spacing), -MOST * spacing, MOST * spacing)
+        points = kept(points + shift[of_points][:, None] * ways)
+    return points
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
