@@ -97,15 +97,17 @@ def whole_number(what: str, value: Any, least: int) -> int:
 def require_function(what: str, value: Any, *arguments: str) -> None:
     """Raises `InputError`, in a sentence that begins with ``what``, unless a value is None or a function of so many
     arguments, which are described in words."""
-    if value is not None and not callable(value):
-        raise InputError(f"{what} is {shown(value)}, but must be a function, or be left out.")
     if value is not None:
-        require_arguments(what, value, arguments)
+        require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raises `InputError` where a function does not take so many arguments, if Python can tell; ``other``: what else it
-    could be, in words."""
+    """Raises `InputError` for what is no function, or does not take so many arguments, if Python can tell; ``other``:
+    what else it could be, in words."""
+    if not callable(function) or isinstance(function, type):
+        raise InputError(
+            f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
+        )
     try:
         takes = signature(function)
     except (TypeError, ValueError):

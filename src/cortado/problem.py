@@ -5,14 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import (
-    check_step_numbers,
-    check_steps,
-    require_arguments,
-    require_function,
-    require_methods,
-    whole_number,
-)
+from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
 from cortado.calls import public
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError, warn
@@ -26,10 +19,11 @@ from cortado.losses.along_tangents import derivative_along
 from cortado.losses.by_step import LossesByStep
 from cortado.losses.loss import moment_of
 from cortado.particles.state import State
+from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import Residual
 from cortado.rollout.restarts import one_for_each
-from cortado.rollout.rollout import MEMORY_BUDGET, OBSERVED, BackwardStep, Observer, Rollout
+from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.trajectory import noted
@@ -207,7 +201,6 @@ class Problem:
         """The same along several directions, each with an observer of its own, of one run."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
-            require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
             require_arguments("observe", observe, OBSERVED)
             along.append((self._space.checked(directions, "direction"), observe))
         varied = {name for directions, _ in along for name in directions}

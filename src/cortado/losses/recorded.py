@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import require_arguments, require_methods
+from cortado.arrays import require_arguments
 from cortado.code_words import code_words
 from cortado.device.threads import WARP
 from cortado.fixed import fixed
@@ -27,7 +27,6 @@ class Recorded:
     """
 
     def __init__(self, function: WarpFunction):
-        require_methods("function", function, ("__call__",), "a function of positions, velocities and a loss")
         require_arguments("function", function, LAUNCHED)
         self.function = function
 

@@ -6,6 +6,9 @@ from math import isqrt
 
 from cortado.particles.state import State, StateSeries
 
+MEMORY_BUDGET = 8 * 2**30
+"""Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
+
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
     """Steps from one checkpoint to the next: the fewest with which no more states than affordable are alive at a time,

@@ -176,14 +176,6 @@ class ParameterSpace:
             origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
             check_state(state, shapes, origin, simulation)
 
-    def check_directions(self, along: Arrays) -> None:
-        """Whether directions go with a state; raises `InputError`."""
-        for name in self._known.state:
-            if name in along:
-                raise InputError(
-                    f"direction {name} is given, but must be left out: give it among those of the state's fields."
-                )
-
     def _origin(self, rest_density: np.ndarray) -> Origin:
         """Of the particles of a run with these rest densities (phases,)."""
         return origin_of(self._simulation, rest_density)

@@ -29,7 +29,7 @@ class Residual:
 
     def put_aside(self) -> None:
         """Copy what another evaluation is about to overwrite."""
-        self._aside = self.rollout.put_aside()
+        self._aside = PutAside(self.rollout)
 
     def bring_back(self) -> None:
         """Make this the rollout's present evaluation again."""

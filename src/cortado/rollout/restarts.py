@@ -1,6 +1,6 @@
 """Whether a state is one of a simulation: what it belongs to, its numbers, and its clock."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,13 @@ def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int
         if not isinstance(one, RestartState):
             raise InputError(f"state is {shown(one)}, but must be a RestartState, such as trajectory.last_state.")
     return states
+
+
+def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) -> None:
+    """Raises `InputError` where directions have parameters that are ``of_state``, which a state has instead."""
+    if given := [name for name in of_state if name in along]:
+        wanted = "but must be left out: give it among those of the state's fields"
+        raise InputError(f"direction {given[0]} is given, {wanted}.")
 
 
 def check_state(

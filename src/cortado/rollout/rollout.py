@@ -20,7 +20,7 @@ from cortado.device.staying import Staying
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.rollout.checkpoints import Checkpoints, checkpoint_interval
+from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, checkpoint_interval
 from cortado.rollout.chunks import chunk_length
 from cortado.rollout.counted import require_counted
 from cortado.rollout.divergence import diverged
@@ -29,9 +29,6 @@ from cortado.rollout.progress import Progress
 from cortado.rollout.step_sizes import FixedSteps, StepSizes
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepTangent
-
-MEMORY_BUDGET = 8 * 2**30
-"""Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
@@ -142,10 +139,6 @@ class Rollout(Staying):
             self._checkpoints = Checkpoints(self.initial, self._interval)
         self.pending.clear()
         self.progress, self.evaluation = Progress(), next(self._evaluations)
-
-    def put_aside(self) -> PutAside:
-        """What the next evaluation overwrites."""
-        return PutAside(self)
 
     @in_turn
     def bring_back(self, aside: PutAside) -> None:

@@ -20,6 +20,7 @@ from cortado.rollout.host_states import Given, HostStates, States
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.residual import Residual, of_lost, without_lost
+from cortado.rollout.restarts import check_directions
 from cortado.rollout.rollout import BackwardStep, Rollout
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameters.values import Arrays, Values
@@ -164,7 +165,7 @@ class Stepper:
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
-        space.check_directions(along)
+        check_directions(along, self._simulation.known.state)
         dot, parameters_dot = self._dots
         times = place.write("state_dot", state_dot, dot)
         values = self._brought_back(residual)

@@ -28,8 +28,8 @@ from cortado.scene.solids import SolidTable
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting
-from cortado.solvers.obstacles import FINE, Obstacle
-from cortado.solvers.particles import NamedSolid, ParticleSystem
+from cortado.solvers.obstacles import FINE, NamedSolid, Obstacle
+from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy

@@ -1,9 +1,10 @@
-"""Solids as meshes on a device, for those who ask how deep something is in them."""
+"""Solids as solvers know them: by their wall particles, and as meshes, for those who ask how deep something is."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Solid
@@ -24,6 +25,16 @@ class Obstacle:
     """Whether fluid is inside of the shape."""
     thickness: float
     """Of its thinnest part [m], as far as it is known; infinite otherwise."""
+
+
+@dataclass(frozen=True)
+class NamedSolid:
+    """A solid of a scene."""
+
+    number: int
+    """Of its wall particles (`cortado.scene.motions.wall_numbers`)."""
+    middle: NDArray
+    """(3,) where its middle is at the start [m]"""
 
 
 def middle_of(one: Obstacle) -> Points:

@@ -28,6 +28,7 @@ from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.density import Density
 from cortado.solvers.loop import IterationLog, Loop
+from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.integration import integration_kernels
@@ -35,16 +36,6 @@ from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, StepContext
 from cortado.sph.wall_slope import wall_slope_term
 from cortado.sph.wall_sums import WallAction, WallSums
-
-
-@dataclass(frozen=True)
-class NamedSolid:
-    """A solid of a scene."""
-
-    number: int
-    """Of its wall particles (`cortado.scene.motions.wall_numbers`)."""
-    middle: NDArray
-    """(3,) where its middle is at the start [m]"""
 
 
 @dataclass(frozen=True)

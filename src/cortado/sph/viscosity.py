@@ -310,12 +310,11 @@ class Viscosity:
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
     """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
     Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
-    scene, walls = setting.scene, setting.walls
-    sticks = scene.sticks
+    scene, sticks = setting.scene, setting.scene.sticks
     if scene.forces.viscosity == "stress":
         return stress_of(scene)(setting)
     if scene.forces.viscosity == "pairwise":
         return Viscosity(setting, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
     if scene.forces.viscosity == "laminar":
-        return Viscosity(setting, laminar, 2.0, friction=walls.friction if sticks else 0.0)
+        return Viscosity(setting, laminar, 2.0, friction=setting.walls.friction if sticks else 0.0)
     return None

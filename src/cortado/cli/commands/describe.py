@@ -25,8 +25,9 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of
 from cortado.pictures.plan import plan
+from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.choosing import scheduled_bounds
-from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
+from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.runs.frame_choice import FrameChoice
 from cortado.scene.in_words import vector

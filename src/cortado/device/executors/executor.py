@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from cortado.arrays import require_arguments, require_function, require_methods
+from cortado.arrays import require_arguments, require_function
 from cortado.errors import InputError, shown
 
 Item = TypeVar("Item")
@@ -53,7 +53,6 @@ class InProcess(Executor):
 
 def check_call(function: Any, items: Any, on_result: Any) -> None:
     """Raises `InputError` for arguments of `Executor.map` that it cannot work with."""
-    require_methods("function", function, ("__call__",), "a function of an item")
     require_arguments("function", function, ("an item",))
     if not isinstance(items, Iterable):
         raise InputError(f"items is {shown(items)}, but must be a list of them.")

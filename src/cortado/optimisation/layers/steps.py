@@ -10,9 +10,9 @@ from cortado.device.threads import Turn, in_turn
 from cortado.optimisation.layers.layer import STATE, Array, Layer, Named, Shapes, named, on_host, part, unbatched
 from cortado.optimisation.layers.parameters import LayerParameters
 from cortado.optimisation.layers.states import LAST_STEP, check_state, named_states
+from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.parameter_space import STATE_TIME
-from cortado.rollout.rollout import MEMORY_BUDGET
 from cortado.rollout.stepper import Stepper, StepResidual
 from cortado.simulation import Simulation
 

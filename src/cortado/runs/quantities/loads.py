@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from cortado.particles.arrays import padded
 from cortado.runs.quantities.particles import Particles, Sums, vectors
-from cortado.solvers.particles import NamedSolid, ParticleSolver
+from cortado.solvers.obstacles import NamedSolid
+from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import Tangents
 from cortado.sph.wall_sums import WallAction
 
