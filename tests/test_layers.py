@@ -46,6 +46,7 @@ def imports(source: str, module: str, known: set[str]) -> set[str]:
 
 MODULES = modules()
 MOST_PACKAGES = 17
+MOST_LINES = 320
 
 
 def above(sources: dict[str, str]) -> dict[str, set[str]]:
@@ -169,3 +170,11 @@ def test_the_discretisation_is_without_warp(module):
     program = f"import sys, cortado.{module}; print('warp' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert found == ["False"], f"cortado.{module} imports Warp on the way"
+
+
+def test_no_file_has_more_than_one_topic():
+    """By its length; the longest ones hold one."""
+    long = {
+        name: n for name, path in MODULES.items() if (n := len(path.read_text(encoding="utf-8").splitlines())) > 320
+    }
+    assert not long

@@ -12,7 +12,7 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cortado.errors import ComputationError, InputError
 from cortado.files.atomic import sentences, unfinished, write_fully
-from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frames_seed, steps_seed
+from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frame_checksum, frames_seed, steps_seed
 
 
 class TrajectoryWriter:
@@ -155,7 +155,7 @@ class TrajectoryWriter:
                 raise InputError(f"Expected {name} of shape {first.shape}, found {array.shape}.")
             rows[f"cortado/states/{name}"] = array.tobytes()
         moment = self._layout.times[frame] if time is None else np.float64(time)
-        checksum = _frame_checksum(self._frames_checksum, moment, number, rows.values())
+        checksum = frame_checksum(self._frames_checksum, moment, number, rows.values())
         with self._refusal():
             for name, row in rows.items():
                 self._write(name, frame * len(row), row)
@@ -286,7 +286,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     marks = tuple(map(float, own.attrs.get("marks", ())))
     checksum = frames_seed((particles, dimension), kinds, constants, origin, marks)
     for k in range(frames):
-        checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
+        checksum = frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
     records = _records(diagnostics, record) if record.names else np.zeros(0)
     if checksum != frames_checksum or zlib.crc32(records.tobytes(), steps_seed(record)) != steps_checksum:
         return None
@@ -295,13 +295,6 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
     named = {"others": others, "constants": constants, "diagnostics": diagnostics}
     return arrays | {"times": times, "steps": numbers, "origin": origin, "marks": marks or None, **named}
-
-
-def _frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
-    """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
-    for content in (time.tobytes(), number.tobytes(), *rows):
-        checksum = zlib.crc32(content, checksum)
-    return checksum
 
 
 def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -159,6 +159,13 @@ def frames_seed(
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
+
+
+def frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
+    """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
+    for content in (time.tobytes(), number.tobytes(), *rows):
+        checksum = zlib.crc32(content, checksum)
+    return checksum
 
 
 def steps_seed(records: np.dtype[Any]) -> int:
