@@ -485,6 +485,10 @@ NOWHERE = {
     "a gauge in a solid": (WaveGauge([0.58, 0.0]), "in the solid 'block'"),
     "a floor in millimetres": (WaveGauge([0.3, 0.0], 50.0), "has its floor at 50 m, above the container"),
     "a plane outside": (FlowRate([0.9, 0.0], [1.0, 0.1]), "has its plane through .* outside of the container"),
+    "a floor below the container": (WaveGauge([0.3, 0.0], -5.0), "floor at -5 m, .* begins at 0 m: it reads 5 m less"),
+    "a floor in the water": (WaveGauge([0.3, 0.0], 0.1), "floor at 0.1 m, .* begins at 0 m: it reads 0.1 m more"),
+    "a radius in millimetres": (WaveGauge([0.3, 0.0], radius=50.0), "radius of 50 m, more than the container"),
+    "a reach in millimetres": (FlowRate([0.3, 0.0], [1.0, 0.0], 50.0), "reach of 50 m, more than the container"),
     "a region without walls": (WallForce([0.3, 0.35], [0.32, 0.37]), "without walls"),
 }
 
@@ -501,6 +505,47 @@ def test_a_sensor_that_can_never_see_fluid_is_warned_of_before_the_run(sensor, w
         times, column = dt * np.arange(4), [*sensor.columns(2)][:1]
         observed = cortado.measured.SensorSeries(sensor, times, np.zeros((4, 1)), 2, column)
         cortado.measured.Experiment(simulation, {"mine": observed})
+
+
+@pytest.mark.parametrize(
+    ("sensor", "metres"),
+    [
+        (PressureProbe([300.0, 100.0]), "315.8"),
+        (PressureProbe([0.2, -2.0]), "2.025"),
+        (WaveGauge([5.0, 0.0]), "4.625"),
+        (FlowRate([0.0, 5.0], [0.0, 1.0]), "4.625"),
+    ],
+)
+def test_a_sensor_far_from_all_fluid_is_warned_of_without_a_container(sensor, metres):
+    simulation = cortado.Simulation(plane(container={"shape": "none"}))
+    with pytest.warns(
+        CortadoWarning, match=f"the sensor 'mine' is {metres} m from the fluid and the solids, which begin from"
+    ):
+        Watch(simulation, simulation.rollout(1), sensors={"mine": sensor})
+
+
+def test_a_sensor_near_fluid_without_a_container_is_not_warned_of(recwarn):
+    simulation = cortado.Simulation(plane(container={"shape": "none"}))
+    near = {
+        "gauge": WaveGauge([0.5, 0.0]),
+        "below": PressureProbe([0.2, -0.3]),
+        "plane": FlowRate([0.2, 9.0], [1.0, 0.0]),
+    }
+    Watch(simulation, simulation.rollout(1), sensors=near)
+    assert not [one for one in recwarn if "the sensor" in str(one.message)]
+
+
+def test_a_direction_may_be_as_short_or_as_long_as_a_number(recwarn):
+    unit = FlowRate([0.2, 0.1], [1.0, 2.0]).normal
+    for size in (5e-321, 1e-200, 1e-50, 1e50, 1e300):
+        np.testing.assert_allclose(FlowRate([0.2, 0.1], [size, 2.0 * size]).normal, unit, rtol=1e-3)
+    named = {"kind": "flow_rate", "name": "thin", "position": [0.2, 0.1], "normal": [1e-320, 0.0]}
+    read = cortado.Simulation(plane(sensor=[named])).run(1).sensors["thin"]["flow_rate"]
+    assert np.isfinite(read).all()
+    assert cortado.Simulation(plane(forces={"gravity": [0.0, -1e-320]}, sensor=[GAUGE])).run(1).sensors["level"]
+
+
+GAUGE = {"kind": "wave_gauge", "name": "level", "position": [0.2, 0.1]}
 
 
 def within_plates(dimension, gap):

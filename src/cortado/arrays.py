@@ -170,3 +170,13 @@ def require_names(what: str, names: Any) -> list[Any]:
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """A finite vector (d,) that is not 0 with the length 1, also where the square of its own is too small or too large
+    for a number."""
+    size = np.linalg.norm(vector)
+    if not 0.0 < size < np.inf:
+        vector = vector / np.abs(vector).max()
+        size = np.linalg.norm(vector)
+    return np.asarray(vector / size)

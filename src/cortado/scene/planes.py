@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import PrivateAttr
 
+from cortado.arrays import unit
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.primitives import HalfSpace
 from cortado.discretise.solids.solid import Solid
@@ -67,4 +68,4 @@ class PlaneSolid(SolidTable):
         return np.inf
 
     def _unit(self) -> Points:
-        return np.asarray(np.array(self.normal) / np.linalg.norm(self.normal))
+        return unit(np.array(self.normal))

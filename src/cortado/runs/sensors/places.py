@@ -9,10 +9,10 @@ from cortado.discretise.shapes import Points, corners, grid
 from cortado.errors import warn
 from cortado.runs.sensors.flow_rate import FlowRate
 from cortado.runs.sensors.pressure_probe import PressureProbe
+from cortado.runs.sensors.sensor import Cut, reach_of
 from cortado.runs.sensors.shut_off import is_shut_off
 from cortado.runs.sensors.wall_force import WallForce
 from cortado.runs.sensors.wave_gauge import WaveGauge
-from cortado.scene.discrete_scene import Lattice
 from cortado.scene.scene import Scene
 from cortado.scene.sentences import point_in_words
 
@@ -22,16 +22,12 @@ MOST = 16
 """Points along an axis by which planes and columns are looked at."""
 
 
-class Prepared(Protocol):
+class Prepared(Cut, Protocol):
     """What is known of a simulation."""
 
     @property
     def scene(self) -> Scene:
         """What is simulated."""
-
-    @property
-    def lattice(self) -> Lattice:
-        """Constants of the particles at rest."""
 
     @property
     def positions(self) -> Points:
@@ -60,7 +56,7 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     place = sensor.position
     if len(place) != scene.dimension:
         return None  # refused where it is read
-    there = _what_is_at(simulation, _looked_at(scene, sensor))
+    there = _what_is_at(simulation, _looked_at(scene.container.extent() or _of_things(simulation), sensor))
     key = "reach" if isinstance(sensor, FlowRate) else "radius"
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
@@ -68,21 +64,67 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
         names = " and ".join(dict.fromkeys(filter(None, there)))
         reads += f", or what is within its {key}"
         return f"{what} {point_in_words(place)} m, {names}: it reads {reads}{_in_metres(scene, place)}"
-    ends = scene.container.extent()
-    if isinstance(sensor, WaveGauge) and ends is not None:
-        top = float((corners(*ends) @ sensor.up).max())
-        if sensor.floor > top:
-            return f"has its floor at {sensor.floor:g} m, above the container, which ends at {top:g} m"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
         return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
-    return None
+    if scene.container.extent() is None:
+        return _far_away(simulation, sensor, reach_of(wide, simulation))
+    return _of_column(simulation, sensor) if isinstance(sensor, WaveGauge) else _too_wide(scene, key, wide)
 
 
-def _looked_at(scene: Scene, sensor: Any) -> Points:
-    """(n, d) points of a sensor, of which fluid has to reach one [m]."""
-    place, ends = sensor.position, scene.container.extent()
-    if isinstance(sensor, PressureProbe) or ends is None:
+def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
+    """Of a sensor without a container that is further from fluid and solids than its reach and their own size."""
+    ends = _of_things(simulation)
+    points = _looked_at(ends, sensor)
+    gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
+    if isinstance(sensor, FlowRate):
+        off = (corners(*ends) - sensor.position) @ sensor.normal
+        gap = max(float(off.min()), float(-off.max()), 0.0)
+    size = float(np.linalg.norm(ends[1] - ends[0]))
+    if gap <= reach + size:
+        return None
+    begins = f"the fluid and the solids, which begin from {point_in_words(ends[0])} to {point_in_words(ends[1])} m"
+    return f"is {gap:.4g} m from {begins}: it reads nothing unless fluid comes so far (positions are in metres)"
+
+
+def _of_things(simulation: Prepared) -> tuple[Points, Points]:
+    """The box around fluid and walls as they begin, lower and upper (d,) [m]."""
+    points = np.concatenate([simulation.positions, simulation.walls])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
+    """Of a gauge whose column does not begin at the bottom of the container, or reaches far beyond it."""
+    scene, ends = simulation.scene, simulation.scene.container.extent()
+    assert ends is not None
+    heights = corners(*ends) @ gauge.up
+    bottom, top = float(heights.min()), float(heights.max())
+    if gauge.floor > top:
+        return f"has its floor at {gauge.floor:g} m, above the container, which ends at {top:g} m"
+    foot = gauge.position + (gauge.floor - gauge.position @ gauge.up) * gauge.up
+    near = 0.5 * scene.discretisation.spacing
+    stands = any(table.solid().distance_up_to(foot[None], near)[0] < near for table in scene.solid)
+    if abs(gauge.floor - bottom) > near and not stands:
+        reads = f"{abs(gauge.floor - bottom):g} m {'more' if gauge.floor > bottom else 'less'} than the level"
+        return f"has its floor at {gauge.floor:g} m, but the container begins at {bottom:g} m: it reads {reads} there"
+    return _too_wide(scene, "radius", gauge.radius)
+
+
+def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
+    """Of a reach that is larger than a container without periods."""
+    ends = scene.container.extent()
+    if wide is None or ends is None or any(scene.container.periods(scene.dimension)[1]):
+        return None
+    size = float(np.linalg.norm(np.subtract(*ends)))
+    if wide <= size:
+        return None
+    return f"has a {key} of {wide:g} m, more than the container, which is {size:g} m across: it reads no place in it"
+
+
+def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
+    """(n, d) points of a sensor within a box (2, d), of which fluid has to reach one [m]."""
+    place = sensor.position
+    if isinstance(sensor, PressureProbe):
         return np.array([place])
     around = corners(*ends)
     if isinstance(sensor, WaveGauge):

@@ -7,15 +7,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
+from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
 from cortado.discretise.shapes import grid
 from cortado.errors import InputError
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.solids import SolidTable
 
 
-class Reading(Protocol):
-    """A state as sensors see it: a `cortado.losses.Snapshot`."""
+class Cut(Protocol):
+    """A scene that is cut into particles."""
 
     @property
     def dimension(self) -> int:
@@ -24,6 +24,10 @@ class Reading(Protocol):
     @property
     def lattice(self) -> Lattice:
         """Constants of the particles at rest, such as their volume, and along which axes they repeat."""
+
+
+class Reading(Cut, Protocol):
+    """A state as sensors see it: a `cortado.losses.Snapshot`."""
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
@@ -133,7 +137,7 @@ MOST_PARTS = 40
 """Along an axis: enough for a reach of half a spacing, and less is warned of."""
 
 
-def reach_of(given: float | None, at: Reading) -> float:
+def reach_of(given: float | None, at: Cut) -> float:
     """How far from a plane or an axis particles count [m]: what is given, or else two support radii, or five spacings
     where these are more."""
     if given is not None:
@@ -179,10 +183,9 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 def direction(what: str, values: Any) -> NDArray[Any]:
     """The same of length 1."""
     array = point(what, values)
-    length = float(np.linalg.norm(array))
-    if not length:
+    if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
-    return array / length
+    return unit(array)
 
 
 def positive(what: str, value: Any) -> float:
