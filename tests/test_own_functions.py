@@ -373,9 +373,12 @@ def slower(x, v):
     return x
 
 
-def away(x, v, centre):
-    d = centre - x
-    return v if d else x
+def beyond_z(x, v):
+    return x[3] * v
+
+
+def nested(x, v):
+    return wp.vec3(x, v[0], 1.0)
 
 
 @pytest.mark.parametrize(
@@ -385,8 +388,7 @@ def away(x, v, centre):
         (lambda: Body(with_helping_itself), "helping_itself that Body function with_helping_itself calls calls itself"),
         (lambda: Body(waiting), "Body function waiting waits or yields, but must be made by def"),
         (lambda: Body(yielding), "Body function yielding waits or yields, but must be made by def"),
-        (lambda: Body(slower), "Body function slower compares v, which is a vector, but must compare numbers"),
-        (lambda: Body(away, centre=AWAY), "Body function away compares d, which is a vector"),
+        (lambda: Body(beyond_z), r"Body function beyond_z has x\[3\], but must have an index of 0, 1 or 2 there"),
         (lambda: Body(3.0), "Body has 3.0, but must have a function, made by def"),
         (
             lambda: Body(lambda x, v, k: -k * v, k=1.0),
@@ -446,6 +448,21 @@ def away(x, v, centre):
 def test_what_is_no_force_is_a_sentence(make, said):
     with pytest.raises(InputError, match=said):
         make()
+
+
+@pytest.mark.parametrize(
+    ("force", "said"),
+    [
+        (slower, r"slower cannot be compiled: invalid operands .* \(a vector and a vector\); it must use numbers"),
+        (nested, "nested cannot be compiled: no matching constructor for initialization of a vector; it must"),
+    ],
+)
+def test_what_the_compiler_says_is_the_reason_and_nothing_more(force, said, capfd):
+    """It would print pages."""
+    with pytest.raises(InputError, match=said):
+        problem(Body(force))
+    captured = capfd.readouterr()
+    assert "error" not in captured.out + captured.err
 
 
 def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):

@@ -31,25 +31,24 @@ def silenced() -> Iterator[None]:
         return
     wp.config.log_level = wp.LOG_ERROR
     try:
-        with _without_c_stderr():
+        with open(os.devnull, "w") as nothing, c_stderr_to(nothing.fileno()):
             yield
     finally:
         wp.config.log_level = max(chosen, wp.LOG_WARNING)
 
 
 @contextmanager
-def _without_c_stderr() -> Iterator[None]:
-    """What C code writes to stderr goes nowhere: Warp's warns there of a missing CUDA driver."""
+def c_stderr_to(file: int) -> Iterator[None]:
+    """What C code writes to stderr goes to an open file: Warp's warns there of a missing CUDA driver, and its compiler
+    says there what is wrong."""
     try:
         stderr = os.dup(2)
     except OSError:  # there is none
         yield
         return
-    nothing = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nothing, 2)
+        os.dup2(file, 2)
         yield
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
-        os.close(nothing)

@@ -2,21 +2,24 @@
 
 import ast
 import inspect
+import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from tempfile import TemporaryFile
 from types import FunctionType, MappingProxyType
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.device.silence import c_stderr_to
 from cortado.errors import InputError
 from cortado.sph.frozen import Frozen
 from cortado.sph.function_source import definition
 from cortado.sph.function_text import DerivativeCheck, check_names, check_returns
 from cortado.sph.in_precision import REAL, VECTOR, InPrecision
-from cortado.sph.meaning_checks import check_calls, check_helper, check_truths, check_vectors
+from cortado.sph.meaning_checks import check_calls, check_helper, check_truths
 from cortado.sph.python_meaning import meanings
 
 
@@ -32,6 +35,8 @@ class Inputs:
 
 TIME = "t", "time"
 """Names that the time has."""
+TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
+"""How a compiler writes those of vectors and numbers."""
 INPUTS = {
     "Body": Inputs(("x", "v")),
     "Pair": Inputs(("x_ij", "v_ij")),
@@ -91,8 +96,6 @@ def formula(
     check_names(what, written, own, frozen.scope)
     check_calls(what, written, own, frozen.scope)
     check_truths(what, written)
-    given = inputs[:2] if INPUTS[kind].kind == "vector" else ()
-    check_vectors(what, written, {*given, *(name for name, value in values.items() if np.ndim(value))})
     rewritten = InPrecision(what, frozen.scope, own).visit(ast.Module([written], []))
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
     scope = MappingProxyType(frozen.scope)
@@ -132,12 +135,21 @@ def _arguments(
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
     """Compile a module with a user's function, which returns a vector or a number; raises `InputError` where
-    Warp cannot."""
-    try:
-        wp.load_module(module, device)
-    except Exception as error:  # Warp raises any kind for a text that it does not understand
-        reason = str(error).replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
-        wanted = (
-            f"it must use numbers, vectors of three components and functions of Warp alone, and return a {returned}"
-        )
-        raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error
+    Warp cannot, with the first thing that its compiler says of it."""
+    with TemporaryFile() as said:
+        try:
+            with c_stderr_to(said.fileno()):
+                wp.load_module(module, device)
+        except Exception as error:  # Warp raises any kind for a text that it does not understand
+            said.seek(0)
+            found = re.findall("error: (.*)", said.read().decode(errors="replace"))
+            text = (
+                TYPES.sub(lambda one: "a vector" if "vec" in one[0] else "a number", found[0]) if found else str(error)
+            )
+            reason = text.replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
+            wanted = (
+                f"it must use numbers, vectors of three components and functions of Warp alone, and return a {returned}"
+            )
+            raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error
+        said.seek(0)
+        sys.stderr.write(said.read().decode(errors="replace"))

@@ -28,6 +28,12 @@ class InPrecision(ast.NodeTransformer):
         self._what, self._scope, self._local = what, scope, local
         self._counts: dict[str, int] = {}
         """What loops count with, where the text has come to."""
+        self._given = set[str]()
+        """Arguments, of which vectors have three components."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        self._given = {one.arg for one in node.args.args}
+        return self.generic_visit(node)
 
     def visit_Constant(self, node: ast.Constant) -> ast.AST:
         return _number(node, node.value)
@@ -41,7 +47,10 @@ class InPrecision(ast.NodeTransformer):
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         node.value = self.visit(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        written: list[ast.expr] = [ast.Constant(self._index(part)) for part in parts]
+        numbers = [self._index(part) for part in parts]
+        if isinstance(node.value, ast.Name) and node.value.id in self._given and set(numbers) - set(range(-3, 3)):
+            raise InputError(f"{self._what} has {ast.unparse(node)}, but must have an index of 0, 1 or 2 there.")
+        written: list[ast.expr] = [ast.Constant(number) for number in numbers]
         node.slice = ast.Tuple(written, ast.Load()) if isinstance(node.slice, ast.Tuple) else written[0]
         return node
 

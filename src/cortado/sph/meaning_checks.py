@@ -17,10 +17,6 @@ MATH = (
     *("log", "log10", "log2", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
 )
 """Those of its module math."""
-MADE = ("cross", "cw_div", "cw_mul", "normalize", "vec3", "vec3d", "vec3f")
-"""Functions of Warp that return vectors."""
-SIZES = ast.Lt, ast.LtE, ast.Gt, ast.GtE
-"""Comparisons of numbers alone."""
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
@@ -58,41 +54,6 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
         if isinstance(node, ast.BoolOp) and node not in tests and not _is_truth(node, truths):
             found = f"{what} has {ast.unparse(node)!r}, which is one of its numbers in Python and a truth in Warp"
             raise InputError(f"{found}, but must have comparisons there, or x if x != 0.0 else y.")
-
-
-def check_vectors(what: str, function: ast.FunctionDef, vectors: set[str]) -> None:
-    """Raises `InputError` where a vector, such as one of those that have these names, is compared by size or is taken
-    for a truth, of which the compiler would have more to say than a sentence."""
-    known = set(vectors)
-    for name, values in _assigned(function).items():
-        if all(_is_vector(value, known) for value in values):
-            known.add(name)
-    for node in ast.walk(function):
-        judged: list[ast.expr] = []
-        if isinstance(node, (ast.If, ast.IfExp, ast.While)):
-            judged = [node.test]
-        elif isinstance(node, ast.BoolOp):
-            judged = node.values
-        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            judged = [node.operand]
-        elif isinstance(node, ast.Compare) and any(isinstance(op, SIZES) for op in node.ops):
-            judged = [node.left, *node.comparators]
-        for one in judged:
-            if _is_vector(one, known):
-                wanted = "but must compare numbers, such as its length by wp.length or a component by [0]"
-                raise InputError(f"{what} compares {ast.unparse(one)}, which is a vector, {wanted}.")
-
-
-def _is_vector(node: ast.expr, vectors: set[str]) -> bool:
-    if isinstance(node, ast.UnaryOp) and not isinstance(node.op, ast.Not):
-        return _is_vector(node.operand, vectors)
-    if isinstance(node, ast.IfExp):
-        return _is_vector(node.body, vectors)
-    if isinstance(node, ast.BinOp):
-        return any(_is_vector(part, vectors) for part in (node.left, node.right))
-    if isinstance(node, ast.Call):
-        return ast.unparse(node.func).removeprefix("wp.") in MADE
-    return isinstance(node, ast.Name) and node.id in vectors
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
