@@ -11,7 +11,6 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
 from cortado.cli.commands.drawing_time import seconds_of_picture
-from cortado.cli.commands.fluid_masses import FluidMasses
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.cli.commands.run_length import RunLength
 from cortado.cli.commands.run_summary import Energy, RunSummary
@@ -76,7 +75,7 @@ def test_a_cubic_metre_of_water_is_a_tonne():
                 "container.lower=[0,0]",
             ]
             cut = ["discretisation.spacing=0.2", f"discretisation.kernel={kernel}", f"discretisation.support={support}"]
-            found = FluidMasses.of(cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])))
+            found = cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])).masses
             assert sum(found.given.values()) == pytest.approx(1000.0, rel=1e-6)
 
 
@@ -153,6 +152,17 @@ def test_an_emitter_has_fluid_for_the_run_or_runs_dry(capsys):
     assert "runs dry at 1.5" in (told := capsys.readouterr().out) and "before the end of the run at 2 s" in told
     main(asked)
     assert "has fluid for 2.6" in capsys.readouterr().out
+
+
+def test_an_opening_that_is_no_whole_number_of_cells_is_told(capsys):
+    """The flow rate is kept, and the speed is not that of the opening."""
+    template = str(Path(cortado.__file__).parent / "cli/templates/jet.toml")
+    asked = ["describe", template, "--time", "0.01", "--set", "emitter.flow_rate=0.12"]
+    main(asked)
+    assert "at 1.2 m/s" in (told := capsys.readouterr().out) and "opening" not in told
+    main([*asked, "--set", "emitter.radius=0.0575"])
+    told = capsys.readouterr().out
+    assert "at 1.2 m/s, through 0.1 m of cells, where an opening of 0.115 m was asked for" in told
 
 
 def test_a_schedule_is_told(capsys):

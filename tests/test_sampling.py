@@ -1,12 +1,16 @@
 """From scenes to particles: where they are, how many, and that none is there twice."""
 
+import pickle
+import warnings
 from itertools import product
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.errors import InputError, SceneError
+from cortado import CortadoWarning, Simulation
+from cortado.discretise.pairs import pairs_within
+from cortado.errors import InputError, SceneError, unwarned
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.sampling import fluid_particles, period
 from cortado.scene.scene import Scene
@@ -97,6 +101,81 @@ def test_whole_layers_of_a_cylinder_stand_on_its_base(axis, height):
     across = np.delete(from_base, along, axis=1)
     assert 0.45 < np.linalg.norm(across, axis=1).max() < 0.505
     assert len(from_base) * SPACING**3 == pytest.approx(np.pi * 0.5**2 * height, rel=0.01)
+
+
+L_SHAPE = [[0.0, 0.0], [0.6, 0.0], [0.6, 0.2], [0.2, 0.2], [0.2, 0.6], [0.0, 0.6]]
+SHAPES = {
+    "on cells": (2, {"shape": "polygon", "corners": L_SHAPE}, 0.2),
+    "triangle": (2, {"shape": "polygon", "corners": [[0.0, 0.0], [0.7, 0.0], [0.0, 0.5]]}, 0.175),
+    "disc": (2, {"shape": "sphere", "centre": [0.1, 0.2], "radius": 0.2}, np.pi * 0.04),
+    "ball": (3, {"shape": "sphere", "centre": [0.1, 0.2, 0.3], "radius": 0.12}, 4.0 / 3.0 * np.pi * 0.12**3),
+    "rod": (3, {"shape": "cylinder", "base": [0, 0, 0], "radius": 0.06, "height": 0.9}, np.pi * 0.06**2 * 0.9),
+    "turned": (3, box([0.0] * 3, [0.3, 0.2, 0.25], rotation=[0.3, 0.2, 0.5]), 0.015),
+    "box": (2, box([0.0, 0.0], [0.52, 0.33]), 0.52 * 0.33),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_what_a_body_is_asked_to_hold_is_the_volume_of_its_shape(name):
+    """To round-off, and not that of cells that measure it, nor of the box around it."""
+    dimension, fluid, volume = SHAPES[name]
+    assert fluid_particles(scene_of(dimension, [fluid])).asked == pytest.approx([volume], rel=1e-12)
+
+
+def test_a_body_is_not_asked_to_hold_what_a_solid_takes_of_it():
+    pillar = box([0.43, 0.0], [0.57, 0.3], name="pillar")
+    scene = scene_of(2, [box([0.0, 0.0], [1.0, 0.5])]).model_dump(exclude_unset=True) | {"solid": [pillar]}
+    assert fluid_particles(Scene(**scene)).asked == pytest.approx([0.5 - 0.14 * 0.3], rel=1e-3)
+
+
+def test_another_mass_than_was_asked_for_is_warned_of_once():
+    """When a simulation is made, and not when it is made once more for a batch or in another process."""
+    packed, full = (scene_of(2, [box([0.0, 0.0], [side, side])]) for side in (0.33, 0.35))
+    with pytest.warns(CortadoWarning, match=r"107.5 kg of water, where 108.9 kg were asked for") as told:
+        simulation = Simulation(packed)
+        simulation.batch_of(2)
+        pickle.loads(pickle.dumps(simulation))
+    assert len(told) == 1 and told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Simulation(full)
+
+
+# ---- seams -------------------------------------------------------------------------------------------------------
+
+
+def densities(scene: Scene) -> np.ndarray:
+    """(n,) of first particles, over that of the lattice."""
+    found = discretise(scene)
+    x, walls, support = found.fluid.positions, found.walls, found.lattice.support
+    weights = np.append(np.ones(len(x)), walls.weights)
+    one, other, distances = pairs_within(x, np.concatenate([x, walls.positions]), support, *period(scene))
+    seen = weights[other] * found.kernel.weight(distances, scene.dimension, support)
+    return found.lattice.volume * np.bincount(one, seen, minlength=len(x))
+
+
+SEAMS = {
+    "halves": ([box([0.0, 0.0], [0.31, 0.5]), box([0.31, 0.0], [1.0, 0.5])], [1.5, 1.0], [0.31, 0.15]),
+    "stretched": ([box([0.0, 0.0], [1.184, 0.81]), box([1.184, 0.0], [2.514, 0.81])], [3.0, 1.0], [1.184, 0.4]),
+    "on top": ([box([0.0, 0.0], [1.17, 0.32]), box([0.71, 0.32], [1.17, 0.54])], [1.17, 0.74], [1.0, 0.3]),
+    "layers": ([box([0.0, 0.0], [0.42, 0.49]), box([0.0, 0.49], [0.42, 0.71], phase="oil")], None, [0.21, 0.49]),
+    "period": ([box([0.0, 0.0], [0.5, 0.43]), box([0.5, 0.0], [1.03, 0.43])], [1.03, 0.6], [0.5, 0.15]),
+}
+"""Boxes of fluid, the upper corner of their container, and a place on the seam."""
+
+
+@pytest.mark.parametrize("name", SEAMS)
+def test_fluid_is_neither_compressed_nor_torn_along_a_seam(name):
+    """Of two boxes, whatever lattices or packed particles they have."""
+    fluids, upper, place = SEAMS[name]
+    container = None if upper is None else box([0.0, 0.0], upper, periodic=[name == "period", False])
+    kernel = "wendland_c2" if name in ("on top", "layers") else "cubic_spline"
+    scene = scene_of(2, fluids, container).replaced(f"discretisation.kernel={kernel}", "discretisation.support=2.0")
+    with unwarned():
+        sample, found = discretise(scene).fluid, densities(scene)
+    assert found.max() < 1.03
+    assert found[np.abs(sample.positions - place).max(axis=1) < 2.0 * SPACING].min() > 0.97
+    assert sum(sample.sizes) == len(found) and 0.985 < len(found) * SPACING**2 / sum(sample.asked) < 1.003
 
 
 def test_particles_come_in_the_order_of_the_fluids(tmp_path):

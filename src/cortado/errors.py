@@ -2,7 +2,8 @@
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 LONGEST = 90
@@ -27,6 +28,14 @@ def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back
     warnings.warn(sentence, category, stacklevel=level)
+
+
+@contextmanager
+def unwarned() -> Iterator[None]:
+    """No warning of Cortado's is told within it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        yield
 
 
 class InputError(CortadoError):

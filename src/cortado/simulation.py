@@ -20,7 +20,7 @@ from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.threads import WARP, Turn, in_turn
-from cortado.errors import InputError, shown, warn
+from cortado.errors import InputError, shown, unwarned, warn
 from cortado.fixed import fixed
 from cortado.particles.state import State
 from cortado.pictures.notebook import with_picture
@@ -112,10 +112,8 @@ class Simulation(Stepping, Measuring, Picturing):
         smaller = "" if self.batch is None else "a smaller batch, "
         require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
         check_distance(scene, discrete, self.precision)
-        self.positions = discrete.fluid.positions
-        """(n, d) first positions [m]."""
-        self.velocities = discrete.fluid.velocities
-        """(n, d) first velocities [m / s]."""
+        self.positions, self.velocities = discrete.fluid.positions, discrete.fluid.velocities
+        """(n, d) first positions [m], and first velocities [m / s]."""
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
         """(n, phases) first mass fractions [-]."""
         self.particles = len(self.positions)
@@ -124,8 +122,8 @@ class Simulation(Stepping, Measuring, Picturing):
         self.smoothing = discrete.kernel
         self.walls = discrete.walls.positions
         """(b, d) wall particles [m]."""
-        self.lattice = discrete.lattice
-        """Constants of the lattice of particles at rest."""
+        self.lattice, self.masses = discrete.lattice, discrete.masses
+        """Constants of the lattice of particles at rest; masses of the fluid at the start, given and asked for [kg]."""
         self.free_particles = discrete.fluid.emitted.start
         """How many particles, the first ones, do not wait in a nozzle."""
         self.solver: Solver = self._built(discrete)
@@ -270,10 +268,12 @@ class Simulation(Stepping, Measuring, Picturing):
         end_after(rollout, time)
         return rollout
 
+    @unwarned()
     def batch_of(self, size: int) -> "Simulation":
         """The same scene so many times in one launch."""
         return Simulation(*self._made_of(self.precision.name, size))
 
+    @unwarned()
     def in_precision(self, precision: str) -> "Simulation":
         """A single one of the same scene, on the same device, in a precision."""
         return Simulation(*self._made_of(precision, None))
@@ -308,6 +308,7 @@ class Simulation(Stepping, Measuring, Picturing):
         return stable_substeps(self.scene, self.free_energy, *numbers)
 
 
+@unwarned()
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
     """A simulation from what it was made from, first positions of the same checksum included."""
     simulation = Simulation(*made_of)

@@ -3,7 +3,7 @@
 Their particles are then moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import TypeGuard
@@ -11,6 +11,7 @@ from typing import TypeGuard
 import numpy as np
 
 from cortado.discretise.pairs import apart, pairs_within
+from cortado.discretise.region import Region
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points, grid
 from cortado.scene.fluids import ALIGNED, Fluid, RegionFluid
@@ -65,9 +66,20 @@ class CutBody:
         return float(whole * self.spacing**dimension + shares * fine**dimension)
 
     @cached_property
+    def asked(self) -> float:
+        """[m^d] that it is to hold: the volume of the fluid's shape, times the part of it that walls leave."""
+        everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
+        return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
+
+    @cached_property
+    def _held(self) -> float:
+        """Its volume, as cells measure it [m^d]."""
+        return self.volume()
+
+    @cached_property
     def count(self) -> int:
         """The number of its particles."""
-        volume = self.volume()
+        volume = self._held
         lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
         return round((volume - lacking) / self.spacing**self.room.dimension)
 

@@ -24,6 +24,7 @@ from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice
 from cortado.errors import warn
 from cortado.scene.bodies import Surroundings
+from cortado.scene.fluid_masses import FluidMasses
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.sampling import FluidSample, fluid_particles, period
 from cortado.scene.scene import Scene
@@ -80,6 +81,8 @@ class DiscreteScene:
     """Constants."""
     fluid: FluidSample
     """The first fluid particles."""
+    masses: FluidMasses
+    """Theirs, and those that were asked for."""
     wall_layers: WallLayers
     """How the walls lie and how they drag; also for a scene without walls."""
     walls: Walls
@@ -96,7 +99,7 @@ class DiscreteScene:
 
 def discretise(scene: Scene) -> DiscreteScene:
     """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read, or if
-    points are packed too densely."""
+    points are packed too densely; warns where the fluid has another mass than was asked for."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     layers = wall_layers(kernel, spacing, support, dimension)
@@ -104,9 +107,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = fluid_particles(scene)
     at_rest = RestLattice(kernel, spacing, support)
     walls = walls_of(scene, layers, at_rest)
-    for sentence in thin_sentences(scene):
+    fluid = _packed(fluid, walls, at_rest, *period(scene))
+    masses = FluidMasses.of(scene, fluid)
+    for sentence in filter(None, (*thin_sentences(scene), masses.warning)):
         warn(sentence)
-    fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
     if scene.discretisation.jitter:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
     fluid = replace(fluid, velocities=_velocities(scene, fluid))
@@ -115,7 +119,7 @@ def discretise(scene: Scene) -> DiscreteScene:
         told = check_crowding(crowding, spacing, "the points of the fluid")
         if told is not None:
             warn(told)
-    return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+    return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, period(scene)[1])
 
 
 def _velocities(scene: Scene, fluid: FluidSample) -> Points:
@@ -126,11 +130,12 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
     return found
 
 
-def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> Points:
-    """(n, d) first positions [m], with those of round bodies where they fill them at the rest density."""
+def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> FluidSample:
+    """The fluid with the particles of round bodies where they fill these at the rest density."""
     if not fluid.bodies:
-        return fluid.positions
+        return fluid
     stays = ~fluid.is_packed
     air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
     fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
-    return Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)
+    found, kept = Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)
+    return replace(fluid.some(kept), positions=found)

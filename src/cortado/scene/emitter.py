@@ -44,7 +44,8 @@ class EmitterTable(FluidBody):
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length does not matter."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """Of the opening [m]."""
+    """Of the opening [m]. The cells of the lattice that it holds are what fluid comes through: its speed is the flow
+    rate over their area, which `describe` says."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Of the column that waits upstream of the opening [m]; six spacings if left out."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
@@ -92,7 +93,15 @@ class EmitterTable(FluidBody):
 
     def speed(self, spacing: float) -> float:
         """[m/s]; with it the volume of the particles that come out is that of the flow rate."""
-        return self.flow_rate / (len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
+        return self.flow_rate / self.area(spacing)
+
+    def area(self, spacing: float) -> float:
+        """Of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
+        return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
+
+    def asked_area(self) -> float:
+        """Of the opening [m2], in 2-D its width [m]."""
+        return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
 
     def opening(self, spacing: float) -> Points:
         """(n, d) [m] a layer of particles, moved into the opening."""

@@ -46,6 +46,9 @@ class Filled(Turnable):
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         return self.body().distance_up_to(points, reach)
 
+    def volume(self, spacing: float) -> float:
+        return self.shape_about()[0].moments().volume
+
     def particles(self, spacing: float) -> Points:
         return points_inside(self.body(), spacing)
 

@@ -10,7 +10,7 @@ from pydantic import ValidationInfo, field_validator, model_validator
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
-from cortado.discretise.solids.primitives import Box, Revolved
+from cortado.discretise.solids.primitives import Box, Revolved, Round
 from cortado.discretise.solids.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
@@ -82,9 +82,9 @@ class Fluid(FluidBody):
         """(n, d) [m] those that a container and solids leave room for."""
         return self.particles(spacing)
 
+    @abstractmethod
     def volume(self, spacing: float) -> float:
-        """[m^d] that it is to have, where nothing cuts it."""
-        return self.count(spacing) * spacing ** len(self.velocity)
+        """[m^d] of its shape, to round-off, whatever cuts it; of points what they hold."""
 
 
 class LatticeFluid(Fluid):
@@ -201,6 +201,9 @@ class SphereFluid(RoundFluid):
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
+    def volume(self, spacing: float) -> float:
+        return Round(np.zeros(len(self.centre)), self.radius).moments().volume
+
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         return Region.ball(np.array(self.centre), self.radius).distance(points)
 
@@ -229,6 +232,9 @@ class CylinderFluid(Turnable, RoundFluid):
         block = block_about(base, half, spacing)
         standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
         return Block(standing, block.counts, block.spacings)
+
+    def volume(self, spacing: float) -> float:
+        return float(np.pi * self.radius**2 * self.height)
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         axis = INDEX_OF_AXIS[self.axis]
@@ -265,6 +271,9 @@ class PointsFluid(Fluid):
 
     def count(self, spacing: float) -> float:
         return float(len(self.points()))
+
+    def volume(self, spacing: float) -> float:
+        return self.count(spacing) * spacing ** len(self.velocity)
 
     def extent(self, spacing: float) -> tuple[Points, Points]:
         return self.points().min(axis=0), self.points().max(axis=0)

@@ -1,6 +1,6 @@
 """From a scene to its fluid particles, in float64."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ class FluidSample:
     """(n,) index into the scene's phases"""
     sizes: tuple[int, ...]
     """How many particles each body of fluid has, without those of the emitter."""
+    asked: tuple[float, ...]
+    """What each of these is to hold, without what walls take of it [m^d]; of points what they hold."""
     bodies: tuple[CutBody, ...]
     """Those whose particles are to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
@@ -39,6 +41,13 @@ class FluidSample:
         """(n, d) [m] positions, with each coordinate of what nobody has placed changed by up to ``most`` [m]."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
+
+    def some(self, kept: NDArray[np.int64]) -> "FluidSample":
+        """The same without particles but those of the given numbers (m,), in rising order; all of the emitter stay."""
+        names = "positions", "velocities", "phase", "is_packed", "is_placed"
+        arrays = {name: getattr(self, name)[kept] for name in names}
+        ends = np.searchsorted(kept, np.cumsum(self.sizes))
+        return replace(self, sizes=tuple(np.diff(ends, prepend=0).tolist()), **arrays)
 
     @property
     def emitted(self) -> slice:
@@ -61,6 +70,9 @@ def fluid_particles(scene: Scene) -> FluidSample:
             raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
     velocities = [fluid.velocities(x) for fluid, x in zip(scene.fluid, positions, strict=True)]
     phases = [names.index(fluid.phase) for fluid in scene.fluid]
+    asked = [
+        fluid.volume(spacing) if body is None else body.asked for fluid, body in zip(scene.fluid, bodies, strict=True)
+    ]
     emitted = None
     if scene.emitter is not None:
         emitted = scene.emitter.sample(spacing)
@@ -75,6 +87,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
         velocities=np.concatenate(velocities),
         phase=np.repeat(phases, sizes),
         sizes=tuple(sizes[: len(scene.fluid)]),
+        asked=tuple(asked),
         bodies=tuple(body for body in bodies if body is not None),
         is_packed=np.repeat([body is not None for body in bodies], sizes),
         is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),
@@ -92,15 +105,6 @@ def reserve_offset(scene: Scene) -> Points:
     size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
     aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
     return 2.0 * (size + scene.discretisation.support_radius) * aside
-
-
-def asked_volumes(scene: Scene) -> dict[str, float]:
-    """By phase [m^d], what its bodies of fluid are to hold, without what walls take of them; of points what they
-    hold."""
-    spacing, found = scene.discretisation.spacing, dict.fromkeys((phase.name for phase in scene.phase), 0.0)
-    for fluid, body in zip(scene.fluid, _cut_bodies(scene), strict=True):
-        found[fluid.phase] += fluid.volume(spacing) if body is None else body.volume()
-    return found
 
 
 def _cut_bodies(scene: Scene) -> list[CutBody | None]:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from cortado.cli.commands.drawing_time import seconds_of_picture
-from cortado.cli.commands.fluid_masses import FluidMasses
+from cortado.cli.commands.emitter_words import SAME, emitter_rows, of_emitter
 from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.cli.commands.run_length import RunLength
 from cortado.device.memory import step_parts
@@ -39,8 +39,6 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 from cortado.words import counted
 
-SAME = 1e-6
-"""Relative: a time step that is rounded to float32 is the same."""
 MANY = 1_000_000
 """Particles: so many are announced before they are made, as that takes some seconds or minutes."""
 FIRST, MOST, ENOUGH = 4, 100, 0.5
@@ -110,14 +108,14 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
     (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
-    masses = FluidMasses.of(simulation)
+    masses = simulation.masses
     found: dict[str, Any] = {
         "name": scene.name,
         "dimension": scene.dimension,
         "particles": simulation.particles,
         "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
         "particles_in_emitter": simulation.particles - simulation.free_particles,
-        "emitter_runs_dry_at_s": _dry_at(scene),
+        **of_emitter(scene),
         "wall_particles": len(simulation.walls),
         "fluid_size_m": _fluid_size(simulation),
         "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
@@ -143,11 +141,6 @@ def _fluid_size(simulation: Simulation) -> list[float]:
     emitter, spacing = simulation.scene.emitter, simulation.scene.discretisation.spacing
     shown = simulation.free_particles + (0 if emitter is None else len(emitter.particles(spacing)))
     return (np.ptp(simulation.positions[:shown], axis=0) + spacing).tolist()
-
-
-def _dry_at(scene: Scene) -> float | None:
-    """When all of the emitter is out [s]; None without one."""
-    return None if scene.emitter is None else scene.emitter.dry_after(scene.discretisation.spacing)
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
@@ -228,7 +221,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
             else f"{found['time_step_s']:g} s; {allowed}",
         ),
         ("viscosity", found["viscosity"]),
-        *_emitter(found, length),
+        *emitter_rows(found, length),
         (
             "memory",
             f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
@@ -255,16 +248,6 @@ def _size(found: dict[str, Any]) -> str:
     container = f", in a container of {held} m" if held else ""
     gravity = vector(found["gravity_m_s2"])
     return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
-
-
-def _emitter(found: dict[str, Any], length: RunLength) -> list[tuple[str, str]]:
-    """When all of it is out, and whether that is before the end of the run."""
-    dry = found["emitter_runs_dry_at_s"]
-    if dry is None:
-        return []
-    if length.time is None or dry >= length.time * (1.0 - SAME):
-        return [("emitter", f"has fluid for {dry:.4g} s")]
-    return [("emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s")]
 
 
 def _time(found: dict[str, Any], length: RunLength) -> str:

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.cli.commands.fluid_masses import FluidMasses
 from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.emitted import is_out
 from cortado.runs.sensors.log import Readings
 from cortado.runs.sensors.summary import summary
+from cortado.scene.fluid_masses import FluidMasses
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
@@ -118,7 +118,7 @@ class RunSummary:
             densities=found,
             spilt=_spilt(simulation, last),
             particles=simulation.free_particles,
-            masses=FluidMasses.of(simulation),
+            masses=simulation.masses,
             readings=readings or {},
         )
 

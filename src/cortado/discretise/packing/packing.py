@@ -11,15 +11,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.packing.around import PointsAround, Which
 from cortado.discretise.packing.relaxation import HIGHEST, LOWEST, ROUNDS, SKIN, Relaxation, density_errors
+from cortado.discretise.pairs import pairs_within
 from cortado.discretise.shapes import Points
 from cortado.discretise.walls.weights import RestLattice
 from cortado.files.terminal import timed_note
 
 MOST_LOOKS, MOST_ROUNDS = 12, 36
 """How often it is looked at all particles; rounds of least squares after each look."""
+COMPRESSED, DIGITS = 0.03, 6
+"""By how much the density of a particle that is left out is above the lattice's, relative, and to how many decimals."""
+BESIDE, MOST_OUT = 10.0, 40
+"""Particles are left out one at a time within so many supports, as others have more room then; and how often."""
 ROUND_OFF = 1e-9
 """By how much, relative, particles of a lattice may be further away than they are."""
 MANY = 20_000
@@ -44,11 +50,12 @@ class Packing:
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
-    def packed(self, particles: Points, stays: Which) -> Points:
-        """(n, d) [m] where particles (n, d) [m] come to lie, but for those that stay where they are (n,). The last few
-        answers are kept."""
+    def packed(self, particles: Points, stays: Which) -> tuple[Points, NDArray[np.int64]]:
+        """(m, d) [m] where particles (n, d) [m] come to lie, but for those that stay where they are (n,); and the
+        numbers (m,) of the particles that there is room for. The last few answers are kept."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
-        return _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays)).copy()
+        found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
+        return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
         """(m,) by how much the densities of ``some`` of particles (n, d) [m] are above that of the lattice, relative; 0
@@ -56,16 +63,38 @@ class Packing:
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
-    def settled(self, particles: Points, stays: Which) -> Points:
-        """As `packed`, computed. Of particles that have the rest density already none moves."""
+    def settled(self, particles: Points, stays: Which) -> tuple[Points, NDArray[np.int64]]:
+        """As `packed`, computed. Of particles that have the rest density already none moves; while some are compressed,
+        as in wedges or where a small body was rounded up to a whole particle, those that are most are left out."""
+        kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
+        for _ in range(MOST_OUT):
+            crowded = self._crowded(found, stays[kept])
+            if not len(crowded):
+                break
+            kept, found = np.delete(kept, crowded), np.delete(found, crowded, axis=0)
+            found = self._at_rest(found, stays[kept])
+        grain = self.lattice.spacing / GRAINS
+        return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
+
+    def _crowded(self, particles: Points, stays: Which) -> NDArray[np.int64]:
+        """The numbers (m,) of particles (n, d) [m] that are compressed, and not less than any beside them."""
+        errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
+        over = np.flatnonzero((errors > COMPRESSED) & ~stays)
+        points, reach = particles[over], BESIDE * self.lattice.support
+        lengths = np.where(self.lengths > 2.0 * reach, self.lengths, 0.0)
+        one, other, _ = pairs_within(points, points, reach, lengths=lengths)
+        less = one[errors[over[one]] < errors[over[other]]]
+        return np.delete(over, np.unique(less))
+
+    def _at_rest(self, particles: Points, stays: Which) -> Points:
+        """Where all particles (n, d) [m] come to lie."""
         found = particles
         for _ in range(MOST_LOOKS):
             wrong = self._wrong(found, stays)
             if not wrong.any():
                 break
             found = self._settled_near(wrong, found, stays)
-        grain = self.lattice.spacing / GRAINS
-        return np.asarray(particles + grain * np.rint((found - particles) / grain))
+        return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
         """Particles (n, d) [m] after those near the ones that are ``wrong`` (n,) were moved. Nothing further away is
@@ -111,7 +140,7 @@ class Packing:
 
 
 @lru_cache(maxsize=8)
-def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> Points:
+def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, NDArray[np.int64]]:
     """See `Packing.packed`: simulations of one scene are made more than once."""
     *numbers, stays = arrays
     fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
