@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cortado import CortadoWarning, Simulation
-from cortado.discretise.pairs import pairs_within
 from cortado.errors import InputError, SceneError, unwarned
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.sampling import fluid_particles, period
 from cortado.scene.scene import Scene
+from test_packing import densities
 
 SPACING = 0.05
 
@@ -144,16 +144,6 @@ def test_another_mass_than_was_asked_for_is_warned_of_once():
 # ---- seams -------------------------------------------------------------------------------------------------------
 
 
-def densities(scene: Scene) -> np.ndarray:
-    """(n,) of first particles, over that of the lattice."""
-    found = discretise(scene)
-    x, walls, support = found.fluid.positions, found.walls, found.lattice.support
-    weights = np.append(np.ones(len(x)), walls.weights)
-    one, other, distances = pairs_within(x, np.concatenate([x, walls.positions]), support, *period(scene))
-    seen = weights[other] * found.kernel.weight(distances, scene.dimension, support)
-    return found.lattice.volume * np.bincount(one, seen, minlength=len(x))
-
-
 SEAMS = {
     "halves": ([box([0.0, 0.0], [0.31, 0.5]), box([0.31, 0.0], [1.0, 0.5])], [1.5, 1.0], [0.31, 0.15]),
     "stretched": ([box([0.0, 0.0], [1.184, 0.81]), box([1.184, 0.0], [2.514, 0.81])], [3.0, 1.0], [1.184, 0.4]),
@@ -172,7 +162,8 @@ def test_fluid_is_neither_compressed_nor_torn_along_a_seam(name):
     kernel = "wendland_c2" if name in ("on top", "layers") else "cubic_spline"
     scene = scene_of(2, fluids, container).replaced(f"discretisation.kernel={kernel}", "discretisation.support=2.0")
     with unwarned():
-        sample, found = discretise(scene).fluid, densities(scene)
+        discrete = discretise(scene)
+    sample, found = discrete.fluid, densities(scene, discrete)
     assert found.max() < 1.03
     assert found[np.abs(sample.positions - place).max(axis=1) < 2.0 * SPACING].min() > 0.97
     assert sum(sample.sizes) == len(found) and 0.985 < len(found) * SPACING**2 / sum(sample.asked) < 1.003
