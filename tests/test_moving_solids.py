@@ -107,6 +107,15 @@ def test_walls_are_where_the_path_says_and_move_as_it_does(scene, scale):
     np.testing.assert_allclose(solid.distance(back), 0.0, atol=1e-9)  # feet turn with it
 
 
+def test_a_run_goes_on_where_fluid_is_where_a_solid_was_at_the_start():
+    block = {"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.7, 0.3], "motion": "path"}
+    scene = plane({**block, "velocity": [0.0, 2.0]}, solver={"time_step": 0.001})
+    whole = Simulation(scene).run(300)
+    assert ((np.abs(whole.positions[250] - [0.6, 0.1]) < [0.07, 0.07]).all(axis=1)).any()
+    rest = Simulation(scene).run(50, state=whole[:251].last_state)
+    assert rest.positions[-1].tobytes() == whole.positions[-1].tobytes()
+
+
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 def test_a_piston_pushes_water_before_it(kind):
     piston = {"name": "piston", "shape": "box", "lower": [-0.3, 0.0], "upper": [0.0, 1.0], "motion": "path"}

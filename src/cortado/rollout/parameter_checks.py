@@ -7,6 +7,7 @@ import numpy as np
 
 from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE
+from cortado.discretise.room import Room
 from cortado.errors import InputError, OutOfRangeError
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Range
@@ -38,7 +39,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
-        for particle in outside(scene, positions[:free])[:1]:
+        for particle in outside(room_of(scene), positions[:free], spacing)[:1]:
             place = place_in_words(positions[particle])
             raise InputError(
                 f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
@@ -51,7 +52,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         )
     if "nozzle_path" in values and scene.emitter is not None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
-        for step in outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
+        places = (path[:, None] + opening).reshape(-1, scene.dimension)
+        for step in outside(room_of(scene), places, spacing)[:1] // len(opening):
             raise InputError(
                 f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
                 "of the opening is inside the container."
@@ -85,10 +87,9 @@ def _check_room(positions: np.ndarray, spacing: float) -> None:
         )
 
 
-def outside(scene: Scene, points: Any) -> np.ndarray:
-    """The numbers of the points (n, d) [m] that are outside of the container, along whose periods nothing is, or in a
-    solid."""
-    return np.flatnonzero(~room_of(scene).contains(points, TOLERANCE * scene.discretisation.spacing))
+def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
+    """The numbers of the points (n, d) [m] that are outside of a room, along whose periods nothing is."""
+    return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
 def place_in_words(point: np.ndarray) -> str:

@@ -12,6 +12,7 @@ from cortado.errors import InputError, shown
 from cortado.rollout.parameter_checks import outside, place_in_words
 from cortado.rollout.scene_parameters import DENSITY, Simulated
 from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.room import resting_room
 
 SAME = 1e-6
 """Relative: two numbers that differ by less are the same, as one of them may have been rounded to float32."""
@@ -87,7 +88,8 @@ def check_state(
     _check_fractions(fields["mass_fractions"])
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
-    for particle in outside(scene, positions[: simulation.free_particles])[:1] if held else ():
+    free, spacing = positions[: simulation.free_particles], scene.discretisation.spacing
+    for particle in outside(resting_room(scene), free, spacing)[:1] if held else ():  # solids that move are elsewhere
         place = place_in_words(positions[particle])
         raise InputError(
             f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
