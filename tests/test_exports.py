@@ -237,6 +237,20 @@ def test_usd_has_the_rate_that_was_asked_for(tmp_path, rate, step, every):
         np.testing.assert_allclose(turn[0, :2], [np.cos(25.0 * time), np.sin(25.0 * time)], atol=1e-6)
 
 
+@pytest.mark.parametrize("spin", [np.array(3.0), np.array([0.0, 3.0, 0.0])], ids=["plane", "space"])
+def test_a_free_body_goes_on_at_its_velocities(spin):
+    """Recorded late on an even way, it is at each mark where it was then."""
+    d, marks = 2 if spin.ndim == 0 else 3, Marks(0.0, 30.0)
+    times = recorded(0.007, marks, 0.5)
+    velocity, spins = np.arange(1.0, d + 1.0), np.multiply.outer(np.ones(len(times)), spin)
+    motion = SolidMotion(np.outer(times, velocity), (times * spins.T).T, np.outer(np.ones(len(times)), velocity), spins)
+    whole = WholeFrames.of(times, marks)
+    found = SolidMotions({"raft": motion}).at(scene(), times, whole.recorded, whole.times)["raft"]
+    np.testing.assert_allclose(found.positions, np.outer(whole.times, velocity), atol=1e-12)
+    np.testing.assert_allclose(found.rotations, np.multiply.outer(whole.times, spin), atol=1e-12)
+    assert np.abs(whole.shifts).max() > 0.004
+
+
 def test_files_and_parts_of_a_run_know_its_rate(tmp_path):
     marks = Marks(0.0, 2.0)
     run = replace(trajectory(), marks=marks)
