@@ -315,6 +315,32 @@ def test_usd_moves_late_states_to_whole_time_codes(tmp_path, capsys):
     assert "by at most 2 ms; the last state, 10 ms after the last whole frame, is left out" in told
 
 
+def test_fluid_that_waits_in_an_emitter_is_not_exported(tmp_path, capsys):
+    nozzle = {"phase": "water", "outlet": [0.0, 0.4, 0.1], "direction": [1.0, 0.0, 0.0], "radius": 0.08, "length": 0.5}
+    made = {**scene().model_dump(exclude_none=True), "solid": [], "emitter": {**nozzle, "flow_rate": 0.02}}
+    made = scene_from_dict({**made, "fluid": made["fluid"][:1], "phase": PHASES[:1]})
+    sample, still = made.emitter.sample(SPACING), lattice()[:64]
+    emitted = np.array([[0.0], [0.21], [0.52]])
+    flown = sample.positions + emitted[..., None] * np.array([1.0, 0.0, 0.0])
+    positions = np.concatenate([np.tile(still, (3, 1, 1)), flown], axis=1).astype(np.float32)
+    run = Trajectory(
+        times=np.array([0.0, 0.1, 0.2]),
+        steps=np.arange(3),
+        positions=positions,
+        velocities=np.zeros_like(positions),
+        diagnostics={"converged": np.ones(2, dtype=bool)},
+        others={"emitted": emitted, "outlet": np.tile(np.array(nozzle["outlet"]), (3, 1, 1))},
+    )
+    run.export(tmp_path / "ply", to="ply", scene=made)
+    for k in range(3):
+        count = 64 + np.count_nonzero(sample.upstream <= emitted[k])
+        points = trimesh.load(tmp_path / f"ply/particles_0000{k}.ply").vertices
+        assert len(points) == count and points[:, 0].min() > 0.0
+        surface = trimesh.load(tmp_path / f"ply/surface_0000{k}.ply", process=False)
+        assert surface.volume == pytest.approx(count * SPACING**3, rel=0.01)
+    assert "encloses" not in capsys.readouterr().out
+
+
 def test_a_surface_that_does_not_enclose_the_fluid_is_told(tmp_path, capsys, monkeypatch):
     trajectory()[2:].export(tmp_path / "held", to="ply")
     assert "encloses" not in capsys.readouterr().out

@@ -19,6 +19,16 @@ def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.
     return found
 
 
+def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
+    """(frames, n, d) [m] where particles are that are shown; those that wait in an emitter count at its opening."""
+    out = np.array([is_out(scene, frame.others.get("emitted"), trajectory.particles) for frame in trajectory])
+    return (
+        trajectory.positions
+        if out.all()
+        else np.where(out[..., None], trajectory.positions, trajectory.others["outlet"])
+    )
+
+
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
     """What takes from arrays (n, ...) the particles that are out (n,): all of them without a copy, where all are."""
     return slice(None) if out.all() else out

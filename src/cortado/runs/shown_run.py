@@ -9,7 +9,6 @@ from hashlib import sha256
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Points
 from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.page import Panel
 from cortado.pictures.painter import colours_of, painter_on, stage_of
@@ -17,7 +16,7 @@ from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scale import Scale
 from cortado.pictures.scenery import State
 from cortado.pictures.stage import Stage, upright
-from cortado.runs.emitted import is_out, those
+from cortado.runs.emitted import is_out, shown_places, those
 from cortado.runs.solid_motion import SolidMotions, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.camera_paths import Moment, View
@@ -43,7 +42,11 @@ class ShownRun:
         """What is around its fluid, with a camera that sees all of it in every frame."""
         stride = max(len(self.trajectory) // ENOUGH, 1)
         poses = [self._pose(k) for k in range(0, len(self.trajectory), stride)] if self._motions else []
-        return stage_of(sized(self.scene, self._motions), self._places, [pose for pose in poses if pose is not None])
+        return stage_of(
+            sized(self.scene, self._motions),
+            shown_places(self.scene, self.trajectory),
+            [pose for pose in poses if pose is not None],
+        )
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
         """Its pictures by the number of the frame, on a stage that is its own but for the camera."""
@@ -83,14 +86,6 @@ class ShownRun:
         """(frames, n) which particles have left the emitter."""
         emitted = (frame.others.get("emitted") for frame in self.trajectory)
         return [is_out(self.scene, one, self.trajectory.particles) for one in emitted]
-
-    @property
-    def _places(self) -> Points:
-        """(frames, n, d) [m] where particles are that are shown; those that wait in an emitter are counted at its
-        opening."""
-        if all(one.all() for one in self._out):
-            return self.trajectory.positions
-        return np.where(np.array(self._out)[..., None], self.trajectory.positions, self.trajectory.others["outlet"])
 
     def _pose(self, k: int) -> Scene | None:
         return posed(self.scene, self._motions, k) if self._motions else None

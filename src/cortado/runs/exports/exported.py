@@ -18,6 +18,7 @@ from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.surface import nearest_colours, spheres
 from cortado.runs.colouring import coloured_by
+from cortado.runs.emitted import is_out, shown_places, those
 from cortado.runs.exports.whole_frames import WholeFrames
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
@@ -87,7 +88,7 @@ class ExportedFrame:
     time: float
     """[s]"""
     positions: Points
-    """(n, 3) of the particles [m], along a periodic axis within the period"""
+    """(n, 3) of the particles [m] that do not wait in an emitter, along a periodic axis within the period"""
     velocities: Points
     """(n, 3) [m/s]"""
     colours: Points
@@ -112,8 +113,8 @@ class Exported:
         parts = _part_names(shown)
         self.solids = [_solid(one, parts[one.name], one.name in trajectory.solids) for one in shown.values()]
         self._trajectory = trajectory
-        self._held = (0.0, 1.0)
-        """[s] the frame whose surface is farthest from the volume of the fluid, and the part of it that it encloses."""
+        self._held = (0.0, 1.0, 1.0)
+        """Of the frame where they differ most: its time [s], what the surface encloses, and the fluid's volume [m³]."""
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -150,33 +151,34 @@ class Exported:
     @property
     def in_words(self) -> str:
         """How far surfaces of frames that were made are from the volume of the fluid; empty where they are near."""
-        time, part = self._held
-        if abs(part - 1.0) <= UNLIKE:
+        if _unlike(self._held) <= UNLIKE:
             return ""
-        whole = self.spacing**3 * self._trajectory.particles
-        return f"at {time:.4g} s the surface encloses {part * whole:.4g} m³, where there are {whole:.4g} m³ of fluid"
+        time, held, whole = self._held
+        return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
         """A state near one that was recorded, with the solids where they are in a frame of their motion."""
-        within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions)
-        positions, velocities = in_space(within), in_space(frame.velocities)
-        colours = colours_of(self.scene, frame.mass_fractions, len(positions))
+        shown = those(is_out(self.scene, frame.others.get("emitted"), len(frame.positions)))
+        within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions[shown])
+        positions, velocities = in_space(within), in_space(frame.velocities[shown])
+        colours = colours_of(self.scene, frame.mass_fractions, len(frame.positions))
         if self._scale is not None and self._values is not None:
             colours = self._scale.colours(self._values[recorded])
-        fractions = np.zeros((len(positions), 0)) if frame.mass_fractions is None else frame.mass_fractions
-        fields = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
+        fractions = np.zeros((len(frame.positions), 0)) if frame.mass_fractions is None else frame.mass_fractions
+        named = dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=True)) | dict(frame.quantities)
+        colours, fields = colours[shown], {name: values[shown] for name, values in named.items()}
         placed = _first_of_each(posed(self.scene, solids, number))
         poses = {name: Pose(_turn_in_space(one.turn), in_space(one.position[None])[0]) for name, one in placed.items()}
         surface = self._surface(positions, velocities, colours) if self.scene.dimension == 3 else None
         if surface is not None and self._stage.picture.surface != "spheres":
-            part = enclosed(surface.points, surface.triangles) / (self.spacing**3 * len(positions))
-            self._held = max(self._held, (frame.time, part), key=lambda one: abs(one[1] - 1.0))
+            volumes = enclosed(surface.points, surface.triangles), self.spacing**3 * len(positions)
+            self._held = max(self._held, (frame.time, *volumes), key=_unlike)
         return ExportedFrame(frame.time, positions, velocities, colours, fields, surface, poses)
 
     @cached_property
     def _stage(self) -> Stage:
         """Of a run in 3-D: whether its fluid ends at the walls of its container."""
-        return Stage.of(self.scene, self._trajectory.positions)
+        return Stage.of(self.scene, shown_places(self.scene, self._trajectory))
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
         try:
@@ -188,6 +190,11 @@ class Exported:
             return None
         own = nearest_colours(found.points, positions, velocities, self.spacing)
         return Mesh(found.points, found.triangles, found.normals, found.colours, own)
+
+
+def _unlike(held: tuple[float, float, float]) -> float:
+    """By which part of the fluid's volume that of a surface is off, of a frame's time and both."""
+    return abs(held[1] / held[2] - 1.0)
 
 
 def in_space(vectors: Points) -> Points:
