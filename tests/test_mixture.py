@@ -270,6 +270,8 @@ def test_free_energies_of_one_name_are_told_from_one_another():
 def test_what_is_no_free_energy_is_a_sentence(changes, said):
     with pytest.raises(InputError, match=said):
         replace(QUARTIC, **changes)
+    with pytest.raises(InputError, match=r"no value, but must be called as FreeEnergy\(name, value,"):
+        FreeEnergy("quartic")
 
 
 def no_functions(precision, phases):

@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_one_number, require_function
+from cortado.calls import public
 from cortado.code_words import code_words
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
@@ -32,6 +33,7 @@ FLOOR = 1e-3
 """delta of the degenerate mobility."""
 
 
+@public
 @dataclass(frozen=True)
 class FreeEnergy:
     """f(c) of mass fractions c (phases,), for kernels and for NumPy. A user's own is another object of this class."""
