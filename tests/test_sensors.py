@@ -17,6 +17,7 @@ from cortado.losses import Series
 from cortado.losses.series import SensorMatch
 from cortado.runs.sensors.log import Readings, as_csv, from_csv
 from cortado.runs.sensors.sensor import value_of
+from cortado.scene.containers import Container, NoContainer
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
@@ -79,6 +80,7 @@ def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor
 
     class Fields(dict):
         dimension, lattice, solids = make().dimension, cortado.Simulation(make()).lattice, ()
+        container = make().container
 
     end = cortado.Problem(cortado.Simulation(make(), precision="float64"), 5, SensorMatch(sensor, 0.0)).end({})
     names = ("positions", "velocities", "pressure", "wall_force")
@@ -135,6 +137,9 @@ def test_still_water_pushes_walls_and_probes_as_it_must():
     assert abs(mean("flow", "flow_rate")) < 1e-3
 
 
+NOWHERE_ENDS = NoContainer()
+
+
 @dataclass(frozen=True)
 class Basin:
     """Half a metre of water that moves as a whole, as sensors see it."""
@@ -144,6 +149,7 @@ class Basin:
     dimension: int
     spacing: float = 0.05
     solids: tuple = ()
+    container: Container = NOWHERE_ENDS
 
     @property
     def lattice(self):

@@ -47,6 +47,10 @@ class Basin:
         return Lattice.of(CUBIC_SPLINE, self.spacing, 2.0 * self.spacing, self.dimension, WITHOUT_PERIODS)
 
     @property
+    def container(self):
+        return self.scene.container
+
+    @property
     def solids(self):
         return self.scene.solid
 
@@ -84,6 +88,16 @@ def test_a_gauge_reads_the_level_of_still_water_around_solids(name, dimension):
             assert value_of(gauge, basin)[0] == pytest.approx(LEVEL, rel=1e-3)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_gauge_reads_the_level_beside_the_walls_of_a_container(dimension):
+    wall = (box(dimension, [0.0, 0.0], [0.3, 0.2]),)
+    for basin in (Basin(dimension, ()), Basin(dimension, wall)):
+        for place in (0.0, 0.013, 0.1, 1.93, 2.0):
+            for radius in (None, 0.12):
+                gauge = WaveGauge([place, 0.2, 0.0][:dimension], radius=radius)
+                assert value_of(gauge, basin)[0] == pytest.approx(LEVEL, rel=1.5e-3)
+
+
 def test_a_gauge_above_a_dry_step_reads_where_it_ends_and_below_a_deck_where_the_water_ends():
     dry = Basin(2, tuple(standing(2)["a block on the floor"]), level=0.2)
     assert value_of(WaveGauge([1.0, 0.0]), dry)[0] == pytest.approx(0.2)
@@ -119,7 +133,7 @@ def test_the_derivative_of_a_gauge_follows_solids_that_move(dimension):
     basin, random, angles = Basin(dimension, turned(dimension)), np.random.default_rng(4), 2 * dimension - 3
 
     class Fields(dict):
-        dimension, solids, lattice = basin.dimension, basin.solids, basin.lattice
+        dimension, solids, lattice, container = basin.dimension, basin.solids, basin.lattice, basin.container
 
     point = {"positions": basin["positions"]}
     for table in basin.solids:

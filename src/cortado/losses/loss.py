@@ -15,6 +15,7 @@ from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
+from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.quantities import check_readable
 from cortado.scene.solids import SolidTable
@@ -83,6 +84,11 @@ class Snapshot:
     def solids(self) -> tuple[SolidTable, ...]:
         """Those of the scene, as they begin; where one that moves is now, fields of the state say."""
         return moment_of(self).solids
+
+    @property
+    def container(self) -> Container:
+        """That of the scene."""
+        return moment_of(self).container
 
     def _quantity(self, name: str) -> np.ndarray:
         return moment_of(self).value(name)

@@ -16,6 +16,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.formulas import formulas
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.quantities.particles import OnDevice, Particles, Pressures, Sums
+from cortado.scene.containers import Container
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import LOAD, check_quantity, is_load
 from cortado.scene.scene import Scene
@@ -56,6 +57,7 @@ class QuantityEvaluator:
         """Constants of the lattice of particles at rest."""
         self.solids: tuple[SolidTable, ...] = scene.solid
         """As they begin."""
+        self.container: Container = scene.container
         self._formulas = formulas(solver, scene.dimension, circulation_factor)
         self._counts: Counts = ()
         """Of the step that was solved last."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
+from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.solids import SolidTable
@@ -19,6 +20,7 @@ class Evaluates(Protocol):
 
     lattice: Lattice
     solids: tuple[SolidTable, ...]
+    container: Container
 
     def values(self, names: Iterable[str], moment: "Moment") -> Arrays: ...
 
@@ -65,6 +67,11 @@ class Moment:
     def solids(self) -> tuple[SolidTable, ...]:
         """Those of the scene, as they begin."""
         return self.evaluator().solids
+
+    @property
+    def container(self) -> Container:
+        """That of the scene."""
+        return self.evaluator().container
 
     def value(self, name: str) -> NDArray:
         """A quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""

@@ -24,6 +24,7 @@ from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solids.solid import Solid
 from cortado.particles.arrays import padded
 from cortado.runs.sensors.sensor import Reading, Weights
+from cortado.scene.containers import Container
 from cortado.scene.motions import position_name, scale_name
 from cortado.scene.poses import Pose
 from cortado.scene.solids import SolidTable
@@ -36,6 +37,8 @@ LEAST = 1e-3
 """The part of a level that counts as no room at all."""
 MOST = 4_000_000
 """Points: where solids go higher they are further apart."""
+NARROW = 0.01
+"""The part of a column that has to be within a container that cuts it."""
 FILM = 1.0
 """In spacings: so deep a film is above a solid that has fluid below it too, before the height is exactly that of it."""
 
@@ -114,12 +117,14 @@ class Column:
     points: NDArray[Any]
     """(levels, c, d) [m]"""
     weights: NDArray[Any]
-    """(c,)"""
+    """(c,), over those that are within the container"""
+    outside: NDArray[Any]
+    """(c,) the part of each place that is behind the sides of the container"""
     solids: list[tuple[Standing, NDArray[Any]]]
     """Those in it, and how far its points are from them (levels, c) [m], where that is less than a step."""
 
     @classmethod
-    def of(cls, axis: Axis, solids: list[Standing], domain: Domain) -> "Column | None":
+    def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
         """None where no solid is in it."""
         foot, up = np.array(axis.foot), np.array(axis.up)
         tops, sizes = np.array([one.reach(up, foot) for one in solids]).T
@@ -132,7 +137,9 @@ class Column:
         places, weights = axis.places()
         if levels * len(places) > MOST:
             wider = (levels * len(places) / MOST) ** (1.0 / len(foot))
-            return cls.of(replace(axis, step=1.01 * wider * axis.step), solids, domain)
+            return cls.of(replace(axis, step=1.01 * wider * axis.step), solids, domain, container)
+        inside = cut_by(axis, container)
+        inside = np.ones(len(places)) if inside is None else inside
         heights = axis.step * (np.arange(levels) + 0.5)
         points = foot + places[None] + heights[:, None, None] * up
         found = []
@@ -141,17 +148,17 @@ class Column:
             distances = one.scale * one.own.distance_up_to(local, axis.step / one.scale).reshape(points.shape[:2])
             if distances.min() < 0.5 * axis.step:
                 found.append((one, distances))
-        return cls(axis, points, weights, found) if found else None
+        return cls(axis, points, weights / (weights @ inside), 1.0 - inside, found) if found else None
 
     @cached_property
     def _taken(self) -> NDArray[Any]:
-        """(levels, c) what solids take of each point, 1 or more where that is all of it."""
-        return np.asarray(sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids))
+        """(levels, c) what solids and the container take of each point, 1 or more where that is all of it."""
+        return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
 
     @cached_property
     def room(self) -> NDArray[Any]:
         """(levels,) the part of each level that is none of a solid."""
-        return np.asarray(1.0 - np.minimum(self._taken, 1.0) @ self.weights)
+        return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -202,11 +209,28 @@ def column_of(axis: Axis, at: Reading) -> Column | None:
     if not tables:
         return None
     if any(table.moves for table in tables):
-        return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain)
-    return _at_rest(axis, tables, domain)
+        return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, at.container)
+    return _at_rest(axis, tables, domain, at.container)
 
 
 @lru_cache(maxsize=64)
-def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain) -> Column | None:
+def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
+    """(c,) which part of each place of a column is within a container whose sides are along it; None where all are, and
+    of containers with other sides."""
+    up, foot = np.array(axis.up), np.array(axis.foot)
+    region, periods = container.region(len(up)), container.periods(len(up))[1]
+    along = np.abs(up) > 1.0 - 1e-12
+    if not along.any() or (region.across @ along and region.across.any()):
+        return None
+    sides = region.opened(np.where(along, 1.0, periods))
+    if sides.distance(foot[None])[0] <= -axis.reach - axis.step:
+        return None
+    places, weights = axis.places()
+    inside = sides.cell_shares(foot + places, axis.step)
+    return inside if weights @ inside > NARROW else None
+
+
+@lru_cache(maxsize=64)
+def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
     """The same of solids that stay, once."""
-    return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain)
+    return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)

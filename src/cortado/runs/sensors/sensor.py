@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
 from cortado.discretise.shapes import grid
 from cortado.errors import InputError
+from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.solids import SolidTable
 
@@ -32,6 +33,10 @@ class Reading(Cut, Protocol):
     @property
     def solids(self) -> tuple[SolidTable, ...]:
         """Those of the scene, as they begin."""
+
+    @property
+    def container(self) -> Container:
+        """That of the scene."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of the state or a quantity of its particles, float64."""

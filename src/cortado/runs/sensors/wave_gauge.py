@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.fixed import fixed
-from cortado.runs.sensors.column import Axis, Column, column_of
+from cortado.runs.sensors.column import Axis, Column, column_of, cut_by
 from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, parts_of, point, positive, reach_of
 
 FINER = 4.0
@@ -23,7 +23,8 @@ class WaveGauge:
     where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids take their part of the room,
     where they are in each step: above one that stands on the floor, hangs in the fluid or reaches through its surface h
     is the level of the surface (`cortado.runs.sensors.column`). Fluid that is in the air counts too, as if it lay on
-    the rest, also on a solid with air below. The column is to be away from side walls by its radius.
+    the rest, also on a solid with air below. What is behind the sides of a container that stand along ``up`` is none of
+    the column.
     """
 
     def __init__(self, position: Any, floor: float = 0.0, radius: float | None = None, up: Any = None):
@@ -41,34 +42,28 @@ class WaveGauge:
         return {"height": "m"}
 
     def value(self, at: Reading) -> NDArray[Any]:
-        column = self._column(at)
-        depth = self._depth(at, self._around(at, column))
+        column, scale, around = self._seen(at)
+        depth = float(scale * around.weights.sum())
         return np.array([self.floor + (depth if column is None else column.level(depth)[0])])
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        column = self._column(at)
-        around = self._around(at, column)
+        column, scale, around = self._seen(at)
         if column is None:
-            return {"positions": around.pulled(bar[0] * self._scale(at))}
-        depth = self._depth(at, around)
+            return {"positions": around.pulled(bar[0] * scale)}
+        depth = float(scale * around.weights.sum())
         bars = column.solid_bars(depth, bar[0], at.lattice.domain)
-        return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * self._scale(at))}
+        return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * scale)}
 
-    def _depth(self, at: Reading, around: Seen) -> float:
-        return float(self._scale(at) * around.weights.sum())
-
-    def _scale(self, at: Reading) -> float:
-        across = at.dimension - 1
-        return at.lattice.cell * ACROSS[across] / reach_of(self.radius, at) ** across
-
-    def _around(self, at: Reading, column: Column | None) -> Seen:
-        """By the horizontal ways (n, d), more exactly where a column ends at the sides of solids."""
-        reach = reach_of(self.radius, at)
-        parts = parts_of(reach if column is None else reach / FINER, at, self._across, at.dimension - 1)
-        return Seen.of(at, self.position, reach, self._across, parts)
+    def _seen(self, at: Reading) -> tuple[Column | None, float, Seen]:
+        """Its column where solids are in it, V over the cross-section that the container leaves, and the particles by
+        their horizontal ways (n, d): in more parts where a column has sides."""
+        reach, across = reach_of(self.radius, at), at.dimension - 1
+        axis = Axis.of(at, self.position, self.floor, self.up, reach)
+        column, inside, scale = column_of(axis, at), cut_by(axis, at.container), ACROSS[across] / reach**across
+        whole = column is None and inside is None
+        parts = parts_of(reach if whole else reach / FINER, at, self._across, across)
+        around = Seen.of(at, self.position, reach, self._across, parts)
+        return column, at.lattice.cell * scale / (1.0 if inside is None else axis.places()[1] @ inside), around
 
     def _across(self, way: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(way - (way @ self.up)[:, None] * self.up)
-
-    def _column(self, at: Reading) -> Column | None:
-        return column_of(Axis.of(at, self.position, self.floor, self.up, reach_of(self.radius, at)), at)
