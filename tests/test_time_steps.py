@@ -563,6 +563,35 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monk
     assert whole.diagnostics["greatest_density_errors"].max() < 0.3
 
 
+def test_derivatives_go_through_steps_that_were_taken_again():
+    """Reverse, forward and as differences of runs whose steps are held at the lengths that were taken in the end."""
+    chosen = Simulation(wedge(0.02), precision="float64")
+    fixed = Simulation(wedge(0.02).replaced("solver.time_step=0.001"), precision="float64")
+    whole = chosen.run(60)
+    sizes = sizes_of(whole)
+    before = int(np.flatnonzero(sizes[1:] < 0.3 * sizes[:-1])[0])
+    first, steps = whole[: before - 1].last_state, 6
+    stepper = chosen.stepper(steps)
+    end, residual = stepper.step(first, {"viscosity": 0.001})
+    rng = np.random.default_rng(0)
+    along, up = (rng.normal(size=end["positions"].shape) for _ in range(2))
+    adjoint, of_viscosity = stepper.vjp(residual, {"positions": up})
+
+    def held(by, viscosity=0.001):
+        state = replace(first, fields={**first.fields, "velocities": first["velocities"] + by * along})
+        state = replace(state, clock=replace(state.clock, time_step=0.0))
+        for size in sizes[before - 2 : before - 2 + steps]:
+            state = fixed.step(state, {"viscosity": viscosity, "time_step": size})
+        return state["positions"]
+
+    assert held(0.0).tobytes() == end["positions"].tobytes()
+    reverse, forward = (adjoint["velocities"] * along).sum(), stepper.jvp(residual, {"velocities": along})["positions"]
+    assert (forward * up).sum() == pytest.approx(reverse, rel=1e-9)
+    assert ((held(1e-6) - held(-1e-6)) * up).sum() / 2e-6 == pytest.approx(reverse, rel=1e-5)
+    changed = held(0.0, 0.001 + 1e-6) - held(0.0, 0.001 - 1e-6)
+    assert (changed * up).sum() / 2e-6 == pytest.approx(of_viscosity["viscosity"], rel=1e-4)
+
+
 def test_the_fall_through_a_funnel_bounds_the_step():
     """Without a container fluid falls from the top of its box to the foot of the lowest solid."""
     sides = [
