@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, plane
 from cortado.discretise.calibration import laplacian_rate, pairwise_rate, stress_rate
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.errors import CortadoWarning, DivergedError, InputError, SceneError
+from cortado.errors import CortadoWarning, DivergedError, InputError, MassWarning, SceneError
 from cortado.losses import CentreOfMass
 from cortado.problem import Problem
 from cortado.scene.fluids import BoxFluid
@@ -434,6 +434,7 @@ def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
 
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
+        warnings.simplefilter("ignore", MassWarning)
         assert speed(limit) < max(2.0 * speed(0.5 * limit), 0.2)
     advice = r"viscosity limits the time step to about .* s, but it is .* s: try"
     with pytest.warns(CortadoWarning, match="from viscosity"), pytest.raises(DivergedError, match=advice):

@@ -18,6 +18,10 @@ class CortadoWarning(UserWarning):
     """Something that works but is probably not meant."""
 
 
+class MassWarning(CortadoWarning):
+    """The fluid has another mass than was asked for; the command line says it where it describes a scene or a run."""
+
+
 _INSIDE = ("cortado", "pydantic", "contextlib", "functools")
 """Modules whose lines are none of a user's."""
 

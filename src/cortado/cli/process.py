@@ -14,7 +14,7 @@ from cortado.cli.parsing import Program, parsed
 from cortado.cli.shortage import shortage
 from cortado.cli.subcommands import CORTADO
 from cortado.cli.usage import usage_sentence
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, MassWarning
 from cortado.files.interruption import Interrupted
 from cortado.files.terminal import say, tell, to_stdout
 from cortado.version import __version__
@@ -84,5 +84,5 @@ def _complaint(error: Exception) -> str | None:
 
 
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:
-    if issubclass(category, CortadoWarning):
+    if issubclass(category, CortadoWarning) and not issubclass(category, MassWarning):
         say(f"Warning: {message}")

@@ -22,7 +22,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice
-from cortado.errors import warn
+from cortado.errors import MassWarning, warn
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluid_masses import FluidMasses
 from cortado.scene.fluids import PointsFluid
@@ -109,8 +109,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     walls = walls_of(scene, layers, at_rest)
     fluid = _packed(fluid, walls, at_rest, *period(scene))
     masses = FluidMasses.of(scene, fluid)
-    for sentence in filter(None, (*thin_sentences(scene), masses.warning)):
+    for sentence in thin_sentences(scene):
         warn(sentence)
+    if masses.warning:
+        warn(masses.warning, MassWarning)
     if scene.discretisation.jitter:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
     fluid = replace(fluid, velocities=_velocities(scene, fluid))

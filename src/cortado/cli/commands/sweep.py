@@ -57,7 +57,7 @@ class Member:
             found = self.finished(combination) or self._computed(combination)
         for warning in caught:
             if issubclass(warning.category, CortadoWarning):
-                warn(f"{combination.name}: {warning.message}")
+                warn(f"{combination.name}: {warning.message}", warning.category)
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
