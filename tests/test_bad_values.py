@@ -371,3 +371,23 @@ def test_whatever_is_public_works_or_says_what_is_wrong(module, tmp_path, monkey
                 assert len(str(error)) > 10 and "\n" not in str(error), (function, words)
             except Exception as error:
                 pytest.fail(f"{function.__qualname__}, where {words}: {type(error).__name__}: {error}")
+
+
+def test_the_first_argument_of_another_type_is_named_and_a_mistake_of_ones_own_is_not_hidden():
+    arrays = np.zeros(1), np.zeros(1), np.zeros((1, 2, 2)), [[[0.0, 0.0]]]
+    with pytest.raises(InputError, match=r"^velocities is \[\[\[0.0, 0.0\]\]\], but must be an array\.$"):
+        cortado.Trajectory(*arrays, {})
+    with pytest.raises(
+        InputError, match=r"^Adam is given no learning_rate, but must be called as Adam\(learning_rate,"
+    ):
+        cortado.optimisers.Adam()
+    with pytest.raises(
+        InputError, match=r"^on_result takes the arguments '\(\)', but must take 2: the number of a point, "
+    ):
+        cortado.evaluate(by_name()["problem"], [{}], on_result=lambda: None)
+
+    def fails(number, estimate):
+        raise ValueError("of their own")
+
+    with pytest.raises(ValueError, match="of their own"):
+        cortado.evaluate(by_name()["problem"], [{}], on_result=fails)

@@ -154,5 +154,7 @@ def _words(hint: Any) -> str:
         return _words(inner[0])
     if kind is Callable and inner and isinstance(inner[0], list):
         return f"a function of {len(inner[0])} arguments"
+    if kind.__name__ == "ndarray":
+        return "an array"
     found = next((words for one, words in _WORDS.items() if isclass(kind) and issubclass(kind, one)), None)
     return found or f"an object of the type {kind.__name__}"
