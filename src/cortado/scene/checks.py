@@ -235,6 +235,10 @@ def _check_schedule(scene: SceneTables) -> None:
             raise field_error(("schedule", name), Words("given"), f"left out, as the scene {BY_NAME[name].absent}")
     if "gravity" in courses and "tilt" in courses:
         raise field_error(("schedule", "gravity"), Words("given"), "left out, as the tilt says where gravity points")
+    usual = type(scene.forces).model_fields["gravity"].default[: scene.dimension]
+    if "gravity" in courses and scene.forces.gravity not in (usual, first := courses["gravity"].values[0]):
+        wanted = f"left out, or {shown(first)}, with which schedule.gravity begins, as that acts in its place"
+        raise field_error(("forces", "gravity"), scene.forces.gravity, wanted)
     path = courses.get("nozzle_path")
     if path is None or scene.emitter is None:
         return

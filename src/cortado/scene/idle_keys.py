@@ -60,7 +60,13 @@ def _idle(scene: SceneTables) -> Iterator[Idle]:
     if forces.surface_tension is None:
         yield ("forces",), forces, ("surface_tension_form",), "there is no surface_tension"
     if np.all(getattr(scene.container, "periodic", False)):
-        yield ("container",), scene.container, ("slip",), "it has no walls where all axes are periodic"
+        names = ("slip", "material", "colour")
+        yield ("container",), scene.container, names, "it has no walls where all axes are periodic"
+    if scene.dimension == 2:
+        tables: list[tuple[FieldPath, Table]] = [(("phase", index), phase) for index, phase in enumerate(scene.phase)]
+        for path, table in [*tables, (("container",), scene.container)]:
+            if "colour" in table.model_fields_set and getattr(table, "colour", None) is not None:
+                yield path, table, ("material",), "colour is given, which is all that a plane shows of it"
     if scene.picture is not None:
         yield from _idle_in_picture(scene.picture, scene.dimension)
 
@@ -81,19 +87,33 @@ def _idle_in_picture(picture: Picture, dimension: int) -> Iterator[Idle]:
 
 
 def _turned_off(scene: SceneTables) -> Iterator[Idle]:
-    mixture, thick = scene.mixture, any(phase.viscosity > 0.0 or phase.rheology for phase in scene.phase)
+    forces, mixture = scene.forces, scene.mixture
+    thick = any(phase.viscosity > 0.0 or phase.rheology for phase in scene.phase)
+    if forces.surface_tension == 0.0:
+        yield ("forces",), forces, ("surface_tension_form",), "surface_tension is 0"
     if mixture.mobility == 0.0:
         yield ("mixture",), mixture, OF_DIFFUSION, "mobility is 0 and nothing diffuses"
-    if scene.forces.viscosity == "none" or not thick:
+    if forces.viscosity == "none" or not thick:
         tables: list[tuple[FieldPath, Any]] = [(("container",), scene.container)]
         tables += [(("solid", index), solid) for index, solid in enumerate(scene.solid)]
         for path, table in tables:
             yield path, table, ("slip",), "no viscous force acts"
-    if not scene.forces.pressure:
+    if not forces.pressure:
         yield ("solver",), scene.solver, OF_ITERATIONS, "forces.pressure is false"
     if all(isinstance(fluid, PointsFluid) for fluid in scene.fluid):
         cut = scene.discretisation
         yield ("discretisation",), cut, ("jitter",), "points of files and an emitter's particles stay where they are"
+    emitter, spacing = scene.emitter, scene.discretisation.spacing
+    if (
+        emitter is not None
+        and emitter.length is not None
+        and emitter.layers(spacing) * spacing < emitter.length - spacing
+    ):
+        yield ("emitter",), emitter, ("length",), "duration is over before so much is out"
+    for index, solid in enumerate(scene.solid):
+        names = tuple(name for name in ("centre", "base") if any(getattr(solid, name, ())))
+        if not np.allclose(solid.middle(), solid.shape_about()[1]):
+            yield ("solid", index), solid, names, "position says where its middle is"
     for index, phase in enumerate(scene.phase):
         path, law = ("phase", index, "rheology"), phase.rheology
         if isinstance(law, Yielding) and law.yield_stress == 0.0:
