@@ -4,8 +4,10 @@ import inspect
 import json
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, get_args
 
+import h5py
 import numpy as np
 
 from cortado import CortadoWarning
@@ -112,6 +114,18 @@ def same(one: Any, other: Any) -> bool:
     if hasattr(one, "__dict__"):
         return same(vars(one), vars(other))
     return bool(one == other)
+
+
+def numbers(path: Path) -> Any:
+    """In a file that a command leaves, but times that it took."""
+    if path.suffix == ".json" and path.name not in ("environment.json", "dataset.json", "scene.json"):
+        return {name: value for name, value in json.loads(path.read_text()).items() if "seconds" not in name}
+    if path.suffix == ".h5":
+        with h5py.File(path) as file:
+            found = {}
+            file.visititems(lambda name, one: found.update({name: one[()]} if isinstance(one, h5py.Dataset) else {}))
+            return found
+    return path.read_text() if path.name == "metrics.jsonl" else None
 
 
 def told(make: Any) -> tuple[Any, list[str]]:

@@ -3,7 +3,6 @@
 import json
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
@@ -13,7 +12,7 @@ from cortado.optimisation.datasets.table import DatasetTables
 from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.pictures.image_files import write_picture
-from every_key import key_at, keys_of, places, put, same
+from every_key import key_at, keys_of, numbers, places, put, same
 
 SENSOR = {"name": "gauge", "kind": "wave_gauge", "position": [0.2, 0.0], "radius": 0.2}
 RENDER = {"resolution": [16, 16]}
@@ -144,17 +143,6 @@ def outcome(cortado_command, unrendered, measured, tmp_path_factory):
         return code, said, {path.name: numbers(path) for path in sorted((folder / "out").rglob("*"))}
 
     return ended
-
-
-def numbers(path):
-    if path.suffix == ".json" and path.name not in ("environment.json", "dataset.json", "scene.json"):
-        return {name: value for name, value in json.loads(path.read_text()).items() if "seconds" not in name}
-    if path.suffix == ".h5":
-        with h5py.File(path) as file:
-            found = {}
-            file.visititems(lambda name, one: found.update({name: one[()]} if isinstance(one, h5py.Dataset) else {}))
-            return found
-    return path.read_text() if path.name == "metrics.jsonl" else None
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from scenes import jet, plane, scene, two_layers
 BELT = {"name": "belt", "shape": "box", "lower": [0.2, 0.3], "upper": [0.4, 0.4]}
 ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
 LAW = {"name": "mud", "rest_density": 1000.0, "viscosity": 0.5}
+SHAKEN = {"gravity": {"times": [0.0, 1.0], "values": [[0.0, -9.81], [2.0, -9.81]]}}
 MUD = {"fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "mud"}]}
 FRAMES = {"kind": "keyframes", "times": [0.0, 1.0], "cameras": [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]}
 
@@ -30,6 +31,10 @@ REFUSED = {
     "forces.viscous_solve": lambda: plane(forces={"viscosity": "pairwise", "viscous_solve": "implicit"}),
     "forces.surface_tension_form": lambda: plane(forces={"surface_tension_form": "pairwise"}),
     "container.slip": lambda: plane(container={**ROOM, "periodic": [True, True], "slip": "no"}),
+    "container.colour": lambda: plane(container={**ROOM, "periodic": [True, True], "colour": [0.1, 0.2, 0.3]}),
+    "container.material": lambda: plane(container={**ROOM, "material": "steel", "colour": [0.1, 0.2, 0.3]}),
+    "phase[0].material": lambda: plane(phase=[{**LAW, "material": "milk", "colour": [0.1, 0.2, 0.3]}], **MUD),
+    "forces.gravity": lambda: plane(forces={"gravity": [0.0, -1.62]}, schedule=SHAKEN),
     "picture.light": lambda: plane(picture={"light": "noon", "background": [0.5, 0.5, 0.5]}),
     "picture.floor": lambda: plane(picture={"floor": False}),
     "picture.field_of_view": lambda: plane(picture={"field_of_view": 40.0}),
@@ -46,6 +51,13 @@ WARNED = {
     "solver.iterations": lambda: plane(
         solver={"kind": "projection", "time_step": 1e-3, "iterations": 5}, forces={"pressure": False}
     ),
+    "forces.surface_tension_form": lambda: plane(
+        forces={"gravity": [0.0, -9.81], "surface_tension": 0.0, "surface_tension_form": "pairwise"}
+    ),
+    "emitter.length": lambda: jet(emitter={**jet().emitter.model_dump(), "length": 1.0, "duration": 0.05}),
+    "solid[0].centre": lambda: plane(
+        solid=[{"name": "ball", "shape": "sphere", "centre": [0.5, 0.6], "radius": 0.1, "position": [0.5, 0.7]}]
+    ),
     "discretisation.jitter": lambda: jet(discretisation={"spacing": 0.05, "jitter": 0.1}, fluid=[]),
     "phase[0].rheology.regularisation": lambda: plane(
         phase=[{**LAW, "rheology": Bingham(yield_stress=0.0, regularisation=0.3)}], **MUD
@@ -59,6 +71,11 @@ def test_a_key_of_a_choice_that_was_not_made_is_refused(key):
         REFUSED[key]()
     assert str(caught.value).startswith(f"{key} is ")
     assert_one_sentence(str(caught.value))
+
+
+def test_gravity_that_a_schedule_begins_with_is_said_twice():
+    first = {"times": [0.0, 1.0], "values": [[0.0, -1.62], [2.0, -1.62]]}
+    assert plane(forces={"gravity": [0.0, -1.62]}, schedule={"gravity": first}).schedule.gravity.times == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("key", WARNED)

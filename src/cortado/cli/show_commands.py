@@ -8,11 +8,12 @@ from tyro.conf import Positional, arg
 
 from cortado.cli.arguments import Device, Flag, Overrides, as_text, require_at_least
 from cortado.cli.command import Work
+from cortado.errors import InputError
 
 
 def picture(
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
-    frame: int = -1,
+    frame: int | None = None,
     film: Flag = False,
     lines: int | None = None,
     camera: str | None = None,
@@ -25,7 +26,7 @@ def picture(
 
     Args:
         runs: Folders of up to nine runs, or of a sweep of them.
-        frame: Number of a recorded frame, counted from the end where it is negative.
+        frame: Number of a recorded frame, counted from the end where it is negative; the last one if left out.
         film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
         lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
         camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
@@ -33,10 +34,19 @@ def picture(
         out: Where to write it, a film as .mp4 or .webp; if left out into the run's figures, of several beside them.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
+    words = as_text(overrides)
+    if film and frame is not None:
+        raise InputError("--frame is given, but must be left out, as --film has all frames.")
+    if lines is not None:
+        _refuse(words, ("width", "height"), "--lines says so already")
+    if colour is not None:
+        _refuse(words, ("colour",), "--colour says so already")
+    if not film:
+        _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
     from cortado.cli.commands.picture import camera_override, draw_runs, picture_settings
 
-    replaced, settings = camera_override(camera) + as_text(overrides), picture_settings(lines, colour)
-    return partial(draw_runs, runs, frame, film, out, replaced, device, settings)
+    replaced, settings = camera_override(camera) + words, picture_settings(lines, colour)
+    return partial(draw_runs, runs, -1 if frame is None else frame, film, out, replaced, device, settings)
 
 
 def export(
@@ -56,16 +66,22 @@ def export(
         overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
     """
     require_at_least(1, every, "--every")
+    words = as_text(overrides)
+    for word in words:
+        if word.partition("=")[0].strip() not in ("picture.colour", "picture.surface"):
+            raise InputError(
+                f"--set is {word}, but must replace picture.colour or picture.surface: others act in pictures."
+            )
     from cortado.cli.commands.export import export_run
 
-    return partial(export_run, run, to, out, every, as_text(overrides))
+    return partial(export_run, run, to, out, every, words)
 
 
 def view(
     path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
     overrides: Overrides = (),
     device: Device = "cpu",
-    precision: str = "float32",
+    precision: str | None = None,
     port: int = 8080,
 ) -> Work:
     """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
@@ -74,9 +90,17 @@ def view(
     Args:
         path: The folder of a run, a scene file, or a task file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        precision: "float32" or "float64", of a scene or a task that runs.
+        precision: "float32" or "float64", of a scene or a task that runs; "float32" if left out.
         port: Of the page on this machine; the next one that is free if it is taken.
     """
     from cortado.cli.commands.view import view as show
 
     return partial(show, path, as_text(overrides), device, precision, port)
+
+
+def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
+    """Raises `InputError` where --set replaces one of some keys of [picture]."""
+    for override in overrides:
+        name = override.partition("=")[0].strip()
+        if name.removeprefix("picture.") in keys:
+            raise InputError(f"--set {name} is given, but must be left out, as {why}.")

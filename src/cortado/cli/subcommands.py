@@ -53,17 +53,19 @@ def new(
 @command(app, answers=True)
 def examples(
     copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
-    to: Path = Path(),
+    to: Path | None = None,
 ) -> Work:
     """List the examples that come with Cortado, or copy some of them.
 
     Args:
         copy: One to copy, or all of them with the name "all"; may be given again.
-        to: The folder to copy to; made if it is missing.
+        to: The folder to copy to, this one if left out; made if it is missing.
     """
+    if to is not None and not copy:
+        raise InputError("--to is given, but must be left out, as --copy says of nothing that it is copied.")
     from cortado.cli.commands.examples import list_examples
 
-    return partial(list_examples, as_text(copy), to)
+    return partial(list_examples, as_text(copy), to or Path())
 
 
 @command(app, answers=True)

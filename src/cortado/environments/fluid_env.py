@@ -36,14 +36,15 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
     def __init__(
         self,
         task: str | Task,
-        size: str = "small",
+        size: str | None = None,
         device: str = "cpu",
         precision: str = "float32",
         particles: int = SEEN,
         sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
     ):
-        """``task``: its name, such as "Carry", in the ``size`` "small" or "large"; or a `Task` of your own.
+        """``task``: its name, such as "Carry", in the ``size`` "small", if left out, or "large"; or a `Task` of
+        your own.
         ``particles``: how many are observed; ``sensors`` by name, such as those of `cortado.sensors`, are observed as
         well; ``device`` and ``precision`` as those of `Simulation`; ``render_mode`` None or "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)

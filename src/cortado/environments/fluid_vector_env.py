@@ -35,7 +35,7 @@ class FluidVectorEnv(Staying, VectorEnv):
         self,
         task: str | Task,
         num_envs: int = 1,
-        size: str = "small",
+        size: str | None = None,
         device: str = "cpu",
         precision: str = "float32",
         particles: int = SEEN,

@@ -131,7 +131,7 @@ class Scene(SceneTables):
             raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
         given = not isinstance(overrides, Sequence) or len(overrides) > 0
         if given and isinstance(data, dict):
-            data = put_in(_given(data), overrides, file)
+            data = put_in(_given(data), overrides, file, OTHER_TABLES)
         return scene_from_dict(data)
 
 
@@ -165,7 +165,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
     Raises:
         SceneError: in one sentence, with the file, the field, what was found and what was wanted.
     """
-    return scene_from_dict(read_toml(path, overrides), os.fspath(path))
+    return scene_from_dict(read_toml(path, overrides, OTHER_TABLES), os.fspath(path))
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from cortado.errors import LONGEST, InputError, SceneError, shown
+from cortado.errors import LONGEST, InputError, SceneError, Words, shown
 from cortado.files.input_files import as_path, content, reason
 
 MOST_BYTES = 1_000_000
@@ -26,8 +26,11 @@ _TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 
 
-def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """The contents of a TOML file with overrides put in. Raises `SceneError`.
+def read_toml(
+    path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The contents of a TOML file with overrides put in, none of them of the tables that stay ``unread``. Raises
+    `SceneError`.
 
     An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``;
     an entry with a name may be called by it, ``phase.oil.viscosity=0.1``.
@@ -49,7 +52,16 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
         beside = _beside(file) if isinstance(problem, FileNotFoundError) else None
         there = f"; did you mean {beside}?" if beside else "."
         raise _unreadable(file, f"cannot be read: {reason(problem)}{there}") from None
-    return put_in(data, overrides, file)
+    return put_in(data, overrides, file, unread)
+
+
+def overrides_of(overrides: Sequence[str], tables: Sequence[str]) -> list[str]:
+    """Those of some overrides that replace something in tables."""
+    return [one for one in overrides if isinstance(one, str) and _table_of(one) in tables]
+
+
+def _table_of(override: str) -> str:
+    return re.split(r"[.\[=\s]", override.strip())[0]
 
 
 def _beside(file: str) -> str | None:
@@ -63,13 +75,17 @@ def _beside(file: str) -> str | None:
     return os.path.join(folder, close[0]) if close else None
 
 
-def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[str, Any]:
-    """The contents of a file with overrides put in. Raises `SceneError`."""
+def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
+    """The contents of a file with overrides put in, none of them of the tables that stay ``unread``. Raises
+    `SceneError`."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
     if not isinstance(overrides, Sequence):
         raise InputError(f"overrides is {shown(overrides)}, but must be a list of texts such as 'solver.kind=pcisph'.")
+    for idle in overrides_of(overrides, unread):
+        key, table = idle.partition("=")[0].strip(), _table_of(idle)
+        raise SceneError(file, key, Words("given"), f"left out, as the table [{table}] is not looked at here")
     for override in overrides:
         if not isinstance(override, str):
             sentence = "is no override, which is a text such as 'solver.time_step=0.002'."

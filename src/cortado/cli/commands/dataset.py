@@ -23,7 +23,7 @@ from cortado.runs.run_files import read_json
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.sentences import sentences as in_sentences
-from cortado.scene.toml import read_toml
+from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation
 from cortado.version import __version__
 from cortado.words import counted
@@ -76,7 +76,8 @@ def make_dataset(
     """Compute the runs that are not there yet, and put them together; returns a sentence that says where they are.
     Raises `ComputationError` where the disk is full, and where a purpose is left without a run."""
     table = _table(file, overrides)
-    member = Member(file.absolute(), tuple(overrides), table, out.absolute(), device, precision)
+    of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
+    member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
     split = table.split(_checked_runs(runs, table))
     asked = _asked(member, runs)
     if out.suffix in (".h5", ".hdf5"):
@@ -155,7 +156,7 @@ def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping
 
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
     """The table [dataset] of a file; raises `SceneError`."""
-    data = read_toml(file, overrides)
+    data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
         raise SceneError(str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one")
     try:
@@ -182,16 +183,28 @@ def _asked(member: Member, runs: int) -> dict[str, Any]:
     table = member.table
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        for end in (0, 1):
-            ends = [f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()]
-            scene = load_scene(member.file, [*member.overrides, *ends])
-            scene.solver.fixed_time_step("a data set")
+        ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
+        for end in ends:
+            load_scene(member.file, [*member.overrides, *end]).solver.fixed_time_step("a data set")
+        for k, key in enumerate(table.vary):
+            others = [*ends[0][:k], *ends[0][k + 1 :]]
+            if ends[0][k] != ends[1][k] and _are_one(member, [*others, ends[0][k]], [*others, ends[1][k]]):
+                raise InputError(f"vary has {key}, which changes nothing that is computed.")
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
             raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
     scene_json = json.loads(_scene(member).to_json())
     numbers = {"runs": runs, "precision": member.precision, "cortado": __version__}
     return {"scene": scene_json, "dataset": table.model_dump(mode="json"), **numbers}
+
+
+def _are_one(member: Member, *overrides: list[str]) -> bool:
+    """Whether the scenes of a run with some overrides and with others compute the same; not where one is refused."""
+    try:
+        scenes = [load_scene(member.file, [*member.overrides, *some]).computed_json() for some in overrides]
+    except SceneError:
+        return False
+    return scenes[0] == scenes[1]
 
 
 def _scene(member: Member) -> Scene:

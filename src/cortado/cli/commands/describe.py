@@ -33,7 +33,7 @@ from cortado.runs.frame_choice import FrameChoice
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
-from cortado.scene.toml import read_toml
+from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
@@ -86,7 +86,8 @@ def describe_scene(
     """As text, or as JSON; a picture of the first state is written where one is asked for."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
-    scene = load_scene(scene_file, overrides).lasting(time, steps)
+    of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
+    scene = load_scene(scene_file, [one for one in overrides if one not in of_search]).lasting(time, steps)
     bodies = scene.fluid if scene.emitter is None else (*scene.fluid, scene.emitter)
     count = sum(body.count(scene.discretisation.spacing) for body in bodies)
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():

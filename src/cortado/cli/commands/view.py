@@ -20,7 +20,7 @@ from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 
-def view(path: Path, overrides: list[str], device: str, precision: str, port: int) -> str:
+def view(path: Path, overrides: list[str], device: str, precision: str | None, port: int) -> str:
     """Show a run folder, or run a task or a scene, until Ctrl-C ends it."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
@@ -36,19 +36,20 @@ def view(path: Path, overrides: list[str], device: str, precision: str, port: in
 
 
 def opened(
-    path: Path, overrides: list[str], device: str, precision: str, port: int
+    path: Path, overrides: list[str], device: str, precision: str | None, port: int
 ) -> LiveView | RecordedView | TaskView:
     """The view of a run folder, of a task file, or of a scene file."""
     if not path.exists():
         raise InputError(f"{path} does not exist, but must be the folder of a run, or the file of a scene or a task.")
     if not path.is_dir():
         if {"problem", "optimise"} & set(read_toml(path, overrides)):
-            made = setup(load_task(path, overrides), device, precision)
+            made = setup(load_task(path, overrides), device, precision or "float32")
             say("The run with the first guess, and its gradient, are computed first.")
             return TaskView(made, port)
-        return LiveView(Simulation(load_scene(path, overrides), device, precision), port)
-    if overrides:
-        raise InputError("--set is given, but must be left out, as the run is there already.")
+        return LiveView(Simulation(load_scene(path, overrides), device, precision or "float32"), port)
+    for option, value in (("set", overrides), ("precision", precision)):
+        if value:
+            raise InputError(f"--{option} is given, but must be left out, as the run is there already.")
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cortado.errors import InputError, SceneError
+from cortado.errors import InputError, SceneError, Words
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.inverse.fit_tables import FitTable, FitTables
 from cortado.optimisation.inverse.measured_data import observation
@@ -65,9 +65,11 @@ class FitTask:
 def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> FitTask:
     """Read one from a TOML file; raises `SceneError` in one sentence."""
     file = os.fspath(path)
-    data = read_toml(path, overrides)
+    data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:
         raise SceneError(file, "fit", MISSING, "a table; a task with [optimise] is solved by cortado optimise")
+    if "optimise" in data:
+        raise SceneError(file, "optimise", Words("given"), "left out of a fit, whose search [fit] describes")
     first, tables = _read(data, file, FitTables)
     others = [_also(Path(file).parent / name) for name in first.problem.also]
     return FitTask((first, *others), tables.fit)

@@ -43,12 +43,13 @@ class Task:
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
     """Read a task from a TOML file; raises `SceneError` in one sentence."""
     file = os.fspath(path)
-    data = read_toml(path, overrides)
+    data = read_toml(path, overrides, ("fit", "dataset"))
     scene = scene_from_dict(data, file)
     if not any(key in data for key in TaskTables.model_fields):
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
-    if "fit" in data and "optimise" not in data:
-        raise SceneError(file, "fit", Words("given"), "solved by cortado fit, as its target was measured")
+    if "fit" in data:
+        others = "solved by cortado fit, as its target was measured"
+        raise SceneError(file, "fit", Words("given"), others if "optimise" not in data else "left out of a search")
     if scene.solver.chooses:
         wanted = "a number of seconds in a task, whose runs are compared step by step"
         raise SceneError(file, "solver.time_step", "auto", wanted)
@@ -145,6 +146,9 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
         wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Words("given"))
         raise SceneError(None, f"optimise.gradient.spread.{name}", found, wanted)
     given = optimise.check.model_fields_set
+    for table, values in (("problem.target", problem.target or {}), ("optimise.start", start)):
+        if problem.loss != "image" and "colours" in values:
+            raise SceneError(None, f"{table}.colours", Words("given"), "left out, as positions are compared")
     if problem.loss != "image" and len(optimise.extinction_schedule) > 1:
         wanted = "left out, as positions are compared"
         raise SceneError(None, "optimise.extinction_schedule", list(optimise.extinction_schedule), wanted)
