@@ -76,6 +76,8 @@ BAD_TASKS = [
     ("target that is a list", _TARGET, "target = [1.5, -9.81]", "problem.target"),
     ("unknown parameter", _START, "start.gravitation = [0.0, -7.0]", "optimise.start.gravitation"),
     ("colour of one channel", _TARGET, f"{_TARGET}\ntarget.colours = [1.0]", "problem.target.colours"),
+    ("colours of positions", _TARGET, f"{_TARGET}\ntarget.colours = [[0.1, 0.2, 0.3]]", "problem.target.colours"),
+    ("fit beside optimise", _CHECK, f"[fit]\nstart.gravity = [0.0, -9.0]\n\n{_CHECK}", "fit"),
     ("parameter of another table", _TARGET, "target.spacing = 0.1", "problem.target.spacing"),
     ("start without target", _START, "start.gravity = [0.0, -7.0]\nstart.viscosity = 0.1", "problem.target.viscosity"),
     ("gravity of three", _START, "start.gravity = [0.0, -7.0, 0.0]", "optimise.start.gravity"),

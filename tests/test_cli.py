@@ -857,6 +857,22 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
         (["gradients", "check", "scene.toml", "--perturbation", "-1"], "perturbation is -1.0, but must be greater"),
         (["gradients", "check", "scene.toml", "--out", "scene.toml"], "The folder scene.toml cannot be made"),
         (["gradients", "check", "absent.toml"], "cannot be read"),
+        (["examples", "--to", "there"], "--to is given, but must be left out"),
+        (["picture", "run", "--film", "--frame", "1"], "--frame is given, but must be left out"),
+        (
+            ["picture", "run", "--set", "picture.film_speed=1"],
+            "--set picture.film_speed is given, but must be left out",
+        ),
+        (
+            ["picture", "run", "--lines", "90", "--set", "picture.width=90"],
+            "picture.width is given, but must be left out",
+        ),
+        (["export", "run", "--to", "ply", "--set", "picture.width=90"], "--set is picture.width=90, but must replace"),
+        (["run", "scene.toml", "--set", "optimise.iterations=5"], "optimise.iterations is given, but must be left out"),
+        (
+            ["describe", "scene.toml", "--set", "fit.starts=3"],
+            "fit.starts is given, but must be left out, as the table",
+        ),
     ],
 )
 def test_other_wrong_arguments_are_refused(cortado_command, folder, arguments, words):

@@ -273,6 +273,11 @@ def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(
             ("--set", 'dataset.vary={"solver.time_step"=[0.001,0.002]}', "--set", "dataset.logarithmic=[]"),
             "vary has solver.time_step, which must be the same",
         ),
+        (
+            ("--set", 'dataset.vary={"picture.film_speed"=[0.1,0.2]}', "--set", "dataset.logarithmic=[]"),
+            "vary has picture.film_speed, which changes nothing that is computed",
+        ),
+        (("--set", "problem.steps=3"), "problem.steps is given, but must be left out"),
         (("--set", 'dataset.vary={"phase.oil.viscosity"=[0.1,0.2]}', "--set", "dataset.logarithmic=[]"), "oil"),
         (
             ("--set", 'dataset.vary={"phase.0.viscosity"=[0.2,0.1]}'),

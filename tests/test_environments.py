@@ -313,6 +313,12 @@ def test_bad_actions_are_refused_in_a_sentence(environments, action, sentence):
         env.step(action)
 
 
+def test_a_task_of_a_users_own_has_no_size():
+    task = cortado.environments.FluidEnv("Carry").scenes.task
+    with pytest.raises(InputError, match="size is 'large', but must be left out, as the task is one of your own"):
+        cortado.environments.FluidEnv(task, size="large")
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [

@@ -190,6 +190,19 @@ def test_fluid_in_millimetres_is_asked_about(spacing, told):
     assert (sentence in [str(one.message) for one in caught]) is told
 
 
+def test_numbers_in_other_units_are_asked_about():
+    data = good_data()
+    data["phase"][0]["viscosity"] = 50_000.0
+    data["solid"] = [{"name": "ball", "shape": "sphere", "centre": [0.1, 0.9, 0.1], "radius": 0.05}]
+    data["solid"][0]["rotation"] = [0.0, 0.0, 90.0]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene_from_dict(data, "scene.toml")
+    said = [str(one.message) for one in caught]
+    assert any(one.endswith("50000 Pa s, more than tar has: is it in mPa s?") for one in said)
+    assert "solid[0].rotation is 90 rad, more than a whole turn: is it in degrees?" in said
+
+
 def test_a_misspelt_key_is_told_the_right_one():
     data = good_data()
     data["solver"]["timestep"] = 0.1
@@ -205,6 +218,10 @@ def test_a_misspelt_key_is_told_the_right_one():
     ("table", "key", "advice"),
     [
         (None, "gravity", "gravity is not a key of the scene; did you mean forces.gravity or schedule.gravity?"),
+        (None, "walls", "walls is not a key of the scene; did you mean container?"),
+        (None, "obstacle", "obstacle is not a key of the scene; did you mean solid?"),
+        ("solver", "dt", "solver.dt is not a key of [solver]; did you mean time_step?"),
+        ("discretisation", "dx", "discretisation.dx is not a key of [discretisation]; did you mean spacing?"),
         (None, "time_step", "time_step is not a key of the scene; did you mean solver.time_step?"),
         ("solver", "spacing", "solver.spacing is not a key of [solver]; did you mean discretisation.spacing?"),
         ("forces", "dimension", "forces.dimension is not a key of [forces]; did you mean dimension at the top of the"),

@@ -77,7 +77,7 @@ class FixedForces(Table):
     """The forces that every scene has."""
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
-    """(d,) Acceleration that acts on all fluid [m/s2]."""
+    """(d,) Acceleration that acts on all fluid [m/s2]; with schedule.gravity, the first row there, if given."""
     viscosity: Literal["stress", "pairwise", "laminar", "none"] = "stress"
     """Form of the viscous force. "stress": a stress that has the asked viscosity within 1 %, with 40 particles across a
     wave of shear, in every direction, and makes no force where fluid turns as a whole. For comparison, "pairwise":

@@ -5,7 +5,7 @@ Whatever is wrong raises a `SceneError`, one sentence.
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,6 +28,8 @@ from cortado.scene.viscous_forms import wall_sentence
 
 LIGHTEST = 50.0
 """Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
+THICKEST = 1e4
+"""Viscosity above which a scene warns [Pa s]: honey has 10."""
 HEAVIEST = {2: 3e5, 3: 3e6}
 """By the dimension, the mass of fluid above which a scene warns [kg]: that of water 30 m x 10 m, and 10 m deep."""
 
@@ -40,19 +42,15 @@ class Scene(SceneTables):
     def _check(self) -> Self:
         check_scene(self)
         check_idle(self)
-        for phase in self.phase:
-            if phase.rest_density < LIGHTEST:
-                found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
-                warn(f"{found}, less than any liquid has: is it in g/cm3?")
-        if wrong := _millimetres(self):
-            warn(wrong)
         time_step = self.solver.time_step
         if time_step == "auto":
             check_bounded(self)
         elif broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
             warn(f"{found}, which comes from {broken[0]}.")
-        for sentence in filter(None, (wall_sentence(self), creep_sentence(self), *idle_sentences(self))):
+        for sentence in filter(
+            None, (*_in_other_units(self), wall_sentence(self), creep_sentence(self), *idle_sentences(self))
+        ):
             warn(sentence)
         return self
 
@@ -133,6 +131,22 @@ class Scene(SceneTables):
         if given and isinstance(data, dict):
             data = put_in(_given(data), overrides, file, OTHER_TABLES)
         return scene_from_dict(data)
+
+
+def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
+    """What to say of numbers that look as if they had another unit."""
+    for phase in scene.phase:
+        if phase.rest_density < LIGHTEST:
+            found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
+            yield f"{found}, less than any liquid has: is it in g/cm3?"
+        if phase.viscosity > THICKEST:
+            yield f"the viscosity of {phase.name} is {phase.viscosity:g} Pa s, more than tar has: is it in mPa s?"
+    for name, bodies in (("fluid", scene.fluid), ("solid", scene.solid)):
+        for index, body in enumerate(bodies):
+            turn = float(np.linalg.norm(getattr(body, "rotation", None) or 0.0))
+            if turn > 2.0 * np.pi:
+                yield f"{name}[{index}].rotation is {turn:g} rad, more than a whole turn: is it in degrees?"
+    yield _millimetres(scene)
 
 
 def _millimetres(scene: SceneTables) -> str | None:

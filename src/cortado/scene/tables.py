@@ -16,6 +16,26 @@ from cortado.scene.docstrings import field_docstrings
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
 from cortado.scene.sentences import UNKNOWN, absent, sentences
 
+ALSO_CALLED = {
+    **dict.fromkeys(("dt", "step_size"), ("time_step",)),
+    **dict.fromkeys(("dx", "h", "particle_size", "particle_radius", "resolution"), ("spacing",)),
+    **dict.fromkeys(("walls", "boundary", "boundaries", "box", "domain", "tank"), ("container",)),
+    **dict.fromkeys(("obstacle", "obstacles", "body", "rigid_body"), ("solid",)),
+    **dict.fromkeys(("fluids", "liquid", "water"), ("phase", "fluid")),
+    **dict.fromkeys(("rho", "mass"), ("rest_density", "density")),
+    **dict.fromkeys(("mu", "eta"), ("viscosity",)),
+    **dict.fromkeys(("speed", "flow", "rate"), ("velocity", "flow_rate")),
+    **dict.fromkeys(("lr", "step"), ("learning_rate",)),
+    **dict.fromkeys(("epochs", "maxiter", "updates"), ("iterations",)),
+    **dict.fromkeys(("method", "algorithm"), ("optimiser",)),
+    **dict.fromkeys(("initial", "guess"), ("start",)),
+    **dict.fromkeys(("min", "from"), ("lower",)),
+    **dict.fromkeys(("max", "to", "size"), ("upper",)),
+    **{"type": ("kind", "shape"), "n": ("flow_index",), "cfl": ("courant",), "omega": ("angular_velocity",)},
+    **{"angle": ("rotation",), "csv": ("file",), "path": ("file",), "fps": ("frame_rate",)},
+}
+"""Keys by what others call them."""
+
 
 class Table(BaseModel):
     """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
@@ -84,7 +104,8 @@ def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCus
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     longer = [name for name in known if key in name.split("_")]
-    close = longer or get_close_matches(key, known, n=1)
+    other = [name for name in ALSO_CALLED.get(key.lower(), ()) if name in known]
+    close = other or longer or get_close_matches(key, known, n=1)
     others = f"{missing}." if (missing := absent(key)) else f"its keys are {', '.join(known)}."
     advice = f"did you mean {close[0]}?" if close else others
     found = Words("short for another") if longer else UNKNOWN
