@@ -59,11 +59,14 @@ class WaveGauge:
         their horizontal ways (n, d): in more parts where a column has sides."""
         reach, across = reach_of(self.radius, at), at.dimension - 1
         axis = Axis.of(at, self.position, self.floor, self.up, reach)
-        column, inside, scale = column_of(axis, at), cut_by(axis, at.container), ACROSS[across] / reach**across
+        column, inside = column_of(axis, at), cut_by(axis, at.container)
+        scale = (
+            at.lattice.cell * ACROSS[across] / reach**across / (1.0 if inside is None else axis.places()[1] @ inside)
+        )
         whole = column is None and inside is None
         parts = parts_of(reach if whole else reach / FINER, at, self._across, across)
         around = Seen.of(at, self.position, reach, self._across, parts)
-        return column, at.lattice.cell * scale / (1.0 if inside is None else axis.places()[1] @ inside), around
+        return column, scale, around
 
     def _across(self, way: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(way - (way @ self.up)[:, None] * self.up)
