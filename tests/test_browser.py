@@ -144,7 +144,7 @@ def look(page, tmp_path, monkeypatch) -> Iterator[Callable[[str], Any]]:
         def open_view(text: str) -> Any:
             Path("scene.toml").write_text(text)
             path = Path("a") if Path("a").exists() else Path("scene.toml")
-            shown = opened(path, [], "cpu", "float32", PORT)
+            shown = opened(path, [], "cpu", None, PORT)
             stack.callback(shown.window.close)
             page.goto(shown.window.address)
             until(page, shown, lambda: coloured(scene_of(page)) > 0.01)

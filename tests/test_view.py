@@ -229,7 +229,7 @@ def test_a_step_that_fails_says_why(task, monkeypatch):
 
 def test_a_run_is_played_and_gone_through(scene):
     main(["run", "scene.toml", "--steps", "4", "--out", "a", "--no-pictures"])
-    shown = opened(Path("a"), [], "cpu", "float32", PORT + 1)
+    shown = opened(Path("a"), [], "cpu", None, PORT + 1)
     try:
         trajectory = Trajectory.load("a/trajectory.vtkhdf")
         shown.show(3)
