@@ -21,7 +21,7 @@ def check_scene(scene: Scene) -> None:
     if not isinstance(scene.solver, PcisphSolver | ProjectionSolver):
         kind = shown(scene.solver.kind)
         raise InputError(f"solver.kind is {kind}, but must be pcisph or projection for the reference engine.")
-    for name in ("shifting", "velocities_follow"):
+    for name in ("shifting", "velocities_follow", "multilevel"):
         if getattr(scene.solver, name, False):
             raise InputError(f"solver.{name} is true, but must be left out for the reference engine.")
     if len(scene.phase) > 1 or scene.emitter is not None:

@@ -110,7 +110,7 @@ class Scene(SceneTables):
         aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
         aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
-        off = {name for name in ("shifting", "velocities_follow") if not getattr(self.solver, name, True)}
+        off = {name for name in ("shifting", "velocities_follow", "multilevel") if not getattr(self.solver, name, True)}
         aside["solver"] = unused | off
         if self.emitter and self.emitter.duration is None:
             aside["emitter"] = {*aside.get("emitter", ()), "duration"}

@@ -83,6 +83,9 @@ class ProjectionSolver(SolverTable):
     """Iterations of the pressure in every step, each from that of the step before."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
+    multilevel: Flag = False
+    """Whether the smooth part of the pressure is found at once, on a grid with nodes two spacings apart, before each
+    iteration: water that is shut in or deep then has its pressure in the first step, and steps may be longer."""
     velocities_follow: Flag = False
     """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
     containers lose less of their speed, and those with a surface can gain energy."""

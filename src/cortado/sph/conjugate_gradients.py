@@ -161,7 +161,7 @@ def round_off(precision: Precision) -> float:
 
 
 class ConjugateGradients:
-    """Solves for the particles of one solver, with arrays of its own."""
+    """Solves for the particles of one solver, or for whatever a layout has as many of, with arrays of its own."""
 
     def __init__(self, layout: Layout, kind: Any, tolerance: float, most: int):
         """For numbers or vectors, a Warp ``kind``, until |r| has fallen to ``tolerance`` of the first, or ``most``
@@ -169,6 +169,7 @@ class ConjugateGradients:
         real = layout.precision.real
         self._kernels, self._layout = solve_kernels(layout.precision, kind), layout
         self._limits = {"tolerance": tolerance, "most": most}
+        self._sizes = {"particles": layout.particles}
         sizes = {"shape": layout.all_particles, "device": layout.device}
         self._p, self._product = (wp.zeros(dtype=kind, **sizes) for _ in range(2))
         self._share = wp.zeros(dtype=real, **sizes)
@@ -204,9 +205,9 @@ class ConjugateGradients:
             multiply(self._p, {"product": self._product, "share": self._share})
             curvature = sum_curvatures(self._share)
             own = {"w": w, "p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
-            step.launch(kernels.descend, scene, own, curvature=curvature, threads=n)
+            step.launch(kernels.descend, scene, own, self._sizes, curvature=curvature, threads=n)
             total = sum_shares(self._share)
-            step.launch(kernels.turn, scene, own, total=total, threads=n)
+            step.launch(kernels.turn, scene, own, self._sizes, total=total, threads=n)
             step.launch(kernels.decide, scene, self._limits, total=total, first=self._first, threads=members)
 
         step.join()  # a loop of a graph cannot begin while something is computed aside

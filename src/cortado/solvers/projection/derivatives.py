@@ -11,6 +11,7 @@ from cortado.device.launching import add
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
+from cortado.solvers.projection.coarse import CoarseAdjoint, CoarseTangent
 from cortado.solvers.projection.measured import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
@@ -37,6 +38,7 @@ class ProjectionTangent(ParticleTangent):
         self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
+        self._coarse = None if solver.coarse is None else CoarseTangent(solver.coarse, solver.layout)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Replace the tangent of the replayed step's state by that of its result."""
@@ -94,18 +96,29 @@ class ProjectionTangent(ParticleTangent):
         before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
         change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
         context.launch(kernels.start.tangent, *known, before, change, v_star_dot=self._v_star_dot)
+        if self._coarse is not None:
+            self._coarse.begin(context, known)
         for k in range(iterations):
-            at = solver.iterates[k]
+            at = solver.corrected[k]
+            if self._coarse is not None:
+                before = {**solver.iterates[k], **change}
+                drift = self._drift(context, before)
+                self._coarse.correct(context, (drift, *known), before, at)
+                self._press(context, known, at)
+            drift = self._drift(context, at)
             new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
-            drift = {}
-            if self._bodies is not None:
-                drift_dot = self._around["drift_dot"]
-                drift = {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
             beta = solver.momenta[k]
             context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift, beta=beta)
             self._press(context, known, solver.iterates[k + 1])
         if self._bodies is not None:
             self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
+
+    def _drift(self, context: StepContext, at: dict[str, wp.array]) -> dict[str, wp.array]:
+        """The tangent of the drift of walls where bodies move; what surrounds particles has that of others."""
+        if self._bodies is None:
+            return {}
+        drift_dot = self._around["drift_dot"]
+        return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
         """Of the velocities that y leaves."""
@@ -136,6 +149,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
+        self._coarse = None if solver.coarse is None else CoarseAdjoint(solver.coarse, solver.layout)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""
@@ -234,9 +248,25 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
+        if self._coarse is not None:
+            self._coarse.begin()
         for k in reversed(range(iterations)):
             self._press(context, known, solver.iterates[k + 1], self._y_bar)
-            self._back(context, known, solver.iterates[k], solver.momenta[k], moves=k == iterations - 1)
+            self._back(context, known, solver.corrected[k], solver.momenta[k], moves=k == iterations - 1)
+            if self._coarse is not None:
+                self._press(context, known, solver.corrected[k], self._y_bar)
+                self._correct(context, known, k)
+        if self._coarse is not None:
+            self._coarse.finish(context, known)
+
+    def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
+        """Of the coarse correction before iteration k, from the adjoints of its k and y to those of y and u before."""
+        assert self._coarse is not None
+        solver, at = self._solver, self._solver.iterates[k]
+        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
+        drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
+        self._coarse.correct(context, (drift, *known), at, solver.corrected[k], steps)
+        self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, steps)
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], y_bar: wp.array) -> None:
         """Of the velocities that y leaves, to the adjoints of v* and of y."""
@@ -259,6 +289,12 @@ class ProjectionAdjoint(ParticleAdjoint):
         if moves:
             context.launch(pressure.whole_adjoint, *known, steps, A_bar=self._A_bar)
             divergence, steps = whole, {**steps, "S": self._A_bar}
-        context.launch(divergence, *known, at, steps, u_bar=self._u_bar)
+        self._diverge(context, known, divergence, at, steps)
+
+    def _diverge(
+        self, context: StepContext, known: tuple[Named, ...], kernel: wp.Kernel, at: dict[str, wp.array], steps: Named
+    ) -> None:
+        """From d_bar and S in ``steps`` to the adjoint of u, by the kernel of one of the two kinds of S."""
+        context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
         if self._bodies is not None:
             self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)

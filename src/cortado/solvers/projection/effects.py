@@ -8,6 +8,7 @@ the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,
+    c = S(0.7, 0.95) of H + 2 nu   its share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
     L = I + c (B (K - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
     K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
     C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
@@ -27,6 +28,8 @@ from cortado.sph.moment_functions import matrix_type, moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
 """The fullness below which nothing, and above which all is done."""
+SHARED = (0.7, 0.95)
+"""The same of the share of a coarse pressure, of H + 2 nu."""
 WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
 REGULAR = 0.05
@@ -60,8 +63,10 @@ class EffectFunctions:
     """1.05 (M + 0.05 I)^-1"""
     diagonal: Any
     """a of L, Q, g, gamma, m and 0.05 a_0."""
+    share: Any
+    """c of M and nu."""
     back: Any
-    """The adjoints of M, Q, g, gamma, nu and m for those of L, a and the weights."""
+    """The adjoints of M, Q, g, gamma, nu and m for those of L, a, the weights and c."""
 
 
 @cache
@@ -76,6 +81,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
     besides, axes = (wp.constant(real(value)) for value in (3 - dimension, dimension - 1))
     (t_0, t_1), (c_0, c_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (TENSION, CORRECTED))
     (u_0, u_1), (r_0, r_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (SHIFTED, REPAIRED))
+    s_0, s_1 = (wp.constant(real(value)) for value in SHARED)
 
     @wp.func
     def unit() -> matrix:
@@ -121,6 +127,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         own_part = L * g + gamma
         return (wp.dot(own_part, own_part) + least) / m + wp.ddot(L * L, Q)
 
+    @wp.func
+    def share(M: matrix, nu: real) -> real:
+        return smoothstep(fullness(M) + real(2.0) * nu, s_0, s_1)
+
     @wp.func(module=module)
     def work(
         M: matrix,
@@ -133,9 +143,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         L_bar: matrix,
         a_bar: real,
         weights_bar: weights4,
+        share_bar: real,
     ) -> real:
         L = correction(M, gamma, nu, least)
-        total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu), weights_bar)
+        total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu), weights_bar) + share_bar * share(M, nu)
         return total + a_bar * diagonal(L, Q, g, gamma, m, least)
 
     @wp.func(module=module)
@@ -150,11 +161,12 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         L_bar: matrix,
         a_bar: real,
         weights_bar: weights4,
+        share_bar: real,
     ):
-        by_M, by_Q, by_g, by_gamma, by_nu, by_m, _least, _L, _a, _w = wp.grad(work)(
-            M, Q, g, gamma, nu, m, least, L_bar, a_bar, weights_bar
+        by_M, by_Q, by_g, by_gamma, by_nu, by_m, _least, _L, _a, _w, _c = wp.grad(work)(
+            M, Q, g, gamma, nu, m, least, L_bar, a_bar, weights_bar, share_bar
         )
         M_bar, Q_bar = real(0.5) * (by_M + wp.transpose(by_M)), real(0.5) * (by_Q + wp.transpose(by_Q))
         return M_bar, Q_bar, by_g, by_gamma, by_nu, by_m
 
-    return EffectFunctions(weights, correction, inverse, diagonal, back)
+    return EffectFunctions(weights, correction, inverse, diagonal, share, back)

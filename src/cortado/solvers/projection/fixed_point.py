@@ -191,7 +191,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._root.fill_(1.0)
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)
         wp.copy(at["k"], self._end[IMPULSE])
-        solver.press(context, 0)
+        solver.press(context, at)
         context.launch(self._gradient.forward, v_flow=at["u"], A=at["A"])
         solver.move(context, 0)
         for k in range(repairs):

@@ -11,12 +11,14 @@ from typing import Any
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.device.cells import Grid
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
+from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.following import following_kernels
 from cortado.solvers.projection.mean_stress import MeanStress
@@ -75,10 +77,16 @@ class ProjectionSteps(ParticleSolver):
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER), StateField(KICK, "m/s", Entry.VECTOR))
 
     def __init__(
-        self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int, follow: bool
+        self,
+        system: ParticleSystem,
+        constants: ProjectionConstants,
+        iterations: int,
+        repairs: int,
+        follow: bool,
+        grid: Grid | None,
     ):
         """Of so many iterations of the pressure and of the repair of density in every step; velocities ``follow`` the
-        shift and the repairs, or stay as they are."""
+        shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure before each iteration."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -98,6 +106,13 @@ class ProjectionSteps(ParticleSolver):
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
+        own = self.discretisation, self.layout, system.walled.dimension
+        self.coarse = Coarse(*own, grid, constants.spacing) if grid is not None else None
+        """What corrects the pressure before each iteration; None where nothing does."""
+        self._corrected_kinds = {**kinds, "r": real}
+        self.corrected = [self._new_corrected()] if grid is not None else self.iterates
+        """The iterates that an iteration of the pressure begins with: the corrected ones, each with r and e of its
+        correction, or those themselves."""
         self.momenta = momenta(iterations)
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
@@ -143,8 +158,14 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         while len(self.iterates) <= iterations:
             self.iterates.append(self.layout.arrays(**self._iterate_kinds))
+            if self.coarse is not None:
+                self.corrected.append(self._new_corrected())
         while len(self.repaired) <= repairs:
             self.repaired.append(self.layout.arrays(**self._repair_kinds))
+
+    def _new_corrected(self) -> dict[str, wp.array]:
+        assert self.coarse is not None
+        return {**self.layout.arrays(**self._corrected_kinds), "e": self.coarse.numbers()}
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
@@ -192,22 +213,33 @@ class ProjectionSteps(ParticleSolver):
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
         context.launch(kernels.pressure.start.forward, self.around, before, first)
+        if self.coarse is not None:
+            self.coarse.begin(context, self.around)
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Iteration k, from the iterates of one slot to those of another."""
-        kernels, at, new = self.kernels, self.iterates[before], self.iterates[after]
+        if self.coarse is not None:
+            at, new = self.iterates[before], self.corrected[before]
+            around = {**self.around, "drift": self._drift(context, at)}
+            self.coarse.correct(context, around, at, new, self.pull)
+            self.press(context, new)
+        at, new = self.corrected[before], self.iterates[after]
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
-        out["drift"] = self.around["drift"]
-        if self.bodies is not None:
-            out["drift"] = self.bodies.drifted(context, self.around["drift"], at["y"])
-        context.launch(kernels.pressure.update.forward, out, self.around, at, self.relaxed, beta=self.momenta[k])
-        self.press(context, after)
+        out["drift"] = self._drift(context, at)
+        update = self.kernels.pressure.update.forward
+        context.launch(update, out, self.around, at, self.relaxed, beta=self.momenta[k])
+        self.press(context, new)
 
-    def press(self, context: StepContext, slot: int) -> None:
-        """The velocities that the y of a slot leaves, with its pull."""
-        at = {"y": self.iterates[slot]["y"], "u": self.iterates[slot]["u"], "T": self.pull, "kick": self.kick}
-        context.launch(self.kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star)
+    def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
+        """That of walls, where bodies move as the y of an iterate pushes them."""
+        drift = self.around["drift"]
+        return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
+
+    def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
+        """The velocities that the y of an iterate leaves, with its pull."""
+        own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
+        context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
 
     def settle(self, context: StepContext, last: int) -> None:
         """The new velocities of bodies, by the k of a slot."""
@@ -224,7 +256,7 @@ class ProjectionSteps(ParticleSolver):
 
     def last_gradient(self, slot: int) -> wp.array:
         """A of the last iteration, whose result is in a slot."""
-        return self.iterates[max(slot - 1, 0)]["A"]
+        return self.corrected[max(slot - 1, 0)]["A"]
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Repair k, from the positions of one slot to those of another."""

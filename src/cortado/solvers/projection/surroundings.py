@@ -23,7 +23,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
-    return {**own, "L": matrix, "a": real, "crowd": vector, "weights": weights_type(precision)}
+    return {**own, "L": matrix, "a": real, "crowd": vector, "weights": weights_type(precision), "coarse": real}
 
 
 def adjoint_entries(precision: Precision) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     own, packed = moment_functions(precision, dimension), symmetric(precision)
     whole, change, six, pack = own.whole, own.change, packed.kind, packed.pack
     here = effect_functions(precision, dimension, module)
-    weights_of, correction_of, diagonal_of = here.weights, here.correction, here.diagonal
+    weights_of, correction_of, diagonal_of, share_of = here.weights, here.correction, here.diagonal, here.share
     along = effect_functions(precision, dimension, tangent_module).back
     back = effect_functions(precision, dimension, adjoint_module).back
     edge = edge_functions(precision, dimension, module).edge
@@ -94,6 +94,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.crowd[i] = crowd
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu)
+        of.coarse[i] = share_of(M, nu)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def surroundings_tangent(
@@ -127,18 +128,20 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
         M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i]
-        L_dot, weights_dot, a_dot = matrix(), weights4(), real(0.0)
-        count = int(14)  # not a number: Warp would write the gradient out for each
+        L_dot, weights_dot, a_dot, coarse_dot = matrix(), weights4(), real(0.0), real(0.0)
+        count = int(15)  # not a number: Warp would write the gradient out for each
         for k in range(count):
-            L_unit, a_unit, weights_unit = matrix(), real(0.0), weights4()
+            L_unit, a_unit, weights_unit, coarse_unit = matrix(), real(0.0), weights4(), real(0.0)
             if k < 9:
                 L_unit[k // 3, k % 3] = real(1.0)
             elif k < 13:
                 weights_unit[k - 9] = real(1.0)
-            else:
+            elif k < 14:
                 a_unit = real(1.0)
+            else:
+                coarse_unit = real(1.0)
             by_M, by_Q, by_g, by_gamma, by_nu, by_m = along(
-                M, Q, g, gamma, nu, m_i, least, L_unit, a_unit, weights_unit
+                M, Q, g, gamma, nu, m_i, least, L_unit, a_unit, weights_unit, coarse_unit
             )
             entry = wp.ddot(by_M, M_i_dot) + wp.ddot(by_Q, Q_i_dot) + wp.dot(by_g, g_i_dot)
             entry += wp.dot(by_gamma, gamma_i_dot) + by_nu * nu_i_dot + by_m * m_dot[i]
@@ -146,8 +149,10 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
                 L_dot[k // 3, k % 3] = entry
             elif k < 13:
                 weights_dot[k - 9] = entry
-            else:
+            elif k < 14:
                 a_dot = entry
+            else:
+                coarse_dot = entry
         n_dot[i] = near_dot + nu_i_dot
         dot.M[i] = M_i_dot
         dot.Q[i] = Q_i_dot
@@ -160,6 +165,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.crowd[i] = crowd_dot
         dot.a[i] = a_dot
         dot.weights[i] = weights_dot
+        dot.coarse[i] = coarse_dot
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def own_adjoint(
@@ -176,8 +182,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         """Of what follows from the moments: adds to the adjoints of them."""
         i = wp.tid()
+        gamma = of.gamma[i]
         M_bar, Q_bar, g_bar, gamma_bar, nu_bar, m_i_bar = back(
-            of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i], least, bar.L[i], bar.a[i], bar.weights[i]
+            of.M[i], of.Q[i], of.g[i], gamma, of.nu[i], m[i], least, bar.L[i], bar.a[i], bar.weights[i], bar.coarse[i]
         )
         m_bar[i] = m_bar[i] + m_i_bar
         M_pull[i] = pack(bar.M[i] + M_bar)
