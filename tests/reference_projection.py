@@ -29,6 +29,9 @@ class Projection:
     iterations: int
     repairs: int
     follow: bool
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    """Of the coarse grid: the place of the first node, 1 / the distance of two, and how many there are, along each
+    axis."""
 
     @classmethod
     def of(cls, simulation):
@@ -44,7 +47,11 @@ class Projection:
         periods = np.array(scene.container.periods(d)[1])
         counts = (getattr(scene.solver, name, 2) for name in ("iterations", "repairs"))
         follow = getattr(scene.solver, "velocities_follow", False)
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow)
+        nodes = None
+        if solver.coarse is not None:
+            grid = solver.coarse.grid["grid"]
+            nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -125,11 +132,17 @@ class Projection:
             apart = v[:, None] - v[None, :]
             return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
 
+        correct = self.coarse(x, m, force, L, g, between(H + 2 * nu, 0.7, 0.95)) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         k = y = full * before[0]
         v = v_star + full[:, None] * before[1]
         t = 5.0
         for left in reversed(range(self.iterations)):
+            if correct is not None:
+                D = divergence(v) - wanted
+                y = y + correct(np.where((y > 0) | (tension > 0.5) | (D > 0), D, 0))
+                k = y = np.where(y > 0, y, tension * y)
+                v = v_star - force(y) / m[:, None]
             u, D = v, divergence(v)
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
@@ -148,6 +161,34 @@ class Projection:
             slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, (k, kick)
+
+    def coarse(self, x, m, force, L, g, c):
+        """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""
+        (first, frequency, counts), (n, d) = self.nodes, x.shape
+        shape = counts.astype(int)
+        s = (x - first) * frequency
+        cell, t = np.floor(s).astype(int), s - np.floor(s)
+        phi, slope, touched = np.zeros((n, shape.prod())), np.zeros((n, shape.prod(), d)), np.zeros(shape.prod())
+        for corner in np.ndindex(*[2] * d):
+            node = np.ravel_multi_index(((cell + corner) % shape).T, shape)
+            weight, sign = np.where(corner, t, 1 - t), np.where(corner, 1, -1) * frequency
+            phi[np.arange(n), node] += weight.prod(1)
+            np.add.at(touched, node, 1 / m)
+            for axis in range(d):
+                others = np.delete(weight, axis, 1).prod(1)
+                slope[np.arange(n), node, axis] += sign[axis] * others
+        moment = np.einsum("j,jab,ijb,ijk->iak", c, L, g, -self.pairs(x, x)[0])
+        q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * force(c)[:, None, :]
+        lattice = 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
+        A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(1e-5 * lattice / 4**d * touched)
+        live = touched > 0
+
+        def correct(r):
+            e = np.zeros(len(touched))
+            e[live] = np.linalg.solve(A[np.ix_(live, live)], (phi.T @ (c * r))[live])
+            return c * (phi @ e)
+
+        return correct
 
     def shift(self, x, v, dt, pull=0.0):
         """By velocities, and dt^2 p / rho of every particle."""

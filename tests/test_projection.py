@@ -10,6 +10,7 @@ from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
 FOLLOW = {**SOLVER, "velocities_follow": True}
+COARSE = {**SOLVER, "multilevel": True}
 C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
 CASES = {
     "plane": lambda: plane(solver=SOLVER),
@@ -18,6 +19,10 @@ CASES = {
     "three phases": lambda: plane_of_three(solver=SOLVER, mixture={"mobility": 0.0}),
     "velocities follow": lambda: plane(solver=FOLLOW),
     "velocities follow in space": lambda: scene(solver=FOLLOW),
+    "multilevel": lambda: plane(solver=COARSE),
+    "multilevel in space": lambda: scene(solver=COARSE),
+    "multilevel, periodic": lambda: plane(solver=COARSE, container=PERIODIC, discretisation=C2),
+    "multilevel, three phases": lambda: plane_of_three(solver=COARSE, mixture={"mobility": 0.0}),
 }
 
 

@@ -123,9 +123,7 @@ class CoarseAdjoint:
         for array in self._bars.values():
             array.zero_()
 
-    def correct(
-        self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named, steps: Named
-    ) -> None:
+    def correct(self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named, steps: Named) -> None:
         """From the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, to those of the one before, ``at``,
         and to d_bar and S there."""
         own, (r, e) = self._coarse, (new["r"], new["e"])

@@ -4,7 +4,8 @@ the moment that its gradient has.
 For a pressure k_j = c_j phi(x_j) with a linear function phi, and T = c L, D^T k of
 `cortado.solvers.projection.pressure` is exactly
 
-    (D^T k)_i = N_i grad phi + phi(x_i) h_i,   N_i = -sum_j (T_j g_ij) x_ij^T,   h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i.
+    (D^T k)_i = N_i grad phi + phi(x_i) h_i,
+    N_i = -sum_j (T_j g_ij) x_ij^T,   h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i.
 
 N is 1 inside of the fluid, and h is 0 there.
 """
@@ -57,7 +58,14 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @fluid_sum(discretisation)
     def push_back(
-        x_ij: vector, T_i: six, T_j: six, h_bar_i: vector, h_bar_j: vector, N_bar_i: matrix, N_bar_j: matrix, s: neighbourhood
+        x_ij: vector,
+        T_i: six,
+        T_j: six,
+        h_bar_i: vector,
+        h_bar_j: vector,
+        N_bar_i: matrix,
+        N_bar_j: matrix,
+        s: neighbourhood,
     ) -> tuple[vector, vector, vector]:
         """The symmetric part of the adjoint of T, and what x is given."""
         g = s.volume * gradient(x_ij, s)
