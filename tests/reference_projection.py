@@ -139,10 +139,14 @@ class Projection:
         t = 5.0
         for left in reversed(range(self.iterations)):
             if correct is not None:
-                D = divergence(v) - wanted
-                y = y + correct(np.where((y > 0) | (tension > 0.5) | (D > 0), D, 0))
-                k = y = np.where(y > 0, y, tension * y)
-                v = v_star - force(y) / m[:, None]
+                r = divergence(v) - wanted
+                r = np.where((y > 0) | (tension > 0.5) | (r > 0), r, 0)
+                z = y + correct(r)
+                change = np.where(z > 0, z, tension * z) - y
+                thrust = -force(change) / m[:, None]
+                alpha = np.clip((r * change).sum() / (m[:, None] * thrust**2).sum(), 0, 1)
+                k = y = y + alpha * change
+                v = v + alpha * thrust
             u, D = v, divergence(v)
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))

@@ -48,6 +48,21 @@ def test_a_step_is_that_of_the_twin(case):
     assert (k > 0.0).any() and (k < 0.0).any()
 
 
+@pytest.mark.parametrize("multilevel, least, most", [(True, -0.05, 0.05), (False, 0.4, 0.7)])
+def test_water_that_is_shut_in_stays_where_a_coarse_grid_knows_it(multilevel, least, most):
+    """Without it the pressure has come half way in ten steps."""
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+    shut = plane(
+        discretisation={"spacing": 0.05, "jitter": 0.05},
+        fluid=[{**box, "phase": "water"}],
+        container=box,
+        forces={"gravity": [9.81, 0.0]},
+        solver={**SOLVER, "multilevel": multilevel},
+    )
+    run = Simulation(shut, precision="float64").run(10)
+    assert least < run.velocities[-1][:, 0].mean() / (9.81 * 10 * 0.002) < most
+
+
 @pytest.mark.parametrize("make", [plane, scene])
 def test_pressures_keep_both_momenta(make):
     """Of fluid that nothing holds; the shift and repairs move particles whose velocities stay as they are."""

@@ -2,7 +2,7 @@
 
 An iteration of `cortado.solvers.projection.pressure` hands a pressure on by a spacing or two. Before each of them the
 smooth part of what is missing is found at once, on a grid with nodes two spacings apart (Takahashi and Lin 2016 have a
-multilevel particle solver; `cortado.solvers.projection.coarse_kernels` has the equations of this one).
+multilevel particle solver; `cortado.solvers.projection.coarse_pressure` has the equations of this one).
 """
 
 import warp as wp
@@ -12,8 +12,12 @@ from cortado.device.cells import CellSort, Grid
 from cortado.particles.arrays import zeros
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
-from cortado.solvers.projection.coarse_kernels import node_kernels, residual_kernels
+from cortado.solvers.projection.coarse_length import length_kernels
+from cortado.solvers.projection.coarse_nodes import node_kernels
+from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels
+from cortado.solvers.projection.coarse_residual import residual_kernels
 from cortado.solvers.projection.coarse_sums import coarse_push_kernels
+from cortado.solvers.projection.velocity import velocity_kernels
 from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
 from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
@@ -36,7 +40,10 @@ class Coarse:
         real, vector = precision.real, precision.vector
         self.push = coarse_push_kernels(discretisation, dimension)
         self.nodes, self.residual = node_kernels(precision, dimension), residual_kernels(discretisation, dimension)
+        self.pressure, self.length = coarse_pressure_kernels(precision, dimension), length_kernels(precision)
+        self.velocity = velocity_kernels(discretisation, dimension)
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
+        self._particles, self._kinds = layout, (real, vector, precision.pair)
         self._layout = Layout(grid.cells, 1, precision, device, layout.batch)
         count = self._layout.all_particles
         self._A = wp.zeros((3**dimension, count), dtype=real, device=device)
@@ -49,12 +56,22 @@ class Coarse:
         """As kernels call them."""
         self.pushed = layout.arrays(h=vector, N=matrix_type(precision), T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
+        self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
+        """Of alpha."""
+        self.still = layout.arrays(still=vector)["still"]
+        """No velocities."""
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
         """What is spread."""
 
     def numbers(self) -> wp.array:
         """(nodes,) of all scenes."""
         return wp.zeros_like(self._node["r"])
+
+    def room(self) -> dict[str, wp.array]:
+        """For what a correction leaves besides a new iterate: r, e, d, the thrust and the sums of alpha."""
+        layout, (real, vector, pair) = self._particles, self._kinds
+        kept = layout.arrays(r=real, change=real, thrust=vector)
+        return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, around: Named) -> None:
         """The matrix of a step."""
@@ -76,12 +93,18 @@ class Coarse:
         self._solution.solve(context, multiply, node["w"], node["r"], e)
 
     def correct(self, context: StepContext, around: Named, at: Named, new: Named, T: wp.array) -> None:
-        """From an iterate ``at``, whose A and divergence are written, to k and y of a ``new`` one, and to its r and e,
-        those of the correction; ``around`` has the drift of walls."""
+        """From an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new`` one, which has `room`
+        for the rest; ``around`` has the drift of walls, and ``T`` is overwritten."""
         context.launch(self.residual.residual, around, at, self.source, r=new["r"])
         self.solve(context, new["e"], new["e"])
-        out = {"k_out": new["k"], "y_out": new["y"], "T": T, "e": new["e"]}
-        context.launch(self.nodes.correct, out, around, at, self.grid)
+        own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
+        context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
+        thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
+        context.launch(self.velocity.velocity.forward, around, thrown, v_star=self.still)
+        context.launch(self.length.share, own, self.parts)
+        wp.copy(new["sums"], self.sums(self.parts["parts"]))
+        out = {"k_out": new["k"], "y_out": new["y"], "u_out": new["u"]}
+        context.launch(self.length.apply, out, own, at)
 
 
 class CoarseTangent:
@@ -89,9 +112,11 @@ class CoarseTangent:
 
     def __init__(self, coarse: Coarse, layout: Layout):
         precision = layout.precision
+        real, vector, six = precision.real, precision.vector, symmetric(precision).kind
         self._coarse, self._e_dot = coarse, coarse.numbers()
-        kinds = {"h": precision.vector, "N": matrix_type(precision), "T": symmetric(precision).kind}
-        self._change = layout.arrays("_dot", **kinds, r=precision.real)
+        kinds = {"h": vector, "N": matrix_type(precision), "r": real, "change": real, "thrust": vector}
+        self._change = layout.arrays("_dot", **kinds, T=six, u=vector)
+        self._T = layout.arrays(T=six)
 
     def begin(self, context: StepContext, known: tuple[Named, ...]) -> None:
         """``known`` has the particles, what surrounds them, and the tangents of both."""
@@ -99,15 +124,23 @@ class CoarseTangent:
             context.launch(kernel, *known, self._coarse.pushed, self._change)
 
     def correct(self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named) -> None:
-        """``at``: the iterate before, and k_dot, y_dot and u_dot, of which the first two are replaced by those of the
-        ``new`` one."""
-        own, change, (r, e) = self._coarse, self._change, (new["r"], new["e"])
-        context.launch(own.residual.residual_tangent, at, *known, change)
-        all_known = (own.grid, own.pushed, change, at, *known)
-        context.launch(own.nodes.source_tangent, *all_known, own.source, r=r, e=e)
-        own.solve(context, e, self._e_dot)
-        out = {"k_out_dot": at["k_dot"], "y_out_dot": at["y_dot"]}
-        context.launch(own.nodes.correct_tangent, *all_known, out, e=e, e_dot=self._e_dot)
+        """``at``: the iterate before, and k_dot, y_dot and u_dot, which are replaced by those of the ``new`` one."""
+        own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
+        found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
+        left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
+        context.launch(own.residual.residual_tangent, at, *known, found)
+        every = (own.grid, left, own.pushed, self._change, *known)
+        context.launch(own.pressure.source_tangent, *every, own.source)
+        own.solve(context, new["e"], self._e_dot)
+        context.launch(own.pressure.correct_tangent, at, *every, e_dot=self._e_dot)
+        pull = {"y": new["change"], "y_dot": change["change"], **self._T, "T_dot": change["T"]}
+        context.launch(own.velocity.pull_tangent, pull, *known)
+        thrown = {"u": new["thrust"], "v_star": own.still, "v_star_dot": own.still}
+        thrown |= {"kick_dot": change["thrust"], "u_dot": change["u"]}
+        context.launch(own.velocity.velocity.tangent, pull, thrown, *known)
+        context.launch(own.length.share_tangent, found, left, own.parts, *known)
+        steps = {name: at[name] for name in ("k_dot", "y_dot", "u_dot")}
+        context.launch(own.length.apply_tangent, steps, found, left, sums_dot=own.sums(own.parts["parts"]))
 
 
 class CoarseAdjoint:
@@ -115,24 +148,35 @@ class CoarseAdjoint:
 
     def __init__(self, coarse: Coarse, layout: Layout):
         precision = layout.precision
+        real, vector, six = precision.real, precision.vector, symmetric(precision).kind
         self._coarse, self._multiplier = coarse, coarse.numbers()
-        self._bars = layout.arrays("_bar", h=precision.vector, N=matrix_type(precision))
-        self._r_bar = layout.arrays(r_bar=precision.real)["r_bar"]
+        self._bars = layout.arrays("_bar", h=vector, N=matrix_type(precision))
+        self._steps = layout.arrays("_bar", r=real, change=real, thrust=vector, alpha=real)
+        self._through = layout.arrays(T=six, f=vector, kick_bar=vector, v_bar=vector)
+        self._sum = layout.sum_of(real)
 
     def begin(self) -> None:
         for array in self._bars.values():
             array.zero_()
 
-    def correct(self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named, steps: Named) -> None:
-        """From the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, to those of the one before, ``at``,
-        and to d_bar and S there."""
-        own, (r, e) = self._coarse, (new["r"], new["e"])
-        all_known = (own.grid, own.pushed, self._bars, *known)
-        context.launch(own.nodes.correct_adjoint, *all_known, at, own.source, steps, e=e)
-        own.solve(context, e, self._multiplier)
-        found = {"r_bar": self._r_bar, "multiplier": self._multiplier}
-        context.launch(own.nodes.source_adjoint, *all_known, found, r=r, e=e)
-        context.launch(own.residual.residual_adjoint, steps, *known, found, at)
+    def correct(
+        self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named, steps: Named, u_bar: wp.array
+    ) -> None:
+        """From the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, and ``u_bar``, to those of k and y of
+        the one before, ``at``, and to d_bar and S there, from which u before has what it has not from u_bar."""
+        own, through, found = self._coarse, self._through, self._steps
+        left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
+        context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])
+        total = self._sum(found["alpha_bar"])
+        context.launch(own.length.apply_adjoint, {"alpha_bar": total}, left, steps, found, *known, u_bar=u_bar)
+        thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}
+        context.launch(own.velocity.own_adjoint, thrown, through, *known)
+        context.launch(own.velocity.velocity.adjoint, thrown, through, *known, y_bar=found["change_bar"])
+        every = (own.grid, left, own.pushed, self._bars, found, *known)
+        context.launch(own.pressure.correct_adjoint, at, {"y_bar": steps["y_bar"]}, own.source, *every)
+        own.solve(context, new["e"], self._multiplier)
+        context.launch(own.pressure.source_adjoint, *every, multiplier=self._multiplier)
+        context.launch(own.residual.residual_adjoint, steps, found, at, *known)
 
     def finish(self, context: StepContext, known: tuple[Named, ...]) -> None:
         """From the adjoints of h and N to those of particles and of what surrounds them."""

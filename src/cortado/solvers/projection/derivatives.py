@@ -104,7 +104,6 @@ class ProjectionTangent(ParticleTangent):
                 before = {**solver.iterates[k], **change}
                 drift = self._drift(context, before)
                 self._coarse.correct(context, (drift, *known), before, at)
-                self._press(context, known, at)
             drift = self._drift(context, at)
             new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
             beta = solver.momenta[k]
@@ -254,19 +253,20 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._press(context, known, solver.iterates[k + 1], self._y_bar)
             self._back(context, known, solver.corrected[k], solver.momenta[k], moves=k == iterations - 1)
             if self._coarse is not None:
-                self._press(context, known, solver.corrected[k], self._y_bar)
                 self._correct(context, known, k)
         if self._coarse is not None:
             self._coarse.finish(context, known)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
-        """Of the coarse correction before iteration k, from the adjoints of its k and y to those of y and u before."""
+        """Of the coarse correction before iteration k, from the adjoints of its k, y and u to those before."""
         assert self._coarse is not None
         solver, at = self._solver, self._solver.iterates[k]
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
-        self._coarse.correct(context, (drift, *known), at, solver.corrected[k], steps)
+        self._coarse.correct(context, (drift, *known), at, solver.corrected[k], steps, self._u_bar)
+        wp.copy(self._f, self._u_bar)
         self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, steps)
+        add(self._f, self._u_bar)
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], y_bar: wp.array) -> None:
         """Of the velocities that y leaves, to the adjoints of v* and of y."""

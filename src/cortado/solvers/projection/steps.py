@@ -109,10 +109,8 @@ class ProjectionSteps(ParticleSolver):
         own = self.discretisation, self.layout, system.walled.dimension
         self.coarse = Coarse(*own, grid, constants.spacing) if grid is not None else None
         """What corrects the pressure before each iteration; None where nothing does."""
-        self._corrected_kinds = {**kinds, "r": real}
         self.corrected = [self._new_corrected()] if grid is not None else self.iterates
-        """The iterates that an iteration of the pressure begins with: the corrected ones, each with r and e of its
-        correction, or those themselves."""
+        """The iterates that an iteration of the pressure begins with: the corrected ones, or those themselves."""
         self.momenta = momenta(iterations)
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
@@ -165,7 +163,7 @@ class ProjectionSteps(ParticleSolver):
 
     def _new_corrected(self) -> dict[str, wp.array]:
         assert self.coarse is not None
-        return {**self.layout.arrays(**self._corrected_kinds), "e": self.coarse.numbers()}
+        return {**self.layout.arrays(**self._iterate_kinds), **self.coarse.room()}
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
@@ -223,7 +221,6 @@ class ProjectionSteps(ParticleSolver):
             at, new = self.iterates[before], self.corrected[before]
             around = {**self.around, "drift": self._drift(context, at)}
             self.coarse.correct(context, around, at, new, self.pull)
-            self.press(context, new)
         at, new = self.corrected[before], self.iterates[after]
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
         out["drift"] = self._drift(context, at)

@@ -1,0 +1,152 @@
+"""Hat functions at the nodes of a grid, as a particle sees them and as a node sees its particles.
+
+A node's hat phi is 1 there and falls to 0 at the nodes next to it, linearly along each axis. The cells of the grid are
+those of a `CellSort`; the node of the same number is at the lower corner of a cell.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.precision import Precision
+
+
+def source_type(precision: Precision) -> Any:
+    """The bundle of what is spread."""
+    return bundle(s_value=precision.real, s_slope=precision.vector, s_bent=precision.vector, s_own=precision.real)
+
+
+@dataclass(frozen=True)
+class HatFunctions:
+    """Warp functions."""
+
+    hat: Any
+    """phi, its gradient and its mixed second derivatives, of one of the nodes at the corners of a position's cell."""
+    at: Any
+    """The same of a sum of hats at a particle: E, G and H of values e at nodes."""
+    products: Any
+    """The sum of e u over the nodes that a particle touches."""
+    bend: Any
+    """H v"""
+    number_of: Any
+    """Of a cell, or of the node at its lower corner."""
+    cell_of_number: Any
+    moved: Any
+    """A cell that is so many cells away."""
+    corner_step: Any
+    """To one of the corners of a cell."""
+    offset_step: Any
+    """To one of the nodes around a node, itself among them."""
+
+
+@cache
+def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
+    """In 2 or 3 dimensions."""
+    real, vector = precision.real, precision.vector
+    grid_type, cells = cell_grid_type(precision), cell_functions(precision)
+    wrap, cell_of = cells.wrap, cells.cell_of
+    CORNERS = wp.constant(2**dimension)
+    flat = wp.constant(dimension == 2)
+
+    @wp.struct
+    class Hat:
+        """phi, its gradient and its mixed second derivatives yz, xz and xy."""
+
+        value: real
+        slope: vector
+        bent: vector
+
+    @wp.func
+    def side(t: real, upper: int) -> real:
+        return wp.where(upper == 1, t, real(1.0) - t)
+
+    @wp.func
+    def bit(corner: int, axis: int) -> int:
+        return (corner >> axis) & 1
+
+    @wp.func
+    def hat(x: vector, corner: int, grid: grid_type) -> Hat:
+        """That of one of the nodes at the corners of a position's cell."""
+        s = wp.cw_mul(x - grid.origin, grid.frequency)
+        t = s - vector(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
+        f, found = grid.frequency, Hat()
+        a, b = side(t[0], bit(corner, 0)), side(t[1], bit(corner, 1))
+        p = wp.where(bit(corner, 0) == 1, f[0], -f[0])
+        q = wp.where(bit(corner, 1) == 1, f[1], -f[1])
+        c, r = real(1.0), real(0.0)
+        if not flat:
+            c = side(t[2], bit(corner, 2))
+            r = wp.where(bit(corner, 2) == 1, f[2], -f[2])
+        found.value = a * b * c
+        found.slope = vector(p * b * c, a * q * c, a * b * r)
+        found.bent = vector(a * q * r, p * b * r, p * q * c)
+        return found
+
+    @wp.func
+    def number_of(cell: wp.vec3i, grid: grid_type) -> int:
+        return (cell[2] * grid.shape[1] + cell[1]) * grid.shape[0] + cell[0]
+
+    @wp.func
+    def moved(cell: wp.vec3i, by: wp.vec3i, grid: grid_type) -> wp.vec3i:
+        return wp.vec3i(
+            wrap(cell[0] + by[0], grid.shape[0]),
+            wrap(cell[1] + by[1], grid.shape[1]),
+            wrap(cell[2] + by[2], grid.shape[2]),
+        )
+
+    @wp.func
+    def cell_of_number(number: int, grid: grid_type) -> wp.vec3i:
+        row = number // grid.shape[0]
+        return wp.vec3i(number % grid.shape[0], row % grid.shape[1], row // grid.shape[1])
+
+    @wp.func
+    def corner_step(corner: int) -> wp.vec3i:
+        return wp.vec3i(bit(corner, 0), bit(corner, 1), bit(corner, 2))
+
+    @wp.func
+    def offset_step(offset: int) -> wp.vec3i:
+        """From a node to one of those around it."""
+        if flat:
+            return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
+        return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
+
+    @wp.func
+    def first_corner(i: int, particles: int, x: vector, grid: grid_type):
+        """The cell of a particle, and the first node of its scene."""
+        return cell_of(x, grid), (i // particles) * (grid.shape[0] * grid.shape[1] * grid.shape[2])
+
+    @wp.func
+    def at(i: int, particles: int, x: vector, e: wp.array(dtype=real), grid: grid_type) -> Hat:
+        """E, G and H of particle i."""
+        own, first = first_corner(i, particles, x, grid)
+        found = Hat()
+        for corner in range(CORNERS):
+            phi = hat(x, corner, grid)
+            value = e[first + number_of(moved(own, corner_step(corner), grid), grid)]
+            found.value += value * phi.value
+            found.slope += value * phi.slope
+            found.bent += value * phi.bent
+        return found
+
+    @wp.func
+    def products(
+        i: int, particles: int, x: vector, e: wp.array(dtype=real), u: wp.array(dtype=real), grid: grid_type
+    ) -> real:
+        """The sum of e u over the nodes that particle i touches."""
+        own, first = first_corner(i, particles, x, grid)
+        total = real(0.0)
+        for corner in range(CORNERS):
+            node = first + number_of(moved(own, corner_step(corner), grid), grid)
+            total += e[node] * u[node]
+        return total
+
+    @wp.func
+    def bend(bent: vector, v: vector) -> vector:
+        """H v"""
+        return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
+
+    return HatFunctions(hat, at, products, bend, number_of, cell_of_number, moved, corner_step, offset_step)

@@ -1,0 +1,159 @@
+"""How far a coarse correction of the pressure goes: alpha of `cortado.solvers.projection.coarse_pressure`."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+
+
+@dataclass(frozen=True)
+class LengthKernels:
+    """Of alpha, given d and the thrust -D^T d / m."""
+
+    share: Any
+    share_tangent: Any
+    """What particles add to both sums of alpha."""
+    apply: Any
+    apply_tangent: Any
+    apply_adjoint: Any
+    """Of y' and u', given both sums."""
+    along_adjoint: Any
+    """What the adjoint of y' and u' gives to alpha."""
+
+
+@cache
+def length_kernels(precision: Precision) -> LengthKernels:
+    """The same in 2 and in 3 dimensions."""
+    real, vector, pair_of = precision.real, precision.vector, precision.pair
+    module = kernel_module(f"coarse_length_{precision.name}")
+
+    @wp.func
+    def length(sums: pair_of) -> real:
+        """alpha; NaN stays NaN, which must not be hidden."""
+        if sums[1] == real(0.0):
+            return real(0.0)
+        found = sums[0] / sums[1]
+        return wp.where(found < real(0.0), real(0.0), wp.where(found > real(1.0), real(1.0), found))
+
+    @wp.func
+    def bends(sums: pair_of) -> bool:
+        """Whether alpha is between its ends, and follows the sums."""
+        return sums[0] > real(0.0) and sums[0] < sums[1]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def share(
+        m: wp.array(dtype=real),
+        r: wp.array(dtype=real),
+        change: wp.array(dtype=real),
+        thrust: wp.array(dtype=vector),
+        # out
+        parts: wp.array(dtype=pair_of),
+    ):
+        i = wp.tid()
+        parts[i] = pair_of(r[i] * change[i], m[i] * wp.dot(thrust[i], thrust[i]))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def apply(
+        particles: int,
+        sums: wp.array(dtype=pair_of),
+        y: wp.array(dtype=real),
+        u: wp.array(dtype=vector),
+        change: wp.array(dtype=real),
+        thrust: wp.array(dtype=vector),
+        # out
+        k_out: wp.array(dtype=real),
+        y_out: wp.array(dtype=real),
+        u_out: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        alpha = length(sums[i // particles])
+        new = y[i] + alpha * change[i]
+        k_out[i] = new
+        y_out[i] = new
+        u_out[i] = u[i] + alpha * thrust[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def share_tangent(
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        of: bundle(r=real, r_dot=real, change=real, change_dot=real, thrust=vector, thrust_dot=vector),
+        # out
+        parts: wp.array(dtype=pair_of),
+    ):
+        i = wp.tid()
+        first = of.r_dot[i] * of.change[i] + of.r[i] * of.change_dot[i]
+        f, f_dot = of.thrust[i], of.thrust_dot[i]
+        parts[i] = pair_of(first, m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def apply_tangent(
+        particles: int,
+        sums: wp.array(dtype=pair_of),
+        sums_dot: wp.array(dtype=pair_of),
+        of: bundle(change=real, change_dot=real, thrust=vector, thrust_dot=vector),
+        # in and out
+        k_dot: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
+        u_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        both, both_dot = sums[i // particles], sums_dot[i // particles]
+        alpha, alpha_dot = length(both), real(0.0)
+        if bends(both):
+            alpha_dot = (both_dot[0] - alpha * both_dot[1]) / both[1]
+        new = y_dot[i] + alpha_dot * of.change[i] + alpha * of.change_dot[i]
+        k_dot[i] = new
+        y_dot[i] = new
+        u_dot[i] = u_dot[i] + alpha_dot * of.thrust[i] + alpha * of.thrust_dot[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def along_adjoint(
+        k_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        u_bar: wp.array(dtype=vector),
+        change: wp.array(dtype=real),
+        thrust: wp.array(dtype=vector),
+        # out
+        alpha_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        alpha_bar[i] = (k_bar[i] + y_bar[i]) * change[i] + wp.dot(u_bar[i], thrust[i])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def apply_adjoint(
+        particles: int,
+        sums: wp.array(dtype=pair_of),
+        alpha_bar: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        of: bundle(r=real, change=real, thrust=vector),
+        u_bar: wp.array(dtype=vector),
+        # in and out: at first those of k' and y', at last those of k and y
+        k_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        m_bar: wp.array(dtype=real),
+        # out
+        change_bar: wp.array(dtype=real),
+        thrust_bar: wp.array(dtype=vector),
+        r_bar: wp.array(dtype=real),
+    ):
+        """``alpha_bar`` is that of each scene. The adjoint of u' is that of u, too."""
+        i = wp.tid()
+        both, no = sums[i // particles], real(0.0)
+        alpha, first_bar, second_bar = length(both), real(0.0), real(0.0)
+        if bends(both):
+            first_bar = alpha_bar[i // particles] / both[1]
+            second_bar = -alpha * first_bar
+        new_bar, f = k_bar[i] + y_bar[i], of.thrust[i]
+        k_bar[i] = no
+        y_bar[i] = new_bar
+        m_bar[i] = m_bar[i] + second_bar * wp.dot(f, f)
+        change_bar[i] = alpha * new_bar + first_bar * of.r[i]
+        thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * second_bar) * f
+        r_bar[i] = first_bar * of.change[i]
+
+    return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint)

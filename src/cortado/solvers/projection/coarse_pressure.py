@@ -1,0 +1,194 @@
+"""A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
+
+With the share c of each particle, and N and h of `cortado.solvers.projection.coarse_sums`,
+
+    q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
+    A_IJ = sum_i (q_iI . q_iJ + eps delta_IJ) / m_i        over the particles of the cells around I and J,
+    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma > 1/2 or D u > b, else 0,
+    d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > 0, else sigma z - y,
+    y' = y + alpha d,   u' = u - alpha D^T d / m,   alpha = sum_i r_i d_i / sum_i |D^T d|^2 / m, from 0 to 1.
+
+alpha is the step along d after which the kinetic energy is least, so that a correction never adds any, whatever the
+clamp leaves of it.
+
+eps makes e small at nodes that few particles touch. Everything goes between nodes and particles in two ways: `spread`
+sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the cells around a node, in their
+order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second derivatives at a particle. With
+w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = eps / m.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.cells import cell_grid_type
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.solvers.projection.clamp import clamp_functions
+from cortado.solvers.projection.coarse_hats import hat_functions, source_type
+from cortado.solvers.projection.effects import weights_type
+from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
+
+
+@dataclass(frozen=True)
+class CoarsePressureKernels:
+    """Of d, given e; those of alpha are in `cortado.solvers.projection.coarse_length`."""
+
+    correct: Any
+    correct_tangent: Any
+    """Given the tangent of e."""
+    source_tangent: Any
+    """What is spread for the tangent of e."""
+    correct_adjoint: Any
+    """From the adjoint of d to what is spread for that of e."""
+    source_adjoint: Any
+    """From lambda, A lambda = the adjoint of e, to all adjoints."""
+
+
+@cache
+def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePressureKernels:
+    """In 2 or 3 dimensions."""
+    real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
+    grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
+    at, products, bend = hats.at, hats.products, hats.bend
+    packed, cross_terms = symmetric(precision), cross_terms_function(precision)
+    six, pack, parts = packed.kind, packed.pack, clamp_functions(precision).parts
+    module = kernel_module(f"coarse_pressure_{dimension}d_{precision.name}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def correct(
+        grid: grid_type,
+        particles: int,
+        x: wp.array(dtype=vector),
+        L: wp.array(dtype=matrix),
+        coarse: wp.array(dtype=real),
+        weights: wp.array(dtype=weights4),
+        y: wp.array(dtype=real),
+        e: wp.array(dtype=real),
+        # out
+        change: wp.array(dtype=real),
+        T: wp.array(dtype=six),
+    ):
+        """T is d L."""
+        i = wp.tid()
+        z = y[i] + coarse[i] * at(i, particles, x[i], e, grid).value
+        new = z
+        if z < real(0.0):
+            new = weights[i][0] * z
+        change[i] = new - y[i]
+        T[i] = (new - y[i]) * pack(L[i])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def source_tangent(
+        grid: grid_type,
+        particles: int,
+        eps: real,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        of: bundle(coarse=real, coarse_dot=real, h=vector, h_dot=vector, N=matrix, N_dot=matrix, r=real, r_dot=real),
+        e: wp.array(dtype=real),
+        # out
+        out: source_type(precision),
+    ):
+        i = wp.tid()
+        f = at(i, particles, x[i], e, grid)
+        N, h, N_dot, h_dot, v = of.N[i], of.h[i], of.N_dot[i], of.h_dot[i], x_dot[i]
+        along = wp.dot(f.slope, v)
+        w = (N * f.slope + f.value * h) / m[i]
+        w_dot = (N_dot * f.slope + N * bend(f.bent, v) + along * h + f.value * h_dot - m_dot[i] * w) / m[i]
+        p, cr = wp.transpose(N) * w, of.coarse[i] * of.r[i]
+        out.s_value[i] = of.coarse_dot[i] * of.r[i] + of.coarse[i] * of.r_dot[i] - wp.dot(h_dot, w) - wp.dot(h, w_dot)
+        out.s_own[i] = eps * m_dot[i] / (m[i] * m[i])
+        out.s_slope[i] = (cr - wp.dot(h, w)) * v - wp.transpose(N_dot) * w - wp.transpose(N) * w_dot
+        out.s_bent[i] = -(cross_terms(p, v) + cross_terms(v, p))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def correct_tangent(
+        grid: grid_type,
+        particles: int,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        of: bundle(coarse=real, coarse_dot=real, weights=weights4, weights_dot=weights4, y=real, y_dot=real),
+        e: wp.array(dtype=real),
+        e_dot: wp.array(dtype=real),
+        # out
+        change_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        f, f_dot = at(i, particles, x[i], e, grid), at(i, particles, x[i], e_dot, grid)
+        z = of.y[i] + of.coarse[i] * f.value
+        z_dot = of.y_dot[i] + of.coarse_dot[i] * f.value
+        z_dot += of.coarse[i] * (wp.dot(f.slope, x_dot[i]) + f_dot.value)
+        rise, fall = parts(z, z)
+        new_dot = rise * z_dot + fall * (of.weights_dot[i][0] * z + of.weights[i][0] * z_dot)
+        change_dot[i] = new_dot - of.y_dot[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def correct_adjoint(
+        grid: grid_type,
+        particles: int,
+        x: wp.array(dtype=vector),
+        of: bundle(coarse=real, weights=weights4, y=real),
+        e: wp.array(dtype=real),
+        change_bar: wp.array(dtype=real),
+        # in and out
+        y_bar: wp.array(dtype=real),
+        x_bar: wp.array(dtype=vector),
+        coarse_bar: wp.array(dtype=real),
+        weights_bar: wp.array(dtype=weights4),
+        # out
+        s_value: wp.array(dtype=real),
+        s_slope: wp.array(dtype=vector),
+        s_bent: wp.array(dtype=vector),
+        s_own: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        no, c = real(0.0), of.coarse[i]
+        f = at(i, particles, x[i], e, grid)
+        z = of.y[i] + c * f.value
+        rise, fall = parts(z, z)
+        new_bar = change_bar[i]
+        z_bar = (rise + fall * of.weights[i][0]) * new_bar
+        weights_bar[i] = weights_bar[i] + weights4(fall * z * new_bar, no, no, no)
+        coarse_bar[i] = coarse_bar[i] + z_bar * f.value
+        x_bar[i] = x_bar[i] + (z_bar * c) * f.slope
+        y_bar[i] = y_bar[i] + z_bar - new_bar
+        s_value[i] = c * z_bar
+        s_slope[i] = vector()
+        s_bent[i] = vector()
+        s_own[i] = no
+
+    @wp.kernel(module=module, enable_backward=False)
+    def source_adjoint(
+        grid: grid_type,
+        particles: int,
+        eps: real,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        of: bundle(coarse=real, h=vector, N=matrix, r=real),
+        e: wp.array(dtype=real),
+        multiplier: wp.array(dtype=real),
+        # in and out
+        bar: bundle(x=vector, m=real, coarse=real, h=vector, N=matrix),
+        r_bar: wp.array(dtype=real),
+    ):
+        """``multiplier`` is lambda."""
+        i = wp.tid()
+        f, g = at(i, particles, x[i], e, grid), at(i, particles, x[i], multiplier, grid)
+        N, h, c, r = of.N[i], of.h[i], of.coarse[i], of.r[i]
+        w, u = (N * f.slope + f.value * h) / m[i], (N * g.slope + g.value * h) / m[i]
+        r_bar[i] = r_bar[i] + c * g.value
+        bar.coarse[i] = bar.coarse[i] + g.value * r
+        bar.h[i] = bar.h[i] - g.value * w - f.value * u
+        bar.N[i] = bar.N[i] - wp.outer(w, g.slope) - wp.outer(u, f.slope)
+        bar.m[i] = bar.m[i] + wp.dot(u, w) + eps * products(i, particles, x[i], e, multiplier, grid) / (m[i] * m[i])
+        x_part = (c * r - wp.dot(h, w)) * g.slope - wp.dot(h, u) * f.slope
+        x_part -= bend(g.bent, wp.transpose(N) * w) + bend(f.bent, wp.transpose(N) * u)
+        bar.x[i] = bar.x[i] + x_part
+
+    return CoarsePressureKernels(correct, correct_tangent, source_tangent, correct_adjoint, source_adjoint)
