@@ -10,7 +10,9 @@ For a pressure k_j = c_j phi(x_j) with a linear function phi, and T = c L, D^T k
 N is 1 inside of the fluid, and h is 0 there.
 """
 
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -24,26 +26,30 @@ from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 
+@dataclass(frozen=True)
+class CoarseSums:
+    """Warp functions."""
+
+    push: Any
+    """sum T_j g_ij, which T_i g_i and c_i gamma_i complete, and the rows of N, for T = c L."""
+    push_tangent: Any
+    push_back: Any
+    """For adjoints of h and N: the symmetric part of that of T, as its diagonal and its other entries, and what x is
+    given."""
+
+
 @cache
-def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of h and N in 2 or 3 dimensions: each time that of T comes first."""
+def coarse_sums(discretisation: Discretisation) -> CoarseSums:
+    """Of a discretisation."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
-    six, pack, times = packed.kind, packed.pack, packed.times
+    six, times = packed.kind, packed.times
     gradient, hessian_product = pair.gradient, pair.hessian_product
-    whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "gamma", "coarse")}
-    seen, bars = bundle(**own), bundle(x=vector, **own)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
 
     @fluid_sum(discretisation)
     def push(x_ij: vector, T_j: six, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
-        """The push, and the rows of N."""
         f = times(T_j, s.volume * gradient(x_ij, s))
         return f, -f[0] * x_ij, -f[1] * x_ij, -f[2] * x_ij
 
@@ -67,13 +73,31 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         N_bar_j: matrix,
         s: neighbourhood,
     ) -> tuple[vector, vector, vector]:
-        """The symmetric part of the adjoint of T, and what x is given."""
         g = s.volume * gradient(x_ij, s)
         from_i, from_j = h_bar_i - N_bar_i * x_ij, h_bar_j + N_bar_j * x_ij
         pulled = s.volume * hessian_product(x_ij, times(T_j, from_i) - times(T_i, from_j), s)
         x_part = pulled - wp.transpose(N_bar_i) * times(T_j, g) - wp.transpose(N_bar_j) * times(T_i, g)
         others = real(-0.5) * (cross_terms(from_j, g) + cross_terms(g, from_j))
         return -wp.cw_mul(from_j, g), others, x_part
+
+    return CoarseSums(push, push_tangent, push_back)
+
+
+@cache
+def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """The kernels of h and N in 2 or 3 dimensions: each time that of T comes first."""
+    precision = discretisation.precision
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    neighbourhood, sums, packed = neighbourhood_type(precision), coarse_sums(discretisation), symmetric(precision)
+    push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
+    six, pack, times = packed.kind, packed.pack, packed.times
+    whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "gamma", "coarse")}
+    seen, bars = bundle(**own), bundle(x=vector, **own)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=module)
     def pull(of: seen, T: wp.array(dtype=six)):
