@@ -548,19 +548,85 @@ def wedge(gap, **solver):
 
 def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monkeypatch):
     simulation = Simulation(wedge(0.02))
-    whole = simulation.run(80)
+    whole = simulation.run(65)
     sizes = sizes_of(whole)
     again = np.flatnonzero(sizes[1:] < 0.3 * sizes[:-1]) + 1
     assert len(again) > 0
     before = int(again[0])
-    rest = simulation.run(80 - before, state=whole[: before + 1].last_state)  # of which the first step is taken again
+    rest = simulation.run(65 - before, state=whole[: before + 1].last_state)  # of which the first step is taken again
     assert rest.positions.tobytes() == whole.positions[before:].tobytes()
-    pair = Simulation(wedge(0.02), batch=2).run(80, {"viscosity": np.array([0.001, 0.1])})
+    pair = Simulation(wedge(0.02), batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
     assert pair[0].positions.tobytes() == whole.positions.tobytes()
     monkeypatch.setattr(retaking, "TIMES", 0)
-    with pytest.raises(cortado.DivergedError, match="entered the solid 'disc'"):
-        simulation.run(80)
+    with pytest.raises(cortado.DivergedError, match=r"entered the solid 'disc'.* shut in by .*, or try a smaller"):
+        simulation.run(65)
     assert whole.diagnostics["greatest_density_errors"].max() < 0.3
+
+
+def test_what_waits_in_a_wall_is_no_reason_to_shorten_steps():
+    """The column of the nozzle reaches through a side of the container, whose wall particles press on it."""
+    slot = {"phase": "water", "outlet": [0.15, 0.45], "direction": [1.0, 0.0], "radius": 0.075, "length": 0.5}
+    scene = jet(emitter={**slot, "flow_rate": 0.05}, solver={"kind": "projection", **CHOSEN})
+    run = Simulation(scene).run(12)
+    assert np.median(run.diagnostics["greatest_density_errors"]) > 0.5
+    assert (sizes_of(run)[1:] > 0.6 * sizes_of(run)[:-1]).all()
+
+
+def test_what_was_compressed_before_is_no_reason_to_shorten_steps():
+    simulation = Simulation(plane(solver={"kind": "projection", **CHOSEN}))
+    begun = simulation.state()
+    packed = replace(begun, fields={**begun.fields, "positions": 0.85 * begun["positions"] + 0.015})
+    run = simulation.run(4, state=packed)
+    assert run.diagnostics["greatest_density_errors"][0] > 0.2
+    assert sizes_of(run)[0] == sizes_of(simulation.run(1))[0]
+
+
+@pytest.mark.parametrize(
+    ("added", "sizes", "wanted"),
+    [
+        ([0.19], [8.0], []),  # nothing is pressed
+        ([0.9, 0.4, 0.19], [8.0, 2.0, 0.5], [2.0, 0.5]),  # each helped
+        ([0.9, 0.8], [8.0, 2.0], [2.0, 8.0]),  # the second did not: the first stays
+        ([np.inf, 0.9, 0.8], [8.0, 2.0, 0.5], [2.0, 0.5, 2.0]),  # the first lost a particle
+        ([0.9, 0.44, 0.21], [8.0, 2.0, 0.5], [2.0, 0.5]),  # no third
+        ([0.9], [0.3], []),  # a quarter is less than a hundredth of 8
+        ([0.9, 0.4], [0.4, 0.1], [0.1]),
+    ],
+)
+def test_a_step_is_shortened_where_that_helps(added, sizes, wanted):
+    retaken, asked = retaking.Retaken(), []
+    for more, size in zip(added, sizes, strict=True):
+        lost = {0: 5} if np.isinf(more) else {}
+        tried, longest = np.array([[0.0], [more], [9.0]]), np.array([[8.0], [size if asked else 8.0], [8.0]])
+        again = retaken.found(4, tried[:2], np.array([[8.0], [size]]), longest[:2], lost)
+        asked += [again[5, 0]] if again else []
+    assert asked == wanted
+
+
+def lowered(gap, kind="projection", **changes):
+    """A plate that is lowered to so many spacings above the floor, in water."""
+    path = {"motion": "path", "times": [0.0, 0.2, 0.3], "positions": [[0.3, 0.2], [0.3, 0.03 + gap * 0.03], [0.3, 0.2]]}
+    plate = {"name": "plate", "shape": "box", "lower": [0.15, 0.17], "upper": [0.45, 0.23], **path}
+    return cortado.Scene(
+        dimension=2,
+        discretisation={"spacing": 0.03},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.12], "phase": "water"}],
+        solid=[plate],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.6]},
+        solver={"kind": kind, **CHOSEN},
+        **changes,
+    )
+
+
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_walls_that_close_to_less_than_a_spacing_are_the_cause_that_is_named(kind):
+    simulation = Simulation(lowered(0.5, kind))
+    with pytest.raises(cortado.DivergedError) as found:
+        simulation.run(time=0.3)
+    assert "fluid is shut in by the container and the solid 'plate'" in str(found.value)
+    sizes = simulation.run(found.value.step - 1).diagnostics["time_steps"]
+    assert sizes.min() > 1e-9 * sizes.max()
 
 
 def test_derivatives_go_through_steps_that_were_taken_again():

@@ -1,7 +1,9 @@
 """Where fluid may be: in a box, whose sides may be infinitely far, and in a cylinder, which may be open on top, or a
 sphere."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -62,6 +64,19 @@ class Region:
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
+    def sides(self) -> Iterator[Callable[[Points], Points]]:
+        """Of each side that is somewhere: (n,) how far points (n, d) [m] are from it, positive inside [m]."""
+        for axis in np.flatnonzero(self.across == 0.0).tolist():
+            for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
+                if np.isfinite(at):
+                    yield partial(_from_plane, axis=axis, at=at, inwards=inwards)
+        if np.isfinite(self.radius):
+            yield self._from_side
+
+    def _from_side(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are inside the cylinder or the sphere [m]."""
+        return np.asarray(self.radius - self._from_axis(points))
+
     def nearest(self, points: Points) -> Points:
         """(n, d) the points of the region that are nearest to points (n, d) [m] beside its faces or its side, and those
         themselves that are within."""
@@ -113,3 +128,8 @@ class Region:
         """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
+
+
+def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
+    """(n,) how far points (n, d) [m] are from a plane across an axis [m]."""
+    return np.asarray(inwards * (points[:, axis] - at))

@@ -2,54 +2,73 @@
 particle.
 
 Between walls that face one another, nearer than a spacing, a pressure that is right on one side of the middle is wrong
-on the other. A particle that a step takes too far goes to and fro there, and then through a wall. The state before a
-step alone decides, so that a run that goes on has the steps of one that did not stop.
+on the other. A particle that a step takes too far goes to and fro there, and then through a wall. No shorter step mends
+what was compressed before it, nor what repairs do by themselves: then a step stays as long as it was. The state before
+a step alone decides, so that a run that goes on has the steps of one that did not stop.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.solvers.loop import IterationLog
-from cortado.solvers.solver import Solver, StepLog
-
 PRESSED = 0.2
-"""Of the density: a step of the projection whose repairs find a particle compressed by more is taken again. In dam
-breaks, with ink and with a jug that pours, they found 0.15 at most."""
+"""Of the density: a step that compresses a particle by more than this, beyond what it was before, is taken again. In
+dam breaks, with ink and with a jug that pours, the repairs found 0.15 at most."""
 SHORTER = 0.25
 """How long it is then, in parts of what it was."""
 TIMES = 2
-"""How often a step is taken again at most."""
+"""How often a step is shortened at most."""
+LEAST = 0.01
+"""No step is shortened below so much of what its state alone allows, whatever the step before it was."""
+HELPED = 0.5
+"""A shorter step helps if it adds at most so much of the compression that the longer one did."""
+
+
+@dataclass(frozen=True)
+class Try:
+    """How a step went."""
+
+    size: float
+    """[s]"""
+    added: float
+    """Compression, infinite where a particle was lost."""
 
 
 class Retaken:
     """The steps of one run that were taken again."""
 
     def __init__(self) -> None:
-        self._times: dict[tuple[int, int], int] = {}
+        self._tries: dict[tuple[int, int], tuple[float, list[Try]]] = {}
+        self._settled: set[tuple[int, int]] = set()
 
-    def found(self, solver: Solver, log: StepLog, first: int, last: int) -> list[tuple[int, int]]:
-        """Of the steps between two numbers, which were taken, those to be taken again, each with its scene of a batch:
-        the first of each scene, as the later ones follow from it."""
-        found = compression(log, first, last)
-        if found is None:
-            return []
-        bad, again = found > PRESSED, []
-        lost = {member: one.step for member, one in solver.containment.lost().items()}
-        for member in range(solver.layout.members):
-            end = lost.get(member, last)
-            steps = [first + int(n) for n in np.flatnonzero(bad[:, member]) if first + n < end]
-            for step in (*steps, end) if first <= end < last else steps:
-                times = self._times.get((step, member), 0)
-                if times < TIMES:
-                    self._times[step, member] = times + 1
-                    again.append((step, member))
+    def found(
+        self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
+    ) -> dict[tuple[int, int], float]:
+        """Of the steps from one number on, which were taken, those to be taken again, each with its scene of a batch,
+        and how long [s]: the first of each scene, as the later ones follow from it. All arrays are (steps, members):
+        the compression that they ``added``, their ``sizes`` and the ``longest`` that their states allow [s]; ``lost``
+        has the steps in which scenes lost a particle."""
+        again = {}
+        for member in range(added.shape[1]):
+            end = lost.get(member, first + len(added))
+            pressing = [first + int(n) for n in np.flatnonzero(added[:, member] > PRESSED) if first + n < end]
+            for step in (*pressing, end) if first <= end < first + len(added) else pressing:
+                n, key = step - first, (step, member)
+                now = Try(float(sizes[n, member]), np.inf if step == end else float(added[n, member]))
+                if key not in self._settled and (size := self._next(key, now, LEAST * float(longest[n, member]))):
+                    again[key] = size
                     break
         return again
 
-
-def compression(log: StepLog, first: int, last: int) -> NDArray[np.float64] | None:
-    """(last - first, members) the greatest that the repairs of the projection found; None of other solvers."""
-    for record in log.records if isinstance(log, IterationLog) else ():
-        if record.loop.iterations_name == "repairs":
-            return np.asarray(record.errors[first:last].numpy()[..., 1], dtype=np.float64)
-    return None
+    def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
+        """How long a step is next that went badly [s]; None if it stays as it is."""
+        least, tries = self._tries.setdefault(key, (least, []))
+        tries.append(now)
+        helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= HELPED * tries[-2].added
+        if helped and len(tries) <= TIMES and SHORTER * now.size >= least:
+            return SHORTER * now.size
+        self._settled.add(key)
+        whole = [one for one in tries if np.isfinite(one.added)]
+        stays = whole[0] if whole and not helped else now
+        return None if stays is now else stays.size

@@ -176,8 +176,8 @@ class Rollout(Staying):
                 chunk = chunk[: end - step]
                 lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
                 for b in lost.keys() - self.lost.keys():
-                    state_then = chunk[lost[b].step - step]
-                    self.lost[b] = diverged(self.solver, b, lost[b], self._buffer, state_then, self.advice(b))
+                    known = [self._buffer, *chunk[: lost[b].step + 1 - step]]
+                    self.lost[b] = diverged(self.solver, b, lost[b], known, self.advice(b))
                 stops = bool(lost) and self.solver.layout.batch is None
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:

@@ -35,6 +35,7 @@ def step_size_kernels(precision: Precision) -> StepSizeKernels:
     @wp.kernel(module=module, enable_backward=False)
     def choose(
         length: real,
+        least: real,
         growth: real,
         greatest: wp.array(dtype=pair),
         bounds: wp.array2d(dtype=real),
@@ -44,20 +45,23 @@ def step_size_kernels(precision: Precision) -> StepSizeKernels:
         times: wp.array2d(dtype=wp.float64),
         sizes: wp.array2d(dtype=real),
         # out
+        longest: wp.array2d(dtype=real),
         time_step: wp.array(dtype=real),
     ):
-        """dt = min(bound, length / max |v|, growth dt of the step before), and the time at which the step begins.
+        """dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at which the
+        step begins.
 
         ``length``: how far a particle may move in a step; ``first``: dt of the step before the first, 0 where there was
-        none. Where no particle moves, nothing is divided by its speed. A speed that is not finite bounds nothing: its
-        particle is lost, and the bound stands until the host has seen it.
+        none; ``longest`` is dt without it. Where no particle moves, nothing is divided by its speed. A speed that is
+        not finite bounds nothing: its particle is lost, and the bound stands until the host has seen it.
         """
         b = wp.tid()
         n = step[b]
         dt = bounds[wp.min(n, bounds.shape[0] - 1), b]
         speed = wp.sqrt(greatest[b][1])
         if wp.isfinite(speed) and dt * speed > length:
-            dt = length / speed
+            dt = wp.max(length / speed, least * dt)
+        longest[n, b] = dt
         before = first[b]
         if n > 0:
             before = sizes[n - 1, b]

@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import sum_and_maximum
 from cortado.particles.state import Parameters, State
-from cortado.rollout.retaking import SHORTER, Retaken
+from cortado.rollout.compressions import Compressions
+from cortado.rollout.retaking import Retaken
 from cortado.rollout.step_size_kernels import step_size_kernels
 from cortado.scene.restart import Clock, RecordedClock
-from cortado.solvers.solver import Solver, StepLog
+from cortado.solvers.projection.steps import ProjectionSteps
+from cortado.solvers.solver import Solver
 
 GROWTH = 1.1
 """A step is at most so many times as long as the one before."""
+LEAST = 1e-6
+"""The speed of the fluid shortens a step to so much of its other bounds at least. What is faster was thrown about by
+walls that leave it no room, ever faster from step to step."""
 
 
 class Scheduled(Protocol):
@@ -56,7 +61,8 @@ class StepSizes(Protocol):
         Returns whether the run ends with the state."""
 
     def choose(self, state: State) -> None:
-        """The length of the step after a state, whose number the solver has counted: launches alone."""
+        """The length of the step after a state that a step has led to, whose number the solver has counted: launches
+        alone."""
 
     def seek(self, step: int) -> None:
         """Have the solver take a step, from 0, as long as it was chosen."""
@@ -136,20 +142,21 @@ class ChosenSteps:
     the step before is in its clock, so that a run that goes on has the steps of one that did not stop.
     """
 
-    def __init__(self, solver: Solver, parameters: Parameters, log: StepLog, steps: int, length: float):
-        """``log`` is what the solver notes of the steps; ``length``: how far a particle may move in a step [m]."""
+    def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
+        """``length``: how far a particle may move in a step [m]."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
-        self._solver, self._parameters, self._log, self._length = solver, parameters, log, length
+        self._solver, self._parameters, self._length = solver, parameters, length
         self._kernels = step_size_kernels(layout.precision)
         self._squares = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
-        self._sizes = wp.zeros(shape, dtype=real, device=device)
+        self._sizes, self._longest = (wp.zeros(shape, dtype=real, device=device) for _ in range(2))
         self._times = wp.zeros(shape, dtype=wp.float64, device=device)
         self._bounds = wp.zeros((max(steps, 1), layout.members), dtype=real, device=device)
         self._first = wp.zeros(layout.members, dtype=real, device=device)
         self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
         self._scheduled: Scheduled | None = None
+        self._compressions = Compressions(solver, steps) if isinstance(solver, ProjectionSteps) else None
         self._retaken = Retaken()
         self.end = inf
         self.longest_chunk = FixedSteps.longest_chunk
@@ -169,7 +176,7 @@ class ChosenSteps:
     def begin_at(self, state: State) -> None:
         """See `StepSizes`."""
         self._solver.step_number.fill_(0)
-        self.choose(state)
+        self._choose(state)
         self._look(0, 0)
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
@@ -179,7 +186,7 @@ class ChosenSteps:
         self._sizes[:step].assign(sizes[:step, None])
         self._times[:step].assign(times[:, None])
         self._solver.step_number.fill_(step)
-        self.choose(state)
+        self._choose(state)
         for first, last in [(0, step)] if self._scheduled is None else [(n, n) for n in range(step + 1)]:
             self._look(first, last)
         return self.is_end(step)
@@ -190,11 +197,17 @@ class ChosenSteps:
 
     def choose(self, state: State) -> None:
         """See `StepSizes`."""
+        if self._compressions is not None:
+            self._compressions.measure(state)
+        self._choose(state)
+
+    def _choose(self, state: State) -> None:
         launch, kernels = self._solver.launch, self._kernels
         launch(kernels.speeds, v=state.velocities, squares=self._squares)
         launch(
             kernels.choose,
             length=self._length,
+            least=LEAST,
             growth=GROWTH,
             greatest=self._greatest(self._squares),
             bounds=self._bounds,
@@ -202,6 +215,7 @@ class ChosenSteps:
             step=self._solver.step_number,
             times=self._times,
             sizes=self._sizes,
+            longest=self._longest,
             time_step=self._parameters["time_step"],
             threads=self._solver.layout.members,
         )
@@ -218,12 +232,16 @@ class ChosenSteps:
 
     def again(self, first: int, last: int) -> bool:
         """See `StepSizes`."""
-        found = self._retaken.found(self._solver, self._log, first, last)
+        if self._compressions is None:
+            return False
+        taken, longest = (array[first:last].numpy() for array in (self._sizes, self._longest))
+        lost = {member: one.step for member, one in self._solver.containment.lost().items()}
+        found = self._retaken.found(first, self._compressions.read(first, last), taken, longest, lost)
         if not found:
             return False
         sizes, bounds = self._sizes.numpy(), self._bounds.numpy()
-        for step, member in found:
-            sizes[step, member] = bounds[step, member] = SHORTER * sizes[step, member]
+        for key, size in found.items():
+            sizes[key] = bounds[key] = size
         self._sizes.assign(sizes)
         self._bounds.assign(bounds)
         self._look(first, first)

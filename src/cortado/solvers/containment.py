@@ -1,6 +1,8 @@
 """Looks for lost particles at the end of every step, on the device. Any solver can use it."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,9 @@ REACH = 4.0
 """In spacings: how far from a surface particles are looked at."""
 FURTHEST = 1e6
 """In spacings from the region of the first particles and walls: particles beyond are lost."""
+
+Distance = Callable[[Points], Points]
+"""(n,) how far points (n, d) [m] are outside of a wall [m]."""
 
 
 @dataclass(frozen=True)
@@ -162,19 +167,28 @@ class Containment:
             return f"was at {place}, further than {FURTHEST:g} spacings from the scene"
         return f"at {place} has no finite velocity or no volume"
 
+    def walls(self, member: int) -> Iterator[tuple[str, Distance]]:
+        """What closes a scene of a batch, each with its name in words: the sides of the container, and solids, those
+        that move as they are after the last step."""
+        for side in self.walled.region.sides():
+            yield "the container", side
+        for one, distance in self._solids(member):
+            yield f"the solid {one.name!r}", distance
+
     def _entered(self, position: np.ndarray) -> str | None:
-        """The name of the solid that holds a position (d,) [m], of those that move as they are after the last step; of
-        a batch, as they are in its first scene."""
-        d = self.walled.dimension
-        after, resting = self._poses[1], len(self.walled.solids)
-        scales = self._scales.numpy()[0]
-        poses = zip(after.positions.numpy()[0], after.turns.numpy()[0], scales, strict=True)
-        places = [position] * resting
-        places += [(position - middle[:d]) @ turn[:d, :d] / scale for middle, turn, scale in poses]
-        for one, place, scale in zip(self._obstacles, places, [1.0] * resting + [*scales], strict=True):
-            if scale * one.solid.distance(place[None])[0] < -self.walled.tolerance(one):
+        """The name of the solid that holds a position (d,) [m]; of a batch, as they are in its first scene."""
+        for one, distance in self._solids(0):
+            if distance(position[None])[0] < -self.walled.tolerance(one):
                 return one.name
         return None
+
+    def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
+        """Solids as they are in a scene of a batch after the last step."""
+        yield from ((one, one.solid.distance) for one in self.walled.solids)
+        after = self._poses[1]
+        poses = (after.positions.numpy()[member], after.turns.numpy()[member], self._scales.numpy()[member])
+        for one, *pose in zip(self.walled.moving, *poses, strict=True):
+            yield one, partial(_moved_distance, one, *pose)
 
     def _made_solids(self, device: wp.Device) -> Any:
         precision, walled = self._precision, self.walled
@@ -208,3 +222,9 @@ class Containment:
         bounds.radius, bounds.rim = region.radius + tolerance, region.rim
         bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
         return bounds
+
+
+def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: float, points: Points) -> Points:
+    """(n,) how far points (n, d) [m] are outside of a solid [m] whose middle is there, turned and scaled."""
+    d = points.shape[1]
+    return np.asarray(scale * one.solid.distance((points - middle[:d]) @ turn[:d, :d] / scale))
