@@ -16,7 +16,7 @@ import warp as wp
 
 from cortado.device.binding import bound
 from cortado.device.bundles import Bundles, bundles_of
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.smoothing import CUBIC_SPLINE

@@ -110,7 +110,10 @@ NB_MODULE(_engine, m) {
         .def_rw("relaxation", &Scene::relaxation)
         .def_rw("repair_relaxations", &Scene::repair_relaxations)
         .def_rw("least_diagonal", &Scene::least_diagonal)
-        .def_rw("nearest_weight", &Scene::nearest_weight);
+        .def_rw("nearest_weight", &Scene::nearest_weight)
+        .def_rw("nodes", &Scene::nodes)
+        .def_rw("first_node", &Scene::first_node)
+        .def_rw("node_frequency", &Scene::node_frequency);
 
     nb::class_<Parameters>(m, "Parameters")
         .def("__init__",

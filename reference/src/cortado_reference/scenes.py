@@ -9,6 +9,7 @@ from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
+from cortado.solvers.projection.coarse_grid import coarse_grid
 from cortado.solvers.projection.constants import lattice_constants
 from cortado_reference.engine import extension
 
@@ -21,7 +22,7 @@ def check_scene(scene: Scene) -> None:
     if not isinstance(scene.solver, PcisphSolver | ProjectionSolver):
         kind = shown(scene.solver.kind)
         raise InputError(f"solver.kind is {kind}, but must be pcisph or projection for the reference engine.")
-    for name in ("shifting", "velocities_follow", "multilevel"):
+    for name in ("shifting", "velocities_follow"):
         if getattr(scene.solver, name, False):
             raise InputError(f"solver.{name} is true, but must be left out for the reference engine.")
     if len(scene.phase) > 1 or scene.emitter is not None:
@@ -101,6 +102,7 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
             "repair_relaxations": constants.repair_relaxations(solver.repairs),
             "least_diagonal": constants.least_diagonal,
             "nearest_weight": constants.nearest_weight,
+            **(_of_nodes(scene, discrete) if solver.multilevel else {}),
         }
     assert isinstance(solver, PcisphSolver)
     greatest = solver.maximum_density_tolerance
@@ -110,3 +112,10 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
         "density_tolerance": solver.density_tolerance,
         "maximum_density_tolerance": float("inf") if greatest is None else greatest,
     }
+
+
+def _of_nodes(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
+    """What the engine is told of the coarse correction."""
+    grid = coarse_grid(scene, discrete, len(discrete.fluid.positions))
+    frequency = (1.0 / grid.cell).tolist()
+    return {"nodes": list(grid.shape), "first_node": grid.origin.tolist(), "node_frequency": frequency}

@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.device.precision import FLOAT32
 from cortado.pictures.particles import MODULE, Look, Particles
 

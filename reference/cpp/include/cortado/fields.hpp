@@ -13,6 +13,10 @@ template <class Scalar, int D>
 using Vector = Eigen::Matrix<Scalar, D, 1>;
 template <class Scalar, int D>
 using Vectors = std::vector<Vector<Scalar, D>>;
+template <class Scalar, int D>
+using Matrix = Eigen::Matrix<Scalar, D, D>;
+template <class Scalar, int D>
+using Matrices = std::vector<Matrix<Scalar, D>>;
 template <class Scalar>
 using Values = std::vector<Scalar>;
 

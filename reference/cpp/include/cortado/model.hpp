@@ -3,6 +3,7 @@
 
 #include <memory>
 
+#include "nodes.hpp"
 #include "pairs.hpp"
 
 namespace cortado {
@@ -25,6 +26,8 @@ struct Model {
     Real density_tolerance, maximum_density_tolerance;
     bool projection;
     Scalar spacing, relaxation, least_diagonal, nearest_weight;
+    Nodes<Scalar, D> nodes;  // of the coarse correction
+    Scalar least_energy;     // eps: 1e-5 of that of a hat's gradient on the lattice, for each particle around a node
     Values<Scalar> momenta;  // beta of the projection's iterations (Nesterov 1983), and 0 of the last
     Values<Scalar> repair_relaxations;
     Vectors<Real, D> wall_positions, wall_normals;
@@ -64,6 +67,8 @@ struct Model {
           relaxation(Real(s.relaxation)),
           least_diagonal(Real(s.least_diagonal)),
           nearest_weight(Real(s.nearest_weight)),
+          nodes(s),
+          least_energy(Real(D == 2 ? 8 : 16) / (Real(3e5) * Real(1 << 2 * D)) / (spacing * spacing)),
           momenta(s.maximum_iterations, Scalar(0)),
           repair_relaxations(s.repair_relaxations.begin(), s.repair_relaxations.end()),
           wall_positions(joined_vectors<Real, D>(high_only(s.wall_positions))),

@@ -3,7 +3,7 @@
 // the same in the same order.
 #pragma once
 
-#include "surroundings.hpp"
+#include "coarse.hpp"
 
 namespace cortado {
 
@@ -30,6 +30,8 @@ struct Projection {
     std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity before iteration i; the last is the result
+    std::vector<Correction<Scalar, D>> corrections;  // [i]: of k, y and u before iteration i; none without a grid
+    Coarse<Scalar, D> coarse;
     Vectors<Scalar, D> kick;                  // what the last k adds to velocities
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of the last but one
     Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
@@ -40,6 +42,9 @@ struct Projection {
     double error = 0;                         // average compression as the last repair found it
 
     State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back(), kick}; }
+
+    // y as iteration i - 1 leaves it, before it is corrected.
+    const Values<Scalar>& uncorrected(std::size_t i) const { return i < corrections.size() ? corrections[i].y : y[i]; }
 
     // omega / a
     Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
@@ -78,7 +83,10 @@ struct Projection {
             k[0][i] = y[0][i] = effects[i].full * state.k[i];
             u[0][i] = v_star[i] + effects[i].full * state.kick[i];
         }
+        corrections.resize(model.nodes.count() > 0 ? iterations : 0);
+        if (!corrections.empty()) spread(model, fluid, state.x);
         for (std::size_t at = 0; at < iterations; ++at) {
+            if (!corrections.empty()) correct(model, fluid, n, corrections[at], at);
             iterate(model, fluid, n, at);
             pull(model, fluid, y[at + 1], v_star, u[at + 1]);
         }
@@ -112,30 +120,87 @@ private:
         });
     }
 
+    // D^T y
+    Vector<Scalar, D> push(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
+                           std::size_t i) const {
+        Vector<Scalar, D> total = y[i] * moments[i].gamma;
+        const Matrix<Scalar, D> T = y[i] * effects[i].L;
+        for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+            const int j = pair->other;
+            total += model.volume * ((T + y[j] * effects[j].L) * pair->gradient());
+        }
+        return total;
+    }
+
     // The velocity v* - D^T y / m that pressures leave.
     void pull(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
               const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) {
         each_particle(y.size(), model.threads, [&](std::size_t i) {
-            Vector<Scalar, D> total = y[i] * moments[i].gamma;
-            const Matrix<Scalar, D> T = y[i] * effects[i].L;
-            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
-                const int j = pair->other;
-                total += model.volume * ((T + y[j] * effects[j].L) * pair->gradient());
-            }
-            kick[i] = -total / model.rest_density;
+            kick[i] = -push(model, fluid, y, i) / model.rest_density;
             left[i] = v_star[i] + kick[i];
         });
+    }
+
+    // D v
+    Scalar divergence_of(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& v,
+                         std::size_t i) const {
+        Scalar divergence = moments[i].gamma.dot(v[i]);
+        for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+            const Vector<Scalar, D> v_ij = v[i] - v[pair->other], corrected = effects[i].L * pair->gradient();
+            divergence += model.volume * v_ij.dot(corrected);
+        }
+        return divergence;
+    }
+
+    // The coarse grid of positions.
+    void spread(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x) {
+        Values<Scalar> c(x.size());
+        for (std::size_t i = 0; i < x.size(); ++i) c[i] = effects[i].shared;
+        coarse.pushes = Pushes<Scalar, D>(x.size());
+        each_particle(x.size(), model.threads, [&](std::size_t i) {
+            coarse.pushes.h[i] = push(model, fluid, c, i);
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+                const Matrix<Scalar, D> T = c[pair->other] * effects[pair->other].L;
+                coarse.pushes.N[i] -= T * (model.volume * pair->gradient()) * pair->x.transpose();
+            }
+        });
+        coarse.find(model, x);
+    }
+
+    // The coarse correction of k, y and u, which `before` keeps.
+    void correct(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
+                 Correction<Scalar, D>& before, std::size_t at) {
+        before.y = y[at];
+        before.u = u[at];
+        for (auto* each : {&before.counted, &before.r, &before.d}) each->resize(n.size());
+        before.f.resize(n.size());
+        each_particle(n.size(), model.threads, [&](std::size_t i) {
+            const Scalar left = divergence_of(model, fluid, before.u, i) - wanted(model, i, n[i]);
+            const bool inside = before.y[i] > Scalar(0) || effects[i].tension > hundredths<Scalar>(50);
+            before.counted[i] = Scalar(inside || !(real_part(left) <= Real(0)) ? 1 : 0);  // NaN must stay
+            before.r[i] = before.counted[i] * left;
+        });
+        before.e = coarse.solve(
+            [&](std::size_t i, const Hat<Scalar, D>& hat) { return hat.value * effects[i].shared * before.r[i]; });
+        each_particle(n.size(), model.threads, [&](std::size_t i) {
+            const Scalar z = before.y[i] + effects[i].shared * coarse.at(i, before.e).value;
+            const Clamp<Scalar> clamp(z, z);
+            before.d[i] = (clamp.rise + clamp.fall * effects[i].tension) * z - before.y[i];
+        });
+        each_particle(n.size(), model.threads, [&](std::size_t i) {
+            before.f[i] = -push(model, fluid, before.d, i) / model.rest_density;
+        });
+        before.stride(model.rest_density);
+        for (std::size_t i = 0; i < n.size(); ++i) {
+            k[at][i] = y[at][i] = before.y[i] + before.alpha * before.d[i];
+            u[at][i] = before.u[i] + before.alpha * before.f[i];
+        }
     }
 
     void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
                  std::size_t at) {
         each_particle(n.size(), model.threads, [&](std::size_t i) {
-            const Vectors<Scalar, D>& v = u[at];
-            Scalar divergence = moments[i].gamma.dot(v[i]);
-            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
-                const Vector<Scalar, D> v_ij = v[i] - v[pair->other], corrected = effects[i].L * pair->gradient();
-                divergence += model.volume * v_ij.dot(corrected);
-            }
+            const Scalar divergence = divergence_of(model, fluid, u[at], i);
             const Scalar per = step_of(model, i), down = y[at][i] + per * divergence;
             const Scalar up = y[at][i] + per * (divergence - wanted(model, i, n[i]));
             const Clamp<Scalar> clamp(up, down);

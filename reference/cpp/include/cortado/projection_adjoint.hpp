@@ -1,6 +1,7 @@
 // The adjoint of the part that the projection has in a step: the transpose of `projection_tangent`, every sum a gather.
 #pragma once
 
+#include "coarse_derivative.hpp"
 #include "density_derivative.hpp"
 #include "surroundings_derivative.hpp"
 
@@ -17,6 +18,7 @@ public:
           count_(state.x.size()),
           moments_bar_(count_),
           effects_bar_(count_),
+          pushes_bar_(at_.corrections.empty() ? 0 : count_),
           x_bar_(zero_vectors<Real, D>(count_)),
           v_star_bar_(zero_vectors<Real, D>(count_)),
           flow_bar_(zero_vectors<Real, D>(count_)),
@@ -124,6 +126,11 @@ private:
             f_[i] = -(u_bar[i] + kick_bar[i]) / model_.rest_density;
             kick_bar[i] = Vector<Real, D>::Zero();
         });
+        pulled(y, y_bar);
+    }
+
+    // Of D^T y, from its adjoint f to that of y.
+    void pulled(const Values<Real>& y, Values<Real>& y_bar) {
         each([&](std::size_t i) {
             const Matrix<Real, D>& L = at_.effects[i].L;
             Matrix<Real, D> T_bar = Matrix<Real, D>::Zero();
@@ -139,16 +146,90 @@ private:
         });
     }
 
+    // Of a divergence D u, from its adjoint: adds to that of u.
+    void diverge(const Values<Real>& d_bar, const Vectors<Real, D>& u, Vectors<Real, D>& u_bar) {
+        each([&](std::size_t i) {
+            const Matrix<Real, D>& L = at_.effects[i].L;
+            Matrix<Real, D> L_bar = Matrix<Real, D>::Zero();
+            u_bar[i] += d_bar[i] * at_.moments[i].gamma;
+            each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                const Vector<Real, D> u_ij = u[i] - u[j];
+                const Matrix<Real, D> S = d_bar[i] * L + d_bar[j] * at_.effects[j].L;
+                u_bar[i] += S * g;
+                L_bar += u_ij * g.transpose();
+                bent = S * u_ij;
+            });
+            effects_bar_[i].L += d_bar[i] * even<Real, D>(L_bar);
+            moments_bar_[i].gamma += d_bar[i] * u[i];
+        });
+    }
+
+    // Of b, from its adjoint.
+    void want(std::size_t i, const Real& b_bar, Values<Real>& n_bar) {
+        const Real n = step_.n[i], dt = model_.time_step;
+        if (!(n < 1)) return;
+        n_bar[i] -= (1 - at_.effects[i].full) / dt * b_bar;
+        effects_bar_[i].full -= (1 - n) / dt * b_bar;
+    }
+
+    // Of the coarse correction before an iteration, from the adjoints of its k, y and u to those of y and u before.
+    void correct(int k, State<Real, D>& bar, Values<Real>& y_bar, Values<Real>& n_bar) {
+        const Correction<Real, D>& before = at_.corrections[k];
+        const Real m = model_.rest_density, alpha = before.alpha;
+        Real alpha_bar = 0;
+        for (std::size_t i = 0; i < count_; ++i) {
+            y_bar[i] += bar.k[i];
+            bar.k[i] = 0;
+            alpha_bar += y_bar[i] * before.d[i] + bar.v[i].dot(before.f[i]);
+        }
+        const Real work_bar = before.bends() ? Real(alpha_bar / before.energy) : Real(0);
+        Values<Real> d_bar(count_), left_bar(count_);
+        for (std::size_t i = 0; i < count_; ++i) {
+            d_bar[i] = alpha * y_bar[i] + work_bar * before.r[i];
+            f_[i] = 2 * alpha * work_bar * before.f[i] - alpha / m * bar.v[i];
+        }
+        pulled(before.d, d_bar);
+        const auto change = correction_adjoint(model_, at_, before, d_bar, pushes_bar_, x_bar_);
+        each([&](std::size_t i) {
+            effects_bar_[i].shared += change[i].shared;
+            effects_bar_[i].tension += change[i].tension;
+            y_bar[i] += change[i].y;
+            left_bar[i] = before.counted[i] * (change[i].r + work_bar * before.d[i]);
+            want(i, -left_bar[i], n_bar);
+        });
+        diverge(left_bar, before.u, bar.v);
+    }
+
+    // Of h and N of the coarse grid, from their adjoints.
+    void pushes() {
+        Values<Real> c(count_), c_bar(count_, Real(0));
+        for (std::size_t i = 0; i < count_; ++i) c[i] = at_.effects[i].shared;
+        f_ = pushes_bar_.h;
+        pulled(c, c_bar);
+        each([&](std::size_t i) {
+            const Matrix<Real, D> &N_bar = pushes_bar_.N[i], T = c[i] * at_.effects[i].L;
+            Matrix<Real, D> T_bar = Matrix<Real, D>::Zero();
+            each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                const Matrix<Real, D> &other = pushes_bar_.N[j], T_j = c[j] * at_.effects[j].L;
+                T_bar -= other * pair.x * g.transpose();
+                bent = -T_j * (N_bar * pair.x) - T * (other * pair.x);
+                x_bar_[i] -= N_bar.transpose() * (T_j * g) + other.transpose() * (T * g);
+            });
+            T_bar = even<Real, D>(T_bar);
+            effects_bar_[i].L += c[i] * T_bar;
+            effects_bar_[i].shared += c_bar[i] + at_.effects[i].L.cwiseProduct(T_bar).sum();
+        });
+    }
+
     // From the adjoints of the last k, of the new velocities and of the kick to those of the first k, y and u.
     void project(State<Real, D>& bar, Values<Real>& y_bar, Values<Real>& n_bar) {
-        const Real dt = model_.time_step;
         Values<Real>& k_bar = bar.k;
         Vectors<Real, D>& u_bar = bar.v;
         Values<Real> d_bar(count_);
         const int last = int(at_.divergences.size()) - 1;
         for (int k = last; k >= 0; --k) {
             const Real beta = model_.momenta[k];
-            pull(at_.y[k + 1], u_bar, bar.kick, y_bar);
+            pull(at_.uncorrected(k + 1), u_bar, bar.kick, y_bar);
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];
                 Effects<Real, D>& of_bar = effects_bar_[i];
@@ -159,31 +240,16 @@ private:
                 const Real z_bar = up_bar + clamp.fall * of.tension * new_bar, b_bar = -per * up_bar;
                 of_bar.tension += clamp.fall * down * new_bar;
                 of_bar.a -= per / of.a * (D_i * z_bar - b * up_bar);
-                if (n < 1) {
-                    n_bar[i] -= (1 - of.full) / dt * b_bar;
-                    of_bar.full -= (1 - n) / dt * b_bar;
-                }
+                want(i, b_bar, n_bar);
                 k_bar[i] = -beta * y_bar[i];
                 y_bar[i] = z_bar;
                 d_bar[i] = per * z_bar;
             });
-            each([&](std::size_t i) {
-                const Matrix<Real, D>& L = at_.effects[i].L;
-                const Vectors<Real, D>& u = at_.u[k];
-                Matrix<Real, D> L_bar = Matrix<Real, D>::Zero();
-                u_bar[i] = d_bar[i] * at_.moments[i].gamma;
-                if (k == last) u_bar[i] += flow_bar_[i];
-                each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
-                    const Vector<Real, D> u_ij = u[i] - u[j];
-                    const Matrix<Real, D> S = d_bar[i] * L + d_bar[j] * at_.effects[j].L;
-                    u_bar[i] += S * g;
-                    L_bar += u_ij * g.transpose();
-                    bent = S * u_ij;
-                });
-                effects_bar_[i].L += d_bar[i] * even<Real, D>(L_bar);
-                moments_bar_[i].gamma += d_bar[i] * u[i];
-            });
+            u_bar = k == last ? flow_bar_ : zero_vectors<Real, D>(count_);
+            diverge(d_bar, at_.u[k], u_bar);
+            if (!at_.corrections.empty()) correct(k, bar, y_bar, n_bar);
         }
+        if (!at_.corrections.empty()) pushes();
     }
 
     // From the adjoints of effects and moments to that of positions.
@@ -224,8 +290,9 @@ private:
     std::size_t count_;
     std::vector<Moments<Real, D>> moments_bar_;
     std::vector<Effects<Real, D>> effects_bar_;
+    Pushes<Real, D> pushes_bar_;
     Vectors<Real, D> x_bar_, v_star_bar_, flow_bar_;
-    Vectors<Real, D> f_;  // -u_bar / m of a velocity, or that of a position
+    Vectors<Real, D> f_;  // -u_bar / m of a velocity, or that of a position: the adjoint of D^T y
 };
 
 }  // namespace cortado

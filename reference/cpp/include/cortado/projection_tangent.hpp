@@ -1,6 +1,7 @@
 // The tangent of the part that the projection has in a step, derived by hand.
 #pragma once
 
+#include "coarse_derivative.hpp"
 #include "density_derivative.hpp"
 #include "surroundings_derivative.hpp"
 
@@ -39,13 +40,13 @@ ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Rea
     return change;
 }
 
-// Of what pressures y add to velocities.
+// Of D^T y.
 template <class Real, int D>
-Vectors<Real, D> kick_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
+Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
                               const ManyMoments<Real, D>& moments_dot, const ManyEffects<Real, D>& effects_dot,
                               const Values<Real>& y, const Values<Real>& dy) {
     const Projection<Real, D>& at = step.projection;
-    Vectors<Real, D> dkick(y.size());
+    Vectors<Real, D> dpull(y.size());
     each_particle(y.size(), model.threads, [&](std::size_t i) {
         const auto pull = [&](std::size_t j) { return Matrix<Real, D>(y[j] * at.effects[j].L); };
         const auto change = [&](std::size_t j) {
@@ -59,9 +60,33 @@ Vectors<Real, D> kick_tangent(const Model<Real, D>& model, const Step<Real, D>& 
             const Vector<Real, D> dg = pair->hessian_product(dx_ij);
             total += model.volume * ((dT + change(j)) * pair->gradient() + (T + pull(j)) * dg);
         }
-        dkick[i] = -total / model.rest_density;
+        dpull[i] = total;
     });
-    return dkick;
+    return dpull;
+}
+
+// Of h and N of the coarse grid.
+template <class Real, int D>
+Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
+                               const ManyMoments<Real, D>& moments_dot, const ManyEffects<Real, D>& effects_dot) {
+    const Projection<Real, D>& at = step.projection;
+    Values<Real> c(dx.size()), dc(dx.size());
+    for (std::size_t i = 0; i < dx.size(); ++i) {
+        c[i] = at.effects[i].shared;
+        dc[i] = effects_dot[i].shared;
+    }
+    Pushes<Real, D> dot(dx.size());
+    dot.h = pull_tangent(model, step, dx, moments_dot, effects_dot, c, dc);
+    each_particle(dx.size(), model.threads, [&](std::size_t i) {
+        for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
+            const int j = pair->other;
+            const Matrix<Real, D> T = c[j] * at.effects[j].L, dT = dc[j] * at.effects[j].L + c[j] * effects_dot[j].L;
+            const Vector<Real, D> dx_ij = dx[i] - dx[j], g = model.volume * pair->gradient();
+            const Vector<Real, D> dg = model.volume * pair->hessian_product(dx_ij);
+            dot.N[i] -= (dT * g + T * dg) * pair->x.transpose() + T * g * dx_ij.transpose();
+        }
+    });
+    return dot;
 }
 
 // From the tangents of a state, of its densities and of predicted velocities to that of the step's result.
@@ -81,21 +106,57 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         dk[i] = dy[i] = dfull * state.k[i] + full * dot.k[i];
         dv[i] = dv_star[i] + dfull * state.kick[i] + full * dot.kick[i];
     });
+    const auto divergence = [&](std::size_t i, const Vectors<Real, D>& u, const Vectors<Real, D>& change) {
+        const Matrix<Real, D>&L = at.effects[i].L, &dL = effects_dot[i].L;
+        Real found = at.moments[i].gamma.dot(change[i]) + moments_dot[i].gamma.dot(u[i]);
+        for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
+            const int j = pair->other;
+            const Vector<Real, D> g = pair->gradient(), dg = pair->hessian_product(dot.x[i] - dot.x[j]);
+            const Vector<Real, D> by_u = L * g, by_x = L * dg + dL * g;
+            found += model.volume * (by_u.dot(change[i] - change[j]) + by_x.dot(u[i] - u[j]));
+        }
+        return found;
+    };
+    const auto wanted = [&](std::size_t i) {
+        const Real less = (at.effects[i].full - 1) * dn[i] - effects_dot[i].full * (1 - step.n[i]);
+        return step.n[i] < 1 ? Real(less / dt) : Real(0);
+    };
+    const auto press = [&](const Values<Real>& y) {
+        dkick = pull_tangent(model, step, dot.x, moments_dot, effects_dot, y, dy);
+        for (std::size_t i = 0; i < count; ++i) {
+            dkick[i] /= -m;
+            dv[i] = dv_star[i] + dkick[i];
+        }
+    };
+    Pushes<Real, D> pushes_dot;
+    if (!at.corrections.empty()) pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
+    const auto correct = [&](std::size_t k) {
+        const Correction<Real, D>& before = at.corrections[k];
+        std::vector<CorrectionChange<Real>> change(count);
+        each_particle(count, model.threads, [&](std::size_t i) {
+            const Real dr = before.counted[i] * (divergence(i, before.u, dv) - wanted(i));
+            change[i] = {dy[i], dr, effects_dot[i].shared, effects_dot[i].tension};
+        });
+        const Values<Real> dd = correction_tangent(model, at, before, dot.x, pushes_dot, change);
+        Vectors<Real, D> df = pull_tangent(model, step, dot.x, moments_dot, effects_dot, before.d, dd);
+        Real climb = 0;
+        for (std::size_t i = 0; i < count; ++i) {
+            df[i] /= -m;
+            climb += change[i].r * before.d[i] + before.r[i] * dd[i] - 2 * before.alpha * m * before.f[i].dot(df[i]);
+        }
+        const Real dalpha = before.bends() ? Real(climb / before.energy) : Real(0);
+        for (std::size_t i = 0; i < count; ++i) {
+            dk[i] = dy[i] += dalpha * before.d[i] + before.alpha * dd[i];
+            dv[i] += dalpha * before.f[i] + before.alpha * df[i];
+        }
+    };
     for (std::size_t k = 0; k < at.divergences.size(); ++k) {
-        const Vectors<Real, D>& u = at.u[k];
+        if (!at.corrections.empty()) correct(k);
         du = dv;
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
-            Real dD = at.moments[i].gamma.dot(du[i]) + moments_dot[i].gamma.dot(u[i]);
-            for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
-                const int j = pair->other;
-                const Vector<Real, D> g = pair->gradient(), dg = pair->hessian_product(dot.x[i] - dot.x[j]);
-                const Vector<Real, D> by_u = of.L * g, by_x = of.L * dg + change.L * g;
-                dD += model.volume * (by_u.dot(du[i] - du[j]) + by_x.dot(u[i] - u[j]));
-            }
             const Real b = at.wanted(model, i, step.n[i]), D_i = at.divergences[k][i], per = at.step_of(model, i);
-            const Real less = (of.full - 1) * dn[i] - change.full * (1 - step.n[i]);
-            const Real db = step.n[i] < 1 ? Real(less / dt) : Real(0);
+            const Real dD = divergence(i, at.u[k], du), db = wanted(i);
             const Real down = at.y[k][i] + per * D_i, dper = -per * change.a / of.a;
             const Clamp<Real> clamp(Real(at.y[k][i] + per * (D_i - b)), down);
             const Real moved = dy[i] + dper * D_i + per * dD;
@@ -104,8 +165,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             dy[i] = dk_new + model.momenta[k] * (dk_new - dk[i]);
             dk[i] = dk_new;
         });
-        dkick = kick_tangent(model, step, dot.x, moments_dot, effects_dot, at.y[k + 1], dy);
-        for (std::size_t i = 0; i < count; ++i) dv[i] = dv_star[i] + dkick[i];
+        press(at.uncorrected(k + 1));
     }
     const Vectors<Real, D>& u = at.flow();
     Vectors<Real, D> dx_moved(count);

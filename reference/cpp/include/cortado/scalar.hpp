@@ -31,6 +31,13 @@ inline __float128 nearest_integer(__float128 a) {
 }
 #endif
 
+// The greatest whole number that is not above a.
+template <class Real>
+Real whole_below(const Real& a) {
+    const Real near = nearest_integer(a);
+    return near > a ? Real(near - Real(1)) : near;
+}
+
 // The relative distance between neighbouring numbers; std::numeric_limits leaves __float128 out in strict modes.
 template <class Real>
 Real epsilon() {

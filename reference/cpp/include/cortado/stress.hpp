@@ -12,10 +12,6 @@
 
 namespace cortado {
 
-template <class Scalar, int D>
-using Matrix = Eigen::Matrix<Scalar, D, D>;
-template <class Scalar, int D>
-using Matrices = std::vector<Matrix<Scalar, D>>;
 
 // How a neighbour counts: with a weight s, as a particle at a separation y.
 template <class Scalar, int D>

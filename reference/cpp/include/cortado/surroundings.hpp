@@ -21,12 +21,12 @@ struct Moments {
     Scalar nu{0};
 };
 
-// What follows from them: L, the diagonal a, and how much tension is let through (sigma), how full it is (f), and how
-// much is shifted and repaired.
+// What follows from them: L, the diagonal a, and how much tension is let through (sigma), how full it is (f), how much
+// is shifted and repaired, and its share c of a coarse pressure.
 template <class Scalar, int D>
 struct Effects {
     Matrix<Scalar, D> L = Matrix<Scalar, D>::Constant(Scalar(0));
-    Scalar a{0}, tension{0}, full{0}, shifted{0}, repaired{0};
+    Scalar a{0}, tension{0}, full{0}, shifted{0}, repaired{0}, shared{0};
 };
 
 // 0 below a first number, 1 above a second one, and a cubic between them; numbers are in hundredths.
@@ -110,7 +110,7 @@ Scalar newton() {
 template <class Scalar, int D>
 struct Surroundings {
     Filling<Scalar, D> filling;
-    Smoothstep<Scalar> tension, full, corrected, shifted, repaired;
+    Smoothstep<Scalar> tension, full, corrected, shifted, repaired, shared;
     Scalar away;              // B
     Scalar direction, lean;   // the denominators of N and C
     Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
@@ -127,7 +127,8 @@ struct Surroundings {
           full(Scalar(filling.H + of.nu), 10, 50),
           corrected(filling.H, 20, 50),
           shifted(filling.H, 50, 80),
-          repaired(filling.H, 80, 95) {
+          repaired(filling.H, 80, 95),
+          shared(Scalar(filling.H + of.nu + of.nu), 70, 95) {
         const Scalar one(1), m = model.rest_density, ratio = of.nu / hundredths<Scalar>(5);
         const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
         away = one / (one + ratio * ratio * ratio * ratio);
@@ -151,6 +152,7 @@ struct Surroundings {
         found.full = full.value;
         found.shifted = shifted.value;
         found.repaired = repaired.value * away;
+        found.shared = shared.value;
     }
 };
 

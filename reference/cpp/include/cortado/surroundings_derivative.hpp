@@ -51,6 +51,7 @@ public:
         found.full = at_.full.slope * (dH + dot.nu);
         found.shifted = at_.shifted.slope * dH;
         found.repaired = at_.repaired.slope * dH * at_.away + at_.repaired.value * dB;
+        found.shared = at_.shared.slope * (dH + 2 * dot.nu);
         return found;
     }
 
@@ -67,10 +68,10 @@ public:
         const Real H_bar = at_.corrected.slope * L_bar.cwiseProduct(at_.bare).sum() +
                            at_.tension.slope * at_.away * bar.tension + at_.full.slope * bar.full +
                            at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away * bar.repaired +
-                           at_.repaired.slope * K_bar.cwiseProduct(at_.late).sum();
+                           at_.repaired.slope * K_bar.cwiseProduct(at_.late).sum() + at_.shared.slope * bar.shared;
         const Real B_bar = bare_bar.cwiseProduct(mixed_).sum() + at_.tension.value * bar.tension +
                            at_.repaired.value * bar.repaired;
-        found.nu = away_slope_ * B_bar + at_.full.slope * bar.full;
+        found.nu = away_slope_ * B_bar + at_.full.slope * bar.full + 2 * at_.shared.slope * bar.shared;
         const Matrix<Real, D> beside_bar = (1 - at_.away) * bare_bar, C_bar = -(1 + at_.lack) * beside_bar;
         const Matrix<Real, D> across_bar = hundredths<Real>(210) / at_.lean * C_bar;
         const Real lacked = lack_slope_ * beside_bar.cwiseProduct(at_.P - at_.C).sum();

@@ -1,11 +1,10 @@
 """The projection as the solver of a scene."""
 
-from cortado.device.cells import Grid
 from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
-from cortado.solvers.projection.coarse import SPACING
+from cortado.solvers.projection.coarse_grid import coarse_grid
 from cortado.solvers.projection.constants import lattice_constants
 from cortado.solvers.projection.solver import Projection
 from cortado.solvers.solver import Solver
@@ -26,16 +25,9 @@ class ProjectionMaker:
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
         counts = table.iterations, table.repairs
-        grid = coarse_grid(setting, system.layout.particles) if table.multilevel else None
+        grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles) if table.multilevel else None
         constants = lattice_constants(setting.scene, setting.discrete)
         return Projection(system, constants, *counts, table.velocities_follow, grid)
-
-
-def coarse_grid(setting: SolverSetting, particles: int) -> Grid:
-    """The nodes of the coarse correction: about everything that can be reached; what goes further wraps around."""
-    discrete, reach = setting.discrete, SPACING * setting.scene.discretisation.spacing
-    most = max(4 * particles, 512)
-    return Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)
 
 
 maker = ProjectionMaker

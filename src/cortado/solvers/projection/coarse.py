@@ -8,10 +8,12 @@ multilevel particle solver; `cortado.solvers.projection.coarse_pressure` has the
 import warp as wp
 
 from cortado.device.binding import Named
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.particles.arrays import zeros
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
+from cortado.solvers.projection.coarse_grid import SPACING
 from cortado.solvers.projection.coarse_length import length_kernels
 from cortado.solvers.projection.coarse_nodes import node_kernels
 from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels
@@ -22,8 +24,6 @@ from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
 from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
 
-SPACING = 2.0
-"""Distance of nodes, in spacings of particles."""
 LEAST = 1e-5
 """eps of all particles around a node over what A_II is on the lattice. It takes 0.7 % off the correction of the longest
 wave in water that is 100 spacings deep, and 3 % where it is 200 deep."""
