@@ -318,7 +318,7 @@ def corners(seed):
     return certify(Problem(simulation, 16, losses.FinalPositions(goal)), {"own.k": 2e4}, seed=seed)
 
 
-ON_ITS_CORNERS = 2
+ON_ITS_CORNERS = 8
 """A seed with which the slopes to both sides are nearer to each other than to the derivative."""
 
 

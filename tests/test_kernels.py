@@ -93,6 +93,7 @@ SINGLE: Values = {
     "rounds": np.array([1]),
     "x_before": np.zeros((N, 3)),
     "v_before": np.zeros((N, 3)),
+    "cell": 0.027,
 }
 """Of a single scene in the first iteration."""
 

@@ -129,25 +129,6 @@ def test_a_bad_override_is_a_sentence(scene_file, override):
 # ---- bad scenes --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "data, sentence",
-    [
-        ({"rigid_body": {}}, "rigid_body is not a key of the scene"),
-    ],
-)
-def test_what_no_scene_can_have_yet_leads_to_the_limits(data, sentence):
-    with pytest.raises(SceneError) as error:
-        Scene(**{**plane(), **data})
-    said = str(error.value)
-    assert said.startswith(sentence) and "docs/limits.md" in said and "its keys are" not in said
-
-
-def test_a_shape_that_is_only_misspelt_does_not():
-    with pytest.raises(SceneError) as error:
-        Scene(**{**plane(), "container": {"shape": "bocks"}})
-    assert "limits" not in str(error.value)
-
-
 def test_there_are_enough_bad_scenes():
     assert len({name for name, *_ in BAD_SCENES}) == len(BAD_SCENES) >= 40
 

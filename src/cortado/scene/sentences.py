@@ -14,8 +14,6 @@ MOST_HOMES = 2
 """Tables that have a key, up to which a sentence names them where the key stands in another table."""
 UNKNOWN = Words("unknown")
 """What was found of a key that its table does not have."""
-ABSENT = {"rigid": "rigid bodies"}
-"""What scenes are asked for and cannot have, by what it is called in them: in words, in the plural."""
 
 
 @contextmanager
@@ -39,12 +37,6 @@ def field_name(path: FieldPath) -> str:
     return text
 
 
-def absent(name: object) -> str:
-    """What to say of a table or a shape that there is not yet, in the place of others; empty for any other name."""
-    found = next((words for part, words in ABSENT.items() if part in str(name).lower()), None)
-    return f"there are no {found} yet: docs/limits.md says what else there is not" if found else ""
-
-
 def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     first = error.errors(include_url=False)[0]
     schema, path = _schema_at(model.model_json_schema(), first["loc"])
@@ -62,7 +54,7 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     elif "discriminator" in schema and isinstance(found, Mapping):
         union = schema["discriminator"]
         path, found = [*path, union["propertyName"]], found.get(union["propertyName"], MISSING)
-        words = "; ".join(filter(None, [_any_of(union["mapping"]), absent(found)]))
+        words = _any_of(union["mapping"])
     elif first["type"] in ("float_type", "finite_number"):
         words = f"a finite number{'' if words.startswith('a ') else f', {words}'}"
     elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):

@@ -14,7 +14,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 from cortado.errors import InputError, Words
 from cortado.scene.docstrings import field_docstrings
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
-from cortado.scene.sentences import UNKNOWN, absent, sentences
+from cortado.scene.sentences import UNKNOWN, sentences
 
 ALSO_CALLED = {
     **dict.fromkeys(("dt", "step_size"), ("time_step",)),
@@ -106,7 +106,6 @@ def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     longer = [name for name in known if key in name.split("_")]
     other = [name for name in ALSO_CALLED.get(key.lower(), ()) if name in known]
     close = other or longer or get_close_matches(key, known, n=1)
-    others = f"{missing}." if (missing := absent(key)) else f"its keys are {', '.join(known)}."
-    advice = f"did you mean {close[0]}?" if close else others
+    advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
     found = Words("short for another") if longer else UNKNOWN
     return field_error((key,), found, f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")

@@ -23,7 +23,7 @@ from cortado.discretise.domain import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solids.solid import Solid
 from cortado.particles.arrays import padded
-from cortado.runs.sensors.sensor import Reading, Weights
+from cortado.runs.sensors.sensor import Reading, Weights, in_dimension
 from cortado.scene.containers import Container
 from cortado.scene.motions import position_name, scale_name
 from cortado.scene.poses import Pose
@@ -94,6 +94,7 @@ class Axis:
     @classmethod
     def of(cls, at: Reading, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
         """Of a gauge."""
+        in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
         foot = position + (floor - position @ up) * up
         step = min(FINE * spacing, reach / ACROSS_REACH)
