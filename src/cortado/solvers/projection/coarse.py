@@ -15,6 +15,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.projection.coarse_grid import SPACING
 from cortado.solvers.projection.coarse_length import length_kernels
+from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
 from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels
 from cortado.solvers.projection.coarse_residual import residual_kernels
@@ -47,8 +48,9 @@ class Coarse:
         self._layout = Layout(grid.cells, 1, precision, device, layout.batch)
         count = self._layout.all_particles
         self._A = wp.zeros((3**dimension, count), dtype=real, device=device)
-        kinds = {"w": real, "r": real}
-        self._node = zeros({name: (count, kind) for name, kind in kinds.items()}, device)
+        self._node = zeros(dict.fromkeys(("w", "r", "z"), (count, real)), device)
+        self._node["w"].fill_(1.0)
+        self._levels = Levels(precision, dimension, grid.shape, self._A)
         self._solution = ConjugateGradients(self._layout, real, round_off(precision), MOST)
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
@@ -78,19 +80,23 @@ class Coarse:
         for kernel in self.push.forward:
             context.launch(kernel, around, self.pushed)
         self._sort(context.fields["x"])
-        step, (offsets, nodes) = (self.grid, self.pushed, self._node), self._A.shape
-        context.launch(self.nodes.fill, *step, A=self._A, threads=offsets * nodes)
-        context.launch(self.nodes.weigh, *step, A=self._A, threads=nodes)
+        offsets, nodes = self._A.shape
+        context.launch(self.nodes.fill, self.grid, self.pushed, A=self._A, threads=offsets * nodes)
+        self._levels.begin(context)
 
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
         """Write to ``e`` (nodes,) what solves A e = the `source`, spread with the e ``before``."""
         node, count = self._node, self._layout.all_particles
-        context.launch(self.nodes.spread, self.grid, self.source, node, e=before, threads=count)
+        context.launch(self.nodes.spread, self.grid, self.source, r=node["r"], e=before, threads=count)
 
         def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
-            context.launch(self.nodes.multiply, self.grid, node, found, A=self._A, p=p, threads=count)
+            context.launch(self.nodes.multiply, self.grid, found, A=self._A, p=p, threads=count)
 
-        self._solution.solve(context, multiply, node["w"], node["r"], e)
+        def precondition() -> wp.array:
+            self._levels.cycle(context, node["r"], node["z"])
+            return node["z"]
+
+        self._solution.solve(context, multiply, node["w"], node["r"], e, precondition)
 
     def correct(self, context: StepContext, around: Named, at: Named, new: Named, T: wp.array) -> None:
         """From an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new`` one, which has `room`

@@ -21,12 +21,10 @@ class NodeKernels:
 
     fill: Any
     """A, for each node and each of its neighbours, itself among them."""
-    weigh: Any
-    """The diagonal of A, 1 at nodes without particles."""
     multiply: Any
-    """A p over its diagonal."""
+    """A p"""
     spread: Any
-    """A sum over particles, over the diagonal of A."""
+    """A sum over particles."""
 
 
 @cache
@@ -74,16 +72,9 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         A[offset, node] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def weigh(A: wp.array2d(dtype=real), w: wp.array(dtype=real)):
-        node = wp.tid()
-        own = A[AROUND // 2, node]
-        w[node] = wp.where(own > real(0.0), own, real(1.0))
-
-    @wp.kernel(module=module, enable_backward=False)
     def multiply(
         grid: grid_type,
         A: wp.array2d(dtype=real),
-        w: wp.array(dtype=real),
         p: wp.array(dtype=real),
         # out
         product: wp.array(dtype=real),
@@ -96,7 +87,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         for offset in range(AROUND):
             there = member * nodes + number_of(moved(here, offset_step(offset), grid), grid)
             total += A[offset, node] * p[there]
-        product[node] = total / w[node]
+        product[node] = total
         share[node] = p[node] * total
 
     @wp.kernel(module=module, enable_backward=False)
@@ -106,7 +97,6 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         x: wp.array(dtype=vector),
         of: source,
         e: wp.array(dtype=real),
-        w: wp.array(dtype=real),
         # out
         r: wp.array(dtype=real),
     ):
@@ -121,6 +111,6 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                 phi = hat(x[i], corner, grid)
                 total += phi.value * of.s_value[i] + wp.dot(phi.slope, of.s_slope[i]) + wp.dot(phi.bent, of.s_bent[i])
                 total += e[node] * of.s_own[i]
-        r[node] = total / w[node]
+        r[node] = total
 
-    return NodeKernels(fill, weigh, multiply, spread)
+    return NodeKernels(fill, multiply, spread)
