@@ -206,9 +206,9 @@ class ConjugateGradients:
         """Write to ``y`` what solves B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
         ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
-        w p B p of each particle to the ``share``. ``precondition`` returns, always in the same array, z that nearly solves
-        B z = ``r``, by a linear map that is symmetric and positive in the same product; the solve then goes on until r z
-        has fallen.
+        w p B p of each particle to the ``share``. ``precondition`` returns, always in the same array, z that nearly
+        solves B z = ``r``, by a linear map that is symmetric and positive in the same product; the solve then goes on
+        until r z has fallen.
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles
