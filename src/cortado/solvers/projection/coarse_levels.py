@@ -69,6 +69,10 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         return wp.vec3i(number % shape[0], row % shape[1], row // shape[1])
 
     @wp.func
+    def scaled(cell: wp.vec3i, factor: wp.vec3i) -> wp.vec3i:
+        return wp.vec3i(cell[0] * factor[0], cell[1] * factor[1], cell[2] * factor[2])
+
+    @wp.func
     def weight(step: int, factor: int) -> real:
         """Of R, for a fine node that is a step from where the coarse one is, along an axis that is halved or not."""
         if step == 0:
@@ -96,8 +100,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
         first = member * fine[0] * fine[1] * fine[2]
-        here = wp.cw_mul(cell_of(node - member * nodes, shape), factor)
-        far = wp.cw_mul(step_of(offset), factor)
+        here = scaled(cell_of(node - member * nodes, shape), factor)
+        far = scaled(step_of(offset), factor)
         total = real(0.0)
         for a in range(AROUND):
             own = step_of(a)
@@ -143,7 +147,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
         first = member * fine[0] * fine[1] * fine[2]
-        here, total = wp.cw_mul(cell_of(node - member * nodes, shape), factor), real(0.0)
+        here, total = scaled(cell_of(node - member * nodes, shape), factor), real(0.0)
         for a in range(AROUND):
             part = weight_of(step_of(a), factor)
             if part > real(0.0):
