@@ -48,7 +48,7 @@ class Projection:
         counts = (getattr(scene.solver, name, 2) for name in ("iterations", "repairs"))
         follow = getattr(scene.solver, "velocities_follow", False)
         nodes = None
-        if solver.coarse is not None:
+        if getattr(solver, "coarse", None) is not None:
             grid = solver.coarse.grid["grid"]
             nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
         return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes)
