@@ -63,6 +63,13 @@ def test_water_that_is_shut_in_stays_where_a_coarse_grid_knows_it(multilevel, le
     assert least < run.velocities[-1][:, 0].mean() / (9.81 * 10 * 0.002) < most
 
 
+def test_what_a_lost_run_left_on_the_coarse_grid_is_not_read():
+    simulation = Simulation(plane(solver=COARSE), precision="float64")
+    first = simulation.run(3)
+    simulation.solver.corrected[0]["e"].fill_(np.nan)
+    assert simulation.run(3).positions.tobytes() == first.positions.tobytes()
+
+
 @pytest.mark.parametrize("make", [plane, scene])
 def test_pressures_keep_both_momenta(make):
     """Of fluid that nothing holds; the shift and repairs move particles whose velocities stay as they are."""

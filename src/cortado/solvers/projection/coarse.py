@@ -50,6 +50,8 @@ class Coarse:
         self._A = wp.zeros((3**dimension, count), dtype=real, device=device)
         self._node = zeros(dict.fromkeys(("w", "r", "z"), (count, real)), device)
         self._node["w"].fill_(1.0)
+        self._none = self.numbers()
+        """Nothing: what a correction left may not be finite, if its run was lost."""
         self._levels = Levels(precision, dimension, grid.shape, self._A)
         self._solution = ConjugateGradients(self._layout, real, round_off(precision), MOST)
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
@@ -102,7 +104,7 @@ class Coarse:
         """From an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new`` one, which has `room`
         for the rest; ``around`` has the drift of walls, and ``T`` is overwritten."""
         context.launch(self.residual.residual, around, at, self.source, r=new["r"])
-        self.solve(context, new["e"], new["e"])
+        self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
         thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
