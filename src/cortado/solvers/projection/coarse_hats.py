@@ -21,6 +21,42 @@ def source_type(precision: Precision) -> Any:
 
 
 @dataclass(frozen=True)
+class NodeFunctions:
+    """Warp functions of the nodes of a grid of some shape, which wraps around."""
+
+    number_of: Any
+    """Of a node, which may be as far outside as the grid is wide."""
+    node_of: Any
+    """Of a number."""
+    step_of: Any
+    """From a node to one of those around it, itself among them."""
+
+
+@cache
+def node_functions(dimension: int) -> NodeFunctions:
+    """In 2 or 3 dimensions."""
+    flat = wp.constant(dimension == 2)
+
+    @wp.func
+    def number_of(node: wp.vec3i, shape: wp.vec3i) -> int:
+        x, y, z = (node[0] + shape[0]) % shape[0], (node[1] + shape[1]) % shape[1], (node[2] + shape[2]) % shape[2]
+        return (z * shape[1] + y) * shape[0] + x
+
+    @wp.func
+    def node_of(number: int, shape: wp.vec3i) -> wp.vec3i:
+        row = number // shape[0]
+        return wp.vec3i(number % shape[0], row % shape[1], row // shape[1])
+
+    @wp.func
+    def step_of(offset: int) -> wp.vec3i:
+        if flat:
+            return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
+        return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
+
+    return NodeFunctions(number_of, node_of, step_of)
+
+
+@dataclass(frozen=True)
 class HatFunctions:
     """Warp functions."""
 
@@ -32,23 +68,16 @@ class HatFunctions:
     """The sum of e u over the nodes that a particle touches."""
     bend: Any
     """H v"""
-    number_of: Any
-    """Of a cell, or of the node at its lower corner."""
-    cell_of_number: Any
-    moved: Any
-    """A cell that is so many cells away."""
     corner_step: Any
     """To one of the corners of a cell."""
-    offset_step: Any
-    """To one of the nodes around a node, itself among them."""
 
 
 @cache
 def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     """In 2 or 3 dimensions."""
     real, vector = precision.real, precision.vector
-    grid_type, cells = cell_grid_type(precision), cell_functions(precision)
-    wrap, cell_of = cells.wrap, cells.cell_of
+    grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
+    number_of = node_functions(dimension).number_of
     CORNERS = wp.constant(2**dimension)
     flat = wp.constant(dimension == 2)
 
@@ -87,32 +116,8 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         return found
 
     @wp.func
-    def number_of(cell: wp.vec3i, grid: grid_type) -> int:
-        return (cell[2] * grid.shape[1] + cell[1]) * grid.shape[0] + cell[0]
-
-    @wp.func
-    def moved(cell: wp.vec3i, by: wp.vec3i, grid: grid_type) -> wp.vec3i:
-        return wp.vec3i(
-            wrap(cell[0] + by[0], grid.shape[0]),
-            wrap(cell[1] + by[1], grid.shape[1]),
-            wrap(cell[2] + by[2], grid.shape[2]),
-        )
-
-    @wp.func
-    def cell_of_number(number: int, grid: grid_type) -> wp.vec3i:
-        row = number // grid.shape[0]
-        return wp.vec3i(number % grid.shape[0], row % grid.shape[1], row // grid.shape[1])
-
-    @wp.func
     def corner_step(corner: int) -> wp.vec3i:
         return wp.vec3i(bit(corner, 0), bit(corner, 1), bit(corner, 2))
-
-    @wp.func
-    def offset_step(offset: int) -> wp.vec3i:
-        """From a node to one of those around it."""
-        if flat:
-            return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
-        return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
 
     @wp.func
     def first_corner(i: int, particles: int, x: vector, grid: grid_type):
@@ -126,7 +131,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         found = Hat()
         for corner in range(CORNERS):
             phi = hat(x, corner, grid)
-            value = e[first + number_of(moved(own, corner_step(corner), grid), grid)]
+            value = e[first + number_of(own + corner_step(corner), grid.shape)]
             found.value += value * phi.value
             found.slope += value * phi.slope
             found.bent += value * phi.bent
@@ -140,7 +145,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         own, first = first_corner(i, particles, x, grid)
         total = real(0.0)
         for corner in range(CORNERS):
-            node = first + number_of(moved(own, corner_step(corner), grid), grid)
+            node = first + number_of(own + corner_step(corner), grid.shape)
             total += e[node] * u[node]
         return total
 
@@ -149,4 +154,4 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         """H v"""
         return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
 
-    return HatFunctions(hat, at, products, bend, number_of, cell_of_number, moved, corner_step, offset_step)
+    return HatFunctions(hat, at, products, bend, corner_step)

@@ -15,6 +15,7 @@ import warp as wp
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.arrays import zeros
+from cortado.solvers.projection.coarse_hats import node_functions
 from cortado.sph.parts import StepContext
 
 FEWEST = 4
@@ -45,28 +46,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
     """In 2 or 3 dimensions."""
     real = precision.real
     module = kernel_module(f"coarse_levels_{dimension}d_{precision.name}")
-    AROUND, flat = wp.constant(3**dimension), wp.constant(dimension == 2)
-
-    @wp.func
-    def step_of(offset: int) -> wp.vec3i:
-        if flat:
-            return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
-        return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
-
-    @wp.func
-    def wrapped(c: int, n: int) -> int:
-        return (c + n) % n
-
-    @wp.func
-    def number_of(cell: wp.vec3i, shape: wp.vec3i) -> int:
-        return (wrapped(cell[2], shape[2]) * shape[1] + wrapped(cell[1], shape[1])) * shape[0] + wrapped(
-            cell[0], shape[0]
-        )
-
-    @wp.func
-    def cell_of(number: int, shape: wp.vec3i) -> wp.vec3i:
-        row = number // shape[0]
-        return wp.vec3i(number % shape[0], row % shape[1], row // shape[1])
+    AROUND, among = wp.constant(3**dimension), node_functions(dimension)
+    number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
 
     @wp.func
     def scaled(cell: wp.vec3i, factor: wp.vec3i) -> wp.vec3i:
@@ -100,7 +81,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
         first = member * fine[0] * fine[1] * fine[2]
-        here = scaled(cell_of(node - member * nodes, shape), factor)
+        here = scaled(node_of(node - member * nodes, shape), factor)
         far = scaled(step_of(offset), factor)
         total = real(0.0)
         for a in range(AROUND):
@@ -133,7 +114,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         node = wp.tid()
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
-        here, total = cell_of(node - member * nodes, shape), real(0.0)
+        here, total = node_of(node - member * nodes, shape), real(0.0)
         for offset in range(AROUND):
             there = member * nodes + number_of(here + step_of(offset), shape)
             total += A[offset, node] * (r[there] / rows[there])
@@ -147,7 +128,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
         first = member * fine[0] * fine[1] * fine[2]
-        here, total = scaled(cell_of(node - member * nodes, shape), factor), real(0.0)
+        here, total = scaled(node_of(node - member * nodes, shape), factor), real(0.0)
         for a in range(AROUND):
             part = weight_of(step_of(a), factor)
             if part > real(0.0):
@@ -174,7 +155,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         nodes = fine[0] * fine[1] * fine[2]
         member = node // nodes
         first = member * shape[0] * shape[1] * shape[2]
-        here, total = cell_of(node - member * nodes, fine), real(0.0)
+        here, total = node_of(node - member * nodes, fine), real(0.0)
         i_n, j_n, k_n = ends(here[0], factor[0]), ends(here[1], factor[1]), ends(here[2], factor[2])
         for k in range(k_n):
             for j in range(j_n):
@@ -196,7 +177,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         node = wp.tid()
         nodes = shape[0] * shape[1] * shape[2]
         member = node // nodes
-        here, total = cell_of(node - member * nodes, shape), real(0.0)
+        here, total = node_of(node - member * nodes, shape), real(0.0)
         for offset in range(AROUND):
             total += A[offset, node] * x[member * nodes + number_of(here + step_of(offset), shape)]
         z[node] = x[node] + (r[node] - total) / rows[node]

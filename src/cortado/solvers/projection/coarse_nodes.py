@@ -11,7 +11,7 @@ import warp as wp
 from cortado.device.cells import cell_grid_type
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.solvers.projection.coarse_hats import hat_functions, source_type
+from cortado.solvers.projection.coarse_hats import hat_functions, node_functions, source_type
 from cortado.sph.moment_functions import matrix_type
 
 
@@ -32,8 +32,8 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     """In 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, source, own = cell_grid_type(precision), source_type(precision), hat_functions(precision, dimension)
-    hat, number_of, cell_of_number, moved = own.hat, own.number_of, own.cell_of_number, own.moved
-    corner_step, offset_step = own.corner_step, own.offset_step
+    hat, corner_step, among = own.hat, own.corner_step, node_functions(dimension)
+    number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
     module = kernel_module(f"coarse_nodes_{dimension}d_{precision.name}")
     CORNERS, AROUND = wp.constant(2**dimension), wp.constant(3**dimension)
 
@@ -54,13 +54,13 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         node = wp.tid() - offset * A.shape[1]
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes
-        here, step = cell_of_number(node - member * nodes, grid), offset_step(offset)
+        here, step = node_of(node - member * nodes, grid.shape), step_of(offset)
         total = real(0.0)
         for corner in range(CORNERS):
             own = corner_step(corner)
             other = own + step
             if wp.min(wp.min(other[0], other[1]), other[2]) >= 0 and wp.max(wp.max(other[0], other[1]), other[2]) <= 1:
-                cell = member * nodes + number_of(moved(here, -own, grid), grid)
+                cell = member * nodes + number_of(here - own, grid.shape)
                 far = other[0] + 2 * other[1] + 4 * other[2]
                 for p in range(grid.starts[cell], grid.starts[cell + 1]):
                     i = order[p]
@@ -83,9 +83,9 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         node = wp.tid()
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes
-        here, total = cell_of_number(node - member * nodes, grid), real(0.0)
+        here, total = node_of(node - member * nodes, grid.shape), real(0.0)
         for offset in range(AROUND):
-            there = member * nodes + number_of(moved(here, offset_step(offset), grid), grid)
+            there = member * nodes + number_of(here + step_of(offset), grid.shape)
             total += A[offset, node] * p[there]
         product[node] = total
         share[node] = p[node] * total
@@ -103,9 +103,9 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         node = wp.tid()
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes
-        here, total = cell_of_number(node - member * nodes, grid), real(0.0)
+        here, total = node_of(node - member * nodes, grid.shape), real(0.0)
         for corner in range(CORNERS):
-            cell = member * nodes + number_of(moved(here, -corner_step(corner), grid), grid)
+            cell = member * nodes + number_of(here - corner_step(corner), grid.shape)
             for p in range(grid.starts[cell], grid.starts[cell + 1]):
                 i = order[p]
                 phi = hat(x[i], corner, grid)
