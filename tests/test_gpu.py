@@ -61,7 +61,6 @@ SCENES = {
     "three fluids": plane_of_three(),
     "stress": plane(forces={"gravity": [0.0, -9.81], "viscosity": "stress"}),
     "projection": splash(kind="projection"),
-    "shifting": splash(shifting=True),
     "projection in the plane": plane_of_three(solver={"kind": "projection", "time_step": 0.002}),
     "implicit, with a law": plane(
         phase=[{**HONEY, "rheology": {"kind": "bingham", "yield_stress": 5.0, "regularisation": 0.5}}],
@@ -152,7 +151,7 @@ SCENES = {
 }
 BATCHED = {
     "tolerance": splash(**TOLERANT),
-    **{name: SCENES[name] for name in ("two fluids", "plane", "shifting", "projection", "projection in the plane")},
+    **{name: SCENES[name] for name in ("two fluids", "plane", "projection", "projection in the plane")},
     **{name: SCENES[name] for name in ("solids in the plane", "solids in space", "free bodies in the plane")},
 }
 

@@ -252,7 +252,6 @@ SCENES = {
         ),
         "positions",
     ),
-    "shifting": (small("pairwise", solver={**SOLVER, "shifting": True}), "positions"),
     "implicit": (
         small("stress", phase=[THICK], fluid=[{**POOL, "phase": "paste"}], emitter=None, forces=IMPLICIT),
         "positions",

@@ -21,7 +21,6 @@ LAMINAR = {"gravity": [1.0, -9.81], "viscosity": "laminar"}
 BINGHAM = {"kind": "bingham", "yield_stress": 10.0, "regularisation": 0.5}
 CASES = {
     "one phase, iterations by tolerance": lambda: splash(minimum_iterations=2, maximum_iterations=20),
-    "shifting": lambda: splash(shifting=True),
     "no viscosity, free space": lambda: scene(
         forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "none"}, container={"shape": "none"}
     ),
@@ -138,7 +137,7 @@ def results(name) -> dict[str, bytes]:
     found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
     for label, estimator in ESTIMATORS.items():
         is_pcisph = simulation.scene.solver.kind == "pcisph"
-        if label == "frozen geometry" and not (is_pcisph and not simulation.scene.solver.shifting):  # a shift has none
+        if label == "frozen geometry" and not is_pcisph:
             continue
         is_free = any(solid.motion == "free" for solid in simulation.scene.solid)
         if label == "implicit pressure" and (is_pcisph or is_free):

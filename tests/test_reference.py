@@ -382,7 +382,6 @@ def stirred(motion, **changes):
             lambda s: reference.Simulation(stirred("free", density=500.0)),
             r"solid\[0\], which moves, but must have",
         ),
-        (lambda s: reference.Simulation(splash(shifting=True)), "solver.shifting is true, but must be left out"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),
             "must not be used with the laminar viscosity",

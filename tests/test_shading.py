@@ -464,7 +464,7 @@ def test_words_and_panels():
 
 UNUSED = (
     *(("discretisation", "jitter"), ("forces", "surface_tension_form")),
-    *(("solver", "courant"), ("solver", "greatest_time_step"), ("solver", "shifting")),
+    *(("solver", "courant"), ("solver", "greatest_time_step")),
 )
 """Keys that change nothing in a scene that does not use them."""
 

@@ -90,7 +90,6 @@ SCENES = {
     ),
     "tension": lambda: plane(ROTOR, forces={"surface_tension": 2.0}),
     "tension, pcisph": lambda: plane(ROTOR, solver=PCISPH, forces={"surface_tension": 2.0}),
-    "shifting": lambda: plane(ROTOR, solver={**PCISPH, "shifting": True}),
     "emitter": lambda: plane(
         ROTOR, emitter={"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
     ),

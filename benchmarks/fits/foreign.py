@@ -14,14 +14,12 @@ from .dissipation import viscosity_by_energy
 from .film import column_of
 
 TASK = Path(__file__).parents[2] / "examples/fit_video.toml"
-SHIFTED = ["solver.shifting=true"]
 PROJECTION = ["solver={kind='projection', time_step=0.001}"]
 SHORT = ["solver={kind='projection', time_step=0.0005}", "problem.steps=400"]
 FINER = ["discretisation.spacing=0.0025", "render.extinction=320"]
 VARIANTS = {
     "PCISPH, 4 mm, 1 ms": [],
     "PCISPH, 2.5 mm, 1 ms": FINER,
-    "PCISPH with shifting, 4 mm, 1 ms": SHIFTED,
     "projection, 4 mm, 1 ms": PROJECTION,
     "projection, 4 mm, 0.5 ms": SHORT,
     "projection, 2.5 mm, 1 ms": [*PROJECTION, *FINER],

@@ -62,9 +62,6 @@ class PcisphSolver(SolverTable):
     """Iterations end once the average of (rho - rho_0) / rho_0 is below it."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
     """The same for the maximum of (rho - rho_0) / rho_0; not asked for if left out."""
-    shifting: Flag = False
-    """Whether particles inside of the fluid are shifted to where they are fewer, as the projection shifts them; flows
-    that shear or turn for long are then nearer to the equations."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:

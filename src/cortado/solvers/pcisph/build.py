@@ -6,9 +6,7 @@ from cortado.scene.solvers import PcisphSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.makers import SolverSetting
-from cortado.solvers.pcisph.shifted import ShiftedPcisph
 from cortado.solvers.pcisph.solver import Pcisph
-from cortado.solvers.projection.constants import lattice_constants
 from cortado.solvers.solver import Solver
 
 
@@ -23,10 +21,7 @@ class PcisphMaker:
     def build(self, setting: SolverSetting) -> Solver:
         """The solver of a scene that is cut into particles, on a device."""
         limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
-        system = particle_system(setting)
-        if self._table.shifting:
-            return ShiftedPcisph(system, lattice_constants(setting.scene, setting.discrete), limits)
-        return Pcisph(system, limits)
+        return Pcisph(particle_system(setting), limits)
 
 
 maker = PcisphMaker

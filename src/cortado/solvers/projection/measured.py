@@ -3,8 +3,6 @@
 
 from functools import partial
 
-import warp as wp
-
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
@@ -23,16 +21,12 @@ class Surroundings(Density):
     ):
         super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
         self.layout = layout
-        self.around, self._n = layout.arrays(**entries(layout.precision)), self.like_density("")
+        self.around = layout.arrays(**entries(layout.precision))
         self.constants = {"least": constants.least_diagonal, "per_nearest": 1.0 / constants.nearest_weight}
         """As kernels call them."""
 
-    def like_density(self, suffix: str) -> dict[str, wp.array]:
-        """Room for n, its tangents or its adjoints, if they are not those of the step's fields."""
-        return {}
-
     def measure(self, context: StepContext) -> None:
-        context.launch(self.kernels.forward, self.around, self.constants, **self._n)
+        context.launch(self.kernels.forward, self.around, self.constants)
 
     def new_tangent(self) -> "SurroundingsTangent":
         return SurroundingsTangent(self)
@@ -49,11 +43,10 @@ class SurroundingsTangent(DensityTangent):
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
         self.around = surroundings.layout.arrays("_dot", **entries(surroundings.layout.precision))
-        self._n = surroundings.like_density("_dot")
 
     def measure(self, context: StepContext, dot: Tangents) -> None:
         own = self._density
-        context.launch(own.kernels.tangent, *dot.named, self.around, own.around, own.constants, **self._n)
+        context.launch(own.kernels.tangent, *dot.named, self.around, own.around, own.constants)
 
 
 class SurroundingsAdjoint(DensityAdjoint):
@@ -65,7 +58,6 @@ class SurroundingsAdjoint(DensityAdjoint):
         super().__init__(surroundings)
         precision = surroundings.layout.precision
         self.around = surroundings.layout.arrays("_bar", **adjoint_entries(precision))
-        self._n = surroundings.like_density("_bar")
         six = symmetric(precision).kind
         self._moments = surroundings.layout.arrays("_pull", M=six, Q=six)
 
@@ -77,5 +69,5 @@ class SurroundingsAdjoint(DensityAdjoint):
         """From the adjoints of n and of all around to those of positions, masses and solids."""
         own, known = self._density, (*bar.named, self.around, self._density.around)
         for kernel in own.kernels.adjoint:
-            context.launch(kernel, *known, self._moments, own.constants, **self._n)
+            context.launch(kernel, *known, self._moments, own.constants)
         bar.solids.add(context.launch, partial(beside_solid_kernel, own.discretisation), *known)
