@@ -178,10 +178,11 @@ def test_a_run_goes_on_bit_for_bit_and_has_the_same_bits_twice(precision):
     assert gradients_twice[0][1]["viscosity"].tobytes() == gradients_twice[1][1]["viscosity"].tobytes()
 
 
-def test_each_scene_of_a_batch_is_that_run_alone():
+@pytest.mark.parametrize("case", ["plane", "multilevel"])
+def test_each_scene_of_a_batch_is_that_run_alone(case):
     tilts = np.array([[[0.0, -9.81]], [[3.0, -9.0]], [[-2.0, -9.5]]])
-    batch = problem_of(CASES["plane"], batch=3)
-    alone = problem_of(CASES["plane"])
+    batch = problem_of(CASES[case], batch=3)
+    alone = problem_of(CASES[case])
     values, found = batch.value_and_gradient({"gravity": tilts})
     for value, gradient, tilt in zip(values, found["gravity"], tilts, strict=True):
         one, wanted = alone.value_and_gradient({"gravity": tilt[0]})

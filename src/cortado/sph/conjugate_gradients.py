@@ -23,13 +23,11 @@ class SolveKernels:
     """The kernels of conjugate gradients, which need no neighbours."""
 
     begin: Any
-    """p = z, y = 0."""
+    """p = r, y = 0."""
     start: Any
     """Of a scene: whether there is anything to do."""
     descend: Any
     """y and r after a step along p."""
-    weigh: Any
-    """w r z of each entry, where z is not r."""
     turn: Any
     """The next p."""
     decide: Any
@@ -41,22 +39,21 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
     """Of a precision, for numbers or vectors of it; ``going`` (members,) is 1 for a scene that goes on."""
     real = precision.real
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
-    product_of = _of_numbers(real, module) if kind is real else _of_vectors(kind, real, module)
+    square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
 
     @wp.kernel(module=module, enable_backward=False)
     def begin(
         w: wp.array(dtype=real),
         r: wp.array(dtype=kind),
-        z: wp.array(dtype=kind),
         # out
         p: wp.array(dtype=kind),
         y: wp.array(dtype=kind),
         share: wp.array(dtype=real),
     ):
         i = wp.tid()
-        p[i] = z[i]
+        p[i] = r[i]
         y[i] = kind(real(0.0))
-        share[i] = w[i] * product_of(r[i], z[i])
+        share[i] = w[i] * square(r[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def start(
@@ -101,18 +98,7 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         left = r[i] - step * product[i]
         y[i] = y[i] + step * p[i]
         r[i] = left
-        share[i] = w[i] * product_of(left, left)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def weigh(
-        w: wp.array(dtype=real),
-        r: wp.array(dtype=kind),
-        z: wp.array(dtype=kind),
-        # out
-        share: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        share[i] = w[i] * product_of(r[i], z[i])
+        share[i] = w[i] * square(left)
 
     @wp.kernel(module=module, enable_backward=False)
     def turn(
@@ -120,14 +106,14 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         going: wp.array(dtype=wp.int32),
         size: wp.array(dtype=real),
         total: wp.array(dtype=real),
-        z: wp.array(dtype=kind),
+        r: wp.array(dtype=kind),
         # in and out
         p: wp.array(dtype=kind),
     ):
         i = wp.tid()
         b = i // particles
         if going[b] == 1:
-            p[i] = z[i] + (total[b] / size[b]) * p[i]
+            p[i] = r[i] + (total[b] / size[b]) * p[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def decide(
@@ -150,23 +136,23 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
             going[b] = 0
             wp.atomic_sub(active, 0, 1)
 
-    return SolveKernels(begin, start, descend, weigh, turn, decide)
+    return SolveKernels(begin, start, descend, turn, decide)
 
 
-def _of_numbers(real: Any, module: Any) -> Any:
+def _square_of_numbers(real: Any, module: Any) -> Any:
     @wp.func(module=module)
-    def product_of(a: real, b: real) -> real:
-        return a * b
+    def square(a: real) -> real:
+        return a * a
 
-    return product_of
+    return square
 
 
-def _of_vectors(vector: Any, real: Any, module: Any) -> Any:
+def _square_of_vectors(vector: Any, real: Any, module: Any) -> Any:
     @wp.func(module=module)
-    def product_of(a: vector, b: vector) -> real:
-        return wp.dot(a, b)
+    def square(a: vector) -> real:
+        return wp.dot(a, a)
 
-    return product_of
+    return square
 
 
 def round_off(precision: Precision) -> float:
@@ -201,19 +187,15 @@ class ConjugateGradients:
         w: wp.array,
         r: wp.array,
         y: wp.array,
-        precondition: Callable[[], wp.array] | None = None,
     ) -> None:
         """Write to ``y`` what solves B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
         ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
-        w p B p of each particle to the ``share``. ``precondition`` returns, always in the same array, z that nearly
-        solves B z = ``r``, by a linear map that is symmetric and positive in the same product; the solve then goes on
-        until r z has fallen.
+        w p B p of each particle to the ``share``.
         """
         kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
         n = self._layout.all_particles
-        z = r if precondition is None else precondition()
-        step.launch(kernels.begin, w=w, r=r, z=z, p=self._p, y=y, share=self._share, threads=n)
+        step.launch(kernels.begin, w=w, r=r, p=self._p, y=y, share=self._share, threads=n)
         self._active.zero_()
         scene = {"size": self._size, "count": self.count, "going": self._going, "active": self._active}
         total = sum_shares(self._share)
@@ -222,11 +204,8 @@ class ConjugateGradients:
         def iterate() -> None:
             multiply(self._p, {"product": self._product, "share": self._share})
             curvature = sum_curvatures(self._share)
-            own = {"w": w, "p": self._p, "product": self._product, "r": r, "z": z, "y": y, "share": self._share}
+            own = {"w": w, "p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
             step.launch(kernels.descend, scene, own, self._sizes, curvature=curvature, threads=n)
-            if precondition is not None:
-                precondition()
-                step.launch(kernels.weigh, own, threads=n)
             total = sum_shares(self._share)
             step.launch(kernels.turn, scene, own, self._sizes, total=total, threads=n)
             step.launch(kernels.decide, scene, self._limits, total=total, first=self._first, threads=members)

@@ -30,6 +30,8 @@ class NodeFunctions:
     """Of a number."""
     step_of: Any
     """From a node to one of those around it, itself among them."""
+    offset_of: Any
+    """The number of such a step."""
 
 
 @cache
@@ -53,7 +55,13 @@ def node_functions(dimension: int) -> NodeFunctions:
             return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
         return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
 
-    return NodeFunctions(number_of, node_of, step_of)
+    @wp.func
+    def offset_of(step: wp.vec3i) -> int:
+        if flat:
+            return 3 * step[1] + step[0] + 4
+        return 9 * step[2] + 3 * step[1] + step[0] + 13
+
+    return NodeFunctions(number_of, node_of, step_of, offset_of)
 
 
 @dataclass(frozen=True)

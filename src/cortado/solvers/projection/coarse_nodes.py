@@ -1,5 +1,5 @@
-"""The kernels of the nodes of the coarse grid: the matrix A of `cortado.solvers.projection.coarse_pressure`, its
-products, and sums over the particles around a node.
+"""The kernels of the nodes of the coarse grid: the matrix A of `cortado.solvers.projection.coarse_pressure` and sums
+over the particles around a node.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,6 @@ class NodeKernels:
 
     fill: Any
     """A, for each node and each of its neighbours, itself among them."""
-    multiply: Any
-    """A p"""
     spread: Any
     """A sum over particles."""
 
@@ -49,7 +47,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         # out
         A: wp.array2d(dtype=real),
     ):
-        """With a thread for each entry (offset, node)."""
+        """With a thread for each of the first half of the offsets of each node, itself among them; A is symmetric."""
         offset = wp.tid() // A.shape[1]
         node = wp.tid() - offset * A.shape[1]
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -70,25 +68,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                     if offset == AROUND // 2:
                         total += eps / m[i]
         A[offset, node] = total
-
-    @wp.kernel(module=module, enable_backward=False)
-    def multiply(
-        grid: grid_type,
-        A: wp.array2d(dtype=real),
-        p: wp.array(dtype=real),
-        # out
-        product: wp.array(dtype=real),
-        share: wp.array(dtype=real),
-    ):
-        node = wp.tid()
-        nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
-        member = node // nodes
-        here, total = node_of(node - member * nodes, grid.shape), real(0.0)
-        for offset in range(AROUND):
-            there = member * nodes + number_of(here + step_of(offset), grid.shape)
-            total += A[offset, node] * p[there]
-        product[node] = total
-        share[node] = p[node] * total
+        A[AROUND - 1 - offset, member * nodes + number_of(here + step, grid.shape)] = total
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(
@@ -113,4 +93,4 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                 total += e[node] * of.s_own[i]
         r[node] = total
 
-    return NodeKernels(fill, multiply, spread)
+    return NodeKernels(fill, spread)
