@@ -27,10 +27,9 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import BY_HAND, ByHand
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.sph.pair_forces import laminar, pairwise
 
 ROOT = Path(cortado.__file__).parent
-ASKED: dict[str, list[Any]] = {"phases": [3], "form": [pairwise, laminar], "sticks": [False]}
+ASKED: dict[str, list[Any]] = {"phases": [3], "sticks": [False]}
 """What the factories of sums ask for beside a discretisation."""
 KINDS: dict[str, Callable[..., Any]] = {"tangent": made_tangent, "adjoint": made_adjoint}
 

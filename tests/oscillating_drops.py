@@ -71,7 +71,6 @@ class Drop:
     def __init__(
         self,
         across,
-        form="curvature",
         turned=0.0,
         ohnesorge=0.1,
         discretisation=C2,
@@ -116,7 +115,7 @@ class Drop:
                         "phase": "water",
                     }
                 ],
-                forces={"gravity": [0.0] * d, "surface_tension": 1.0, "surface_tension_form": form, **forces},
+                forces={"gravity": [0.0] * d, "surface_tension": 1.0, **forces},
                 solver={**solver, "time_step": time_step},
             ),
             precision=precision,

@@ -48,9 +48,8 @@ class Pcisph:
         self.volume, self.stiffness = volume, stiffness
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
-        self.friction = options.get("friction", 0.0)
+        self.sticks = options.get("sticks", False)
         self.reach, self.response = options["reach"], options["response"]
-        self.laplacian_correction = options.get("laplacian_correction", 1.0)
         self.stress = options.get("stress")
 
     def _pairs(self, x, y):
@@ -110,21 +109,18 @@ class Pcisph:
             return np.zeros_like(x)
         if self.viscosity_form == "stress":
             return self.stress.acceleration(x, v, self.slope(x, x), self.slope(x, self.walls), mass, viscosity)
-        kappa = 2 * (self.d + 2) if self.viscosity_form == "pairwise" else 2
         fluid = (harmonic(viscosity) / sigma[None, :])[..., None] * self.phi(x, x, v[:, None] - v[None, :], g)
         total = fluid.sum(1)
-        if self.friction:
+        if self.sticks:
             walls = self.phi(x, self.walls, np.broadcast_to(v[:, None], g_walls.shape), g_walls)
-            weights = self.friction * self.volume * viscosity[:, None, None] * self.wall_weights[None, :, None]
+            weights = self.volume * viscosity[:, None, None] * self.wall_weights[None, :, None]
             total = total + (weights * walls).sum(1)
-        return kappa / (mass * sigma)[:, None] * total
+        return 2 * (self.d + 2) / (mass * sigma)[:, None] * total
 
     def phi(self, x, y, v, g):
         s = x[:, None, :] - y[None, :, :]
         size = (s * s).sum(-1) + 0.01 * self.h**2
-        if self.viscosity_form == "pairwise":
-            return ((v * s).sum(-1) / size)[..., None] * g
-        return (self.laplacian_correction * (s * g).sum(-1) / size)[..., None] * v
+        return ((v * s).sum(-1) / size)[..., None] * g
 
 
 class SurfaceTension:

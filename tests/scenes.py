@@ -26,7 +26,10 @@ def scene(**changes: Any) -> Scene:
         "forces": {"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": True},
         "solver": {"time_step": 0.0021, "minimum_iterations": 5, "maximum_iterations": 5, "density_tolerance": 0.01},
     }
-    return Scene(**{**tables, **changes})
+    tables |= changes
+    if tables["solver"].get("kind") == "projection" and "forces" not in changes:
+        tables["forces"] = {**tables["forces"], "viscosity": "stress"}  # the only one that it has
+    return Scene(**tables)
 
 
 def plane(**changes: Any) -> Scene:

@@ -32,7 +32,8 @@ def tension(**changes: Any) -> Any:
 
 
 def curved_tension() -> Any:
-    return tension().replaced('forces.surface_tension_form="curvature"')
+    forces = {"gravity": [0.0, -9.81], "surface_tension": 0.5}
+    return scenes.plane(forces=forces, solver={"kind": "projection", "time_step": 0.0021})
 
 
 def layers() -> Any:

@@ -30,9 +30,9 @@ SPLINES = {name: {"spacing": 0.05, "support": 2.6, "kernel": name} for name in (
 RIGHT = {
     "3-D, cubic spline, splash": splash,
     "3-D, Wendland C2": lambda: scene(discretisation=SPLINES["wendland_c2"]),
-    "3-D, Wendland C4, laminar, no slip": lambda: scene(
+    "3-D, Wendland C4, pairwise, no slip": lambda: scene(
         discretisation=SPLINES["wendland_c4"],
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"},
         container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
     ),
     "3-D, without walls": lambda: scene(container={"shape": "none"}),
@@ -44,9 +44,9 @@ RIGHT = {
         discretisation=SPLINES["wendland_c2"],
         solver={"time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 30, "density_tolerance": 0.001},
     ),
-    "2-D, periodic, laminar": lambda: plane(
+    "2-D, periodic, pairwise": lambda: plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+        forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
     ),
     "2-D, three fluids that mix": plane_of_three,
     "2-D, nozzle": jet,

@@ -127,11 +127,13 @@ def test_a_folder_of_headers_that_is_gone_is_replaced_in_silence():
     headers._folder.cleanup()
 
 
-TENSION = {"gravity": [0.0, -9.81], "viscosity": "laminar", "surface_tension": 0.01}
+TENSION = {"gravity": [0.0, -9.81], "viscosity": "pairwise", "surface_tension": 0.01}
 SCENES = {
     "one phase": plane(),
-    "laminar, surface tension": plane(forces=TENSION),
-    "surface tension by curvature": plane(forces={**TENSION, "surface_tension_form": "curvature"}),
+    "pairwise, surface tension": plane(forces=TENSION),
+    "surface tension by curvature": plane(
+        forces={**TENSION, "viscosity": "stress"}, solver={"kind": "projection", "time_step": 0.0021}
+    ),
     "no pressure": plane(forces={"gravity": [0.0, -9.81], "pressure": False}),
     "two phases, an emitter": pour(),
 }

@@ -34,7 +34,7 @@ MAKERS = {
     "2-D": plane,
     "periodic": lambda: plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+        forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
     ),
     "three phases": plane_of_three,
     "drops": lambda: plane(fluid=DROPS),

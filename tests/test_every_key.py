@@ -99,7 +99,7 @@ BASES = {
     "chosen": lambda: jet(
         phase=[{**WATER, "rheology": {"kind": "power_law", "flow_index": 0.6, "least_shear_rate": 0.1}}],
         solver={"time_step": "auto", "courant": 0.02},
-        forces={"surface_tension": 0.07, "surface_tension_form": "pairwise"},
+        forces={"surface_tension": 0.07},
     ),
     "mixture": lambda: plane_of_three(
         render={"resolution": [16, 16], "background": [0.5, 0.6, 0.7], "extinction": 5.0},

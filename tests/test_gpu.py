@@ -70,7 +70,8 @@ SCENES = {
     "surface tension by curvature": plane(
         phase=[HONEY],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
-        forces={"gravity": [0.0, -9.81], "surface_tension": 3.0, "surface_tension_form": "curvature"},
+        forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
+        solver={"kind": "projection", "time_step": 0.002},
     ),
     "solids in the plane": plane(
         solid=[

@@ -76,9 +76,9 @@ def test_splash(what, steps, iterations):
 SHAPES = {
     "cubic spline": splash(),
     "wendland_c2": scene(discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}),
-    "wendland_c4, laminar, no slip": scene(
+    "wendland_c4, no slip": scene(
         discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"},
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"},
         container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
     ),
     "plane": plane(),

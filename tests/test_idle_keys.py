@@ -29,7 +29,6 @@ REFUSED = {
     "mixture.free_energy": lambda: two_layers(mixture={"free_energy": "miscible"}),
     "mixture.mobility_form": lambda: two_layers(mixture={"mobility_form": "constant"}),
     "forces.viscous_solve": lambda: plane(forces={"viscosity": "pairwise", "viscous_solve": "implicit"}),
-    "forces.surface_tension_form": lambda: plane(forces={"surface_tension_form": "pairwise"}),
     "container.slip": lambda: plane(container={**ROOM, "periodic": [True, True], "slip": "no"}),
     "container.colour": lambda: plane(container={**ROOM, "periodic": [True, True], "colour": [0.1, 0.2, 0.3]}),
     "container.material": lambda: plane(container={**ROOM, "material": "steel", "colour": [0.1, 0.2, 0.3]}),
@@ -50,9 +49,6 @@ WARNED = {
     "container.slip": lambda: plane(container={**ROOM, "slip": "no"}, forces={"viscosity": "none"}),
     "solver.iterations": lambda: plane(
         solver={"kind": "projection", "time_step": 1e-3, "iterations": 5}, forces={"pressure": False}
-    ),
-    "forces.surface_tension_form": lambda: plane(
-        forces={"gravity": [0.0, -9.81], "surface_tension": 0.0, "surface_tension_form": "pairwise"}
     ),
     "emitter.length": lambda: jet(emitter={**jet().emitter.model_dump(), "length": 1.0, "duration": 0.05}),
     "solid[0].centre": lambda: plane(

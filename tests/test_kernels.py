@@ -40,7 +40,6 @@ from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.gravity import gravity_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.materials import mixture_kernels
-from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from cortado.sph.viscosity_law import newtonian_law
@@ -66,10 +65,8 @@ class Kernels:
     integration = integration_kernels(FLOAT64, False)
     begin_adjoint = begin_adjoint_kernel(DISCRETISATION)
     gravity = gravity_kernels(FLOAT64, False)
-    pairwise_no_slip = viscosity_kernels(DISCRETISATION, pairwise, True)
-    pairwise = viscosity_kernels(DISCRETISATION, pairwise, False)
-    laminar_no_slip = viscosity_kernels(DISCRETISATION, laminar, True)
-    laminar = viscosity_kernels(DISCRETISATION, laminar, False)
+    pairwise_no_slip = viscosity_kernels(DISCRETISATION, True)
+    pairwise = viscosity_kernels(DISCRETISATION, False)
     mixture = mixture_kernels(FLOAT64, 3, False)
     diffusion = MappingProxyType(
         {
@@ -305,12 +302,11 @@ class Viscosity(Operation):
     inputs, outputs = ("x", "v", "n", "m", "mu", "acceleration_in"), ("acceleration",)
     passed = ("acceleration_in",)
     kernels: Any = None
-    friction = 0.0
 
     def __init__(self, cloud):
         super().__init__(cloud)
         self.start["acceleration_in"] = self.start.pop("acceleration")
-        self.given = {"s": self.s, "kappa": 10.0, "friction": self.friction}
+        self.given = {"s": self.s, "kappa": 10.0}
 
     def forward(self, values):
         return launch(self.kernels.forward, **self.given, **values, acceleration=np.zeros((N, 3)))
@@ -331,7 +327,7 @@ class Pairwise(Viscosity):
 
 
 class PairwiseWithFriction(Viscosity):
-    kernels, friction = Kernels.pairwise_no_slip, 0.7
+    kernels = Kernels.pairwise_no_slip
 
 
 class WithoutViscosity(Pairwise):
@@ -345,14 +341,6 @@ class WithoutViscosity(Pairwise):
 
     def tangent(self, values, dots):
         return super().tangent(values, {**dots, "mu": np.zeros(N)})
-
-
-class Laminar(Viscosity):
-    kernels = Kernels.laminar
-
-
-class LaminarWithFriction(Viscosity):
-    kernels, friction = Kernels.laminar_no_slip, 0.7
 
 
 class Stress(Viscosity):
@@ -710,8 +698,6 @@ ADJOINT = [
     DensityRatio,
     Pairwise,
     PairwiseWithFriction,
-    Laminar,
-    LaminarWithFriction,
     Stress,
     StressWithoutSlip,
     GravityTable,

@@ -27,7 +27,6 @@ from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
-from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
@@ -81,8 +80,7 @@ def kernels_of(discretisation):
         pressure_kernels(discretisation),
         pressure_force_kernels(discretisation),
         wall_kernels(discretisation),
-        viscosity_kernels(discretisation, pairwise, True),
-        viscosity_kernels(discretisation, laminar, True),
+        viscosity_kernels(discretisation, True),
         *stress_kernels(discretisation, 3, newtonian_law(), True),
         density_ratio_kernels(discretisation),
         normal_kernels(discretisation),

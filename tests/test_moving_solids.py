@@ -190,10 +190,10 @@ def test_a_belt_moves_fluid_and_stays():
         (lambda: plane(ROTOR, solver=CONVERGED), ImplicitPressure()),
         (lambda: plane(ROTOR, solver={"kind": "pcisph", "time_step": 0.001}), None),
         (lambda: plane(ROTOR, forces={"viscous_solve": "implicit"}), None),
-        (lambda: plane(ROTOR, forces={"viscosity": "laminar"}, solver={"time_step": 0.001}), None),
+        (lambda: plane(ROTOR, forces={"viscosity": "pairwise"}, solver={"kind": "pcisph", "time_step": 0.001}), None),
         (space, None),
     ],
-    ids=["projection", "fixed point", "pcisph", "implicit", "laminar", "space"],
+    ids=["projection", "fixed point", "pcisph", "implicit", "pairwise", "space"],
 )
 def test_derivatives_beside_solids_that_move(made, estimator):
     """Reverse and forward mode to round-off, and differences: of the first state, gravity and viscosity."""

@@ -197,14 +197,14 @@ VOLUME = scene(
 """12 particles that one can look into: samples of a ray are dense and thin ones."""
 
 SCENES = {
-    "laminar, double well": (small("laminar", mixture=MIXING), "everything"),
+    "pairwise, double well": (small("pairwise", mixture=MIXING), "everything"),
     "pairwise, miscible": (
         small("pairwise", mixture={**MIXING, "free_energy": "miscible", "mobility_form": "constant"}),
         "everything",
     ),
     "stress": (small("stress"), "everything"),
-    "projection": (small("pairwise", solver=PROJECTION), "everything"),
-    "velocities that follow": (small("pairwise", solver={**PROJECTION, "velocities_follow": True}), "positions"),
+    "projection": (small("stress", solver=PROJECTION), "everything"),
+    "velocities that follow": (small("stress", solver={**PROJECTION, "velocities_follow": True}), "positions"),
     "projection in the open": (
         plane(
             discretisation={"spacing": 0.05, "support": 2.6},  # second rows are neither full nor at the surface
@@ -215,7 +215,7 @@ SCENES = {
     ),
     "a solid that moves": (
         small(
-            "pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None, solver=PROJECTION, solid=[BALL]
+            "stress", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None, solver=PROJECTION, solid=[BALL]
         ),
         "positions",
     ),
@@ -272,8 +272,8 @@ SCENES = {
         plane(
             discretisation={"spacing": 0.05, "support": 2.0},  # second rows are a part of the surface, not wholly
             fluid=[{"shape": "box", "lower": [0.2, 0.25], "upper": [0.55, 0.6], "phase": "water"}],
-            forces={"gravity": [0.0, 0.0], "surface_tension": 100.0, "surface_tension_form": "curvature"},
-            solver=SOLVER,
+            forces={"gravity": [0.0, 0.0], "surface_tension": 100.0},
+            solver=PROJECTION,
         ),
         "positions",
     ),

@@ -21,12 +21,9 @@ SCENES = {
     "splash": splash(),
     "tolerance": splash(minimum_iterations=2, maximum_iterations=40, density_tolerance=0.001),
     "wendland_c2": scene(discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}),
-    "laminar, no slip": scene(
-        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"},
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
-        container=WALLS,
+    "pairwise, no slip": scene(
+        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"}, container=WALLS
     ),
-    "pairwise, no slip": scene(container=WALLS),
     "stress, no slip": scene(
         discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"},
         forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"},
@@ -44,7 +41,7 @@ SCENES = {
     "plane": plane(forces=PAIRWISE),
     "periodic": plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
-        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+        forces={"gravity": [1.0, -9.81], "viscosity": "pairwise"},
     ),
     "free space": scene(container={"shape": "none"}),
     "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}),
@@ -293,7 +290,7 @@ def test_printed_equations_against_numpy(method):
 def test_same_bits_with_any_number_of_threads(precision):
     found = []
     for threads in (1, 2, 5):
-        simulation = reference.Simulation(SCENES["laminar, no slip"], precision, threads)
+        simulation = reference.Simulation(SCENES["pairwise, no slip"], precision, threads)
         point, directions = point_and_direction(simulation, 30)
         tangent = simulation.tangent(point, directions, 30)
         gradient = simulation.gradient(point, 30, reference.FinalPositions(target_of(simulation)))
@@ -383,8 +380,8 @@ def stirred(motion, **changes):
             r"solid\[0\], which moves, but must have",
         ),
         (
-            lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),
-            "must not be used with the laminar viscosity",
+            lambda s: reference.Simulation(SCENES["stress, no slip"]).tangent({}, {}, 5, method="as_printed"),
+            "must not be used with the stress viscosity",
         ),
         (
             lambda s: reference.Simulation(SCENES["stress, periodic"]).tangent({}, {}, 5, method="as_printed"),

@@ -21,11 +21,11 @@ NO_SLIP = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no
 SCENES = {
     "plane": plane(solver=SOLVER),
     "space": scene(solver=SOLVER),
-    "periodic, laminar": plane(
+    "periodic": plane(
         solver=SOLVER,
         container=PERIODIC,
         discretisation=C2,
-        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+        forces={"gravity": [1.0, -9.81]},
     ),
     "stress, no slip": plane(solver=SOLVER, container=NO_SLIP, discretisation=C2),
     "wendland_c4": plane(solver={**SOLVER, "iterations": 7, "repairs": 1}, discretisation=C4),
@@ -213,7 +213,7 @@ def test_same_bits_with_any_number_of_threads(name):
 
 
 def test_without_pressure_nothing_is_projected():
-    forces = {"gravity": [0.0, -9.81], "viscosity": "pairwise", "pressure": False}
+    forces = {"gravity": [0.0, -9.81], "pressure": False}
     solvers = {"time_step": 0.002}, SOLVER
     one, other = (reference.Simulation(plane(forces=forces, solver=solver)) for solver in solvers)
     wanted, found = (simulation.run(10, thrown(simulation)) for simulation in (one, other))

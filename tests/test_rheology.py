@@ -140,8 +140,8 @@ def test_where_there_can_be_no_law_it_is_a_sentence():
     law = {"kind": "bingham", "yield_stress": 1.0}
     with pytest.raises(SceneError, match="several phases"):
         thick(phase=[{**HONEY, "rheology": law}, {**HONEY, "name": "syrup"}])
-    with pytest.raises(SceneError, match="viscosity is 'laminar', but must be \"stress\""):
-        thick(law, forces={"gravity": [0.0, -9.81], "viscosity": "laminar"})
+    with pytest.raises(SceneError, match="viscosity is 'none', but must be \"stress\""):
+        thick(law, forces={"gravity": [0.0, -9.81], "viscosity": "none"})
     made = thick(forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"})
     with pytest.raises(InputError, match="viscosity is 'pairwise', but must be 'stress'"):
         Simulation(made, forces=[Rheology(cross, time=1.0, index=1.0)])

@@ -65,7 +65,7 @@ def test_the_command_line_says_the_same(compiled, tmp_path):
     """A kernel of another viscosity is among those that it needs, at first."""
     folder, _ = compiled
     scene = "docs/figures/dam_break_plane.toml"
-    options = ["--set", "forces.viscosity=laminar", "--steps", "2", "--no-pictures", "--overwrite"]
+    options = ["--set", "forces.viscosity=stress", "--steps", "2", "--no-pictures", "--overwrite"]
     program = UNOPTIMISED + "import runpy; runpy.run_module('cortado', run_name='__main__')"
     command = [sys.executable, "-c", program, "run", scene, "--out", str(tmp_path), *options]
     errors = []

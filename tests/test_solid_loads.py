@@ -22,7 +22,7 @@ KINDS = {
     "projection, implicit": {"solver": PROJECTION, "forces": {"viscous_solve": "implicit"}},
     "projection, frictionless": {"solver": PROJECTION, "forces": {"viscosity": "none"}},
     "pcisph": {"solver": PCISPH},
-    "pcisph, laminar": {"solver": PCISPH, "forces": {"viscosity": "laminar"}},
+    "pcisph, pairwise": {"solver": PCISPH, "forces": {"viscosity": "pairwise"}},
 }
 
 
@@ -51,7 +51,7 @@ def test_solids_get_the_momentum_that_the_fluid_loses(kind):
     for name, load in loads.items():
         x, y = np.transpose(places[name])
         torque = torque + load[:, 2] + x * load[:, 1] - y * load[:, 0]
-    if kind in ("projection, frictionless", "pcisph, laminar"):
+    if kind in ("projection, frictionless", "pcisph, pairwise"):
         np.testing.assert_allclose(torque, run.sensors["walls"]["torque"][:-1], atol=atol)
     if kind == "pcisph":
         pushes = scene.forces.gravity - np.diff(run.velocities, axis=0) / scene.solver.time_step
@@ -87,7 +87,7 @@ class Loads(Weighted):
 SEEN = {
     "projection": lambda: plane(ROTOR, POST, **KINDS["projection, implicit"]),
     "pcisph": lambda: plane(ROTOR, POST, solver=PCISPH),
-    "laminar": SCENES["laminar"],
+    "pairwise": SCENES["pairwise"],
     "periodic": SCENES["periodic"],
     "space": space,
     "paste": lambda: pasty(PROJECTION),

@@ -73,7 +73,7 @@ SCENES = {
     "paste": lambda: pasty({"kind": "projection", "time_step": 0.001}),
     "paste, implicit": lambda: pasty({"kind": "projection", "time_step": 0.001}, viscous_solve="implicit"),
     "paste, implicit, pcisph": lambda: pasty(PCISPH, viscous_solve="implicit"),
-    "laminar": lambda: plane(ROTOR, solver=PCISPH, forces={"viscosity": "laminar"}),
+    "pairwise": lambda: plane(ROTOR, solver=PCISPH, forces={"viscosity": "pairwise"}),
     "two phases": lambda: plane(
         ROTOR, phase=[WATER, OIL], fluid=[body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))]
     ),

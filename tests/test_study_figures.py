@@ -195,10 +195,10 @@ def test_a_bad_experiment_is_refused_in_a_sentence(tmp_path, monkeypatch, gradie
 
 
 def test_a_scene_is_changed_in_the_file(tmp_path):
-    scene = f'{{ file = "{EXPERIMENTS}/scenes/splash.toml", phase.viscosity = 0.5, forces.viscosity = "laminar" }} #'
+    scene = f'{{ file = "{EXPERIMENTS}/scenes/splash.toml", phase.viscosity = 0.5, forces.viscosity = "stress" }} #'
     (tmp_path / "changed.toml").write_text(GOOD.replace("scene = ", f"scene = {scene}", 1))
     settings = load_experiment(tmp_path / "changed.toml", overrides=["steps=99"]).settings
-    assert (settings.scene.phase[0].viscosity, settings.scene.forces.viscosity) == (0.5, "laminar")
+    assert (settings.scene.phase[0].viscosity, settings.scene.forces.viscosity) == (0.5, "stress")
     assert (settings.scene.solver.time_step, settings.steps) == (0.0021, 99)
 
 

@@ -216,7 +216,7 @@ def rayleigh_taylor(
                 "upper": [1.0, depth + spacing],
                 "periodic": [True, False],
             },
-            forces={"gravity": [0.0, -GRAVITY], "viscosity": "laminar"},
+            forces={"gravity": [0.0, -GRAVITY]},
             solver={"time_step": time_step, "maximum_iterations": 50, "density_tolerance": 0.001, **solver},
         )
     )

@@ -68,10 +68,6 @@ def test_without_tension_or_without_the_depth_of_the_curvature_it_does_not(monke
     assert Drop(24, turned=45.0, discretisation=C4, periods=1.5).fit()[0] > 1.06
 
 
-def test_a_drop_of_pairs_is_further_off():
-    assert abs(Drop(24, form="pairwise", discretisation=C4, step=0.08).fit()[0] - 1.0) > 0.1
-
-
 def test_how_far_the_drop_drifts():
     """The force keeps momentum but nearly: of a drop whose particles are stirred."""
     made = Drop(24, turned=20.0, jitter=0.1, discretisation=C4)

@@ -1,6 +1,6 @@
 """The viscosity of a fluid is the one that was asked for: flows of closed forms, for the default form of the force.
 
-Waves, plates and layers at a ratio of 5 break their bounds with the form "pairwise", and what turns with "laminar":
+Waves, plates and layers at a ratio of 5 break their bounds with the form "pairwise":
 `validation/README.md` has the figures.
 """
 

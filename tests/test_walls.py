@@ -96,7 +96,6 @@ def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
     assert all(0.0 < weight < 500.0 for weight in layers.weights) and list(layers.depths) == sorted(layers.depths)
     assert layers.depths[0] == pytest.approx(SHALLOW * SPACING) or second <= 1e-6
     assert 0.5 * SPACING < layers.depths[-1] < (support - 0.5) * SPACING
-    assert 1.0 < layers.friction < 2.5
 
 
 # ---- containers --------------------------------------------------------------------------------------------------

@@ -29,10 +29,9 @@ def twin(simulation):
         lattice.stiffness,
         *walls,
         viscosity=simulation.scene.forces.viscosity,
-        friction=viscous[0].friction if viscous else 0.0,
+        sticks=bool(viscous) and viscous[0].sticks,
         reach=1.03 * lattice.support,
         response=lattice.response,
-        laplacian_correction=lattice.laplacian_correction,
         stress=stress_twin(simulation, *walls),
     )
 

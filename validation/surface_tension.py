@@ -50,10 +50,7 @@ def main() -> None:
     row("24 across, C4, stirred", across=24, turned=20.0, jitter=0.1, discretisation=C4)
     for support in (2.0, 2.6):
         row(f"24 across, cubic, {support:g}", across=24, discretisation={**CUBIC, "support": support})
-    row("24 across, C4, pairwise", across=24, discretisation=C4, form="pairwise", step=0.08)
-    for form, discretisation in (("pairwise", CUBIC), ("curvature", CUBIC), ("curvature", C4)):
-        name = f"24 across, {discretisation['kernel']}, {form}, PCISPH"
-        row(name, across=24, form=form, discretisation=discretisation, solver=PCISPH, step=0.08)
+    row("24 across, cubic, PCISPH", across=24, discretisation=CUBIC, solver=PCISPH, step=0.08)
     for ohnesorge in (0.05, 0.03, 0.02, 0.01):
         row(
             f"24 across, C4, turned by 20, Oh {ohnesorge:g}",

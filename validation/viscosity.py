@@ -18,7 +18,7 @@ from cortado.errors import CortadoWarning
 from viscous_flows import Channel, turning
 from viscous_layers import by_engine, by_hand, exact, profile, two_layers
 
-FORMS = {"stress": "C0", "laminar": "C1", "pairwise": "C3"}
+FORMS = {"stress": "C0", "pairwise": "C3"}
 
 
 def waves(folder: Path) -> None:
@@ -42,7 +42,7 @@ def bodies(folder: Path) -> None:
     """Angular momentum of a disc and a ball over time."""
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", sharey=True)
     for axis, dimension, across in (axes[0], 2, 24), (axes[1], 3, 10):
-        for (form, colour), style in zip(FORMS.items(), ("-", "-", "--"), strict=True):
+        for (form, colour), style in zip(FORMS.items(), ("-", "--"), strict=True):
             axis.plot(np.linspace(0.0, 2.0, 11), turning(dimension, across, form), colour + style, label=form)
         axis.set(xlabel="t [s]", title=("a disc", "a ball")[dimension - 2] + " that turns alone")
     axes[0].set_ylabel("angular momentum over the first")

@@ -72,7 +72,7 @@ class StirMilk(Task):
             phase=[{**one, "viscosity": VISCOSITY} for one in (COFFEE, {**MILK, "rest_density": 1000.0})],
             fluid=[box("coffee", -half, -band), box("milk", -band, band), box("coffee", band, half)],
             solid=[{**stick, "motion": "path", "velocity": [0.0, 0.0]}],
-            forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"},
+            forces={"gravity": [0.0, 0.0]},
             solver={"kind": "projection", "time_step": self.time_step},
             render={"view": "plane", "resolution": [2 * self.cells, 2 * self.cells]},
         )

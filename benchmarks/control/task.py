@@ -125,11 +125,12 @@ class NoLoss:
 def scene_of(name: str, spacing: float, time_step: float, container: Mapping[str, Any], **tables: Any) -> Scene:
     """A scene with what all tasks have in common, but for these tables; lengths in m, times in s."""
     dimension = len(container["lower" if "lower" in container else "base"])
+    form = {} if "solver" in tables else {"viscosity": "pairwise"}  # the report's, which PCISPH alone has
     common: dict[str, Any] = {
         "discretisation": {"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
         "container": container,
-        "forces": {"gravity": [0.0, -GRAVITY, 0.0][:dimension], "viscosity": "pairwise"},
-        "solver": {"time_step": time_step, "minimum_iterations": 4, "maximum_iterations": 4},
+        "forces": {"gravity": [0.0, -GRAVITY, 0.0][:dimension], **form},
+        "solver": {"kind": "pcisph", "time_step": time_step, "minimum_iterations": 4, "maximum_iterations": 4},
     }
     return Scene(name=name, dimension=dimension, **{**common, **tables})
 

@@ -22,7 +22,7 @@ def dam(spacing: float, counts: tuple[int, ...], **tables: Any) -> dict[str, Any
         "fluid": [{"shape": "box", "lower": [0.0] * len(counts), "upper": [width, height, *depth], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0] * len(counts), "upper": [2.0 * width, 2.0 * height, *depth]},
         "forces": {"gravity": [0.0, -9.81, *[0.0 for _ in depth]], "viscosity": "pairwise"},
-        "solver": {"time_step": 0.04 * spacing, "minimum_iterations": 4, "maximum_iterations": 4},
+        "solver": {"kind": "pcisph", "time_step": 0.04 * spacing, "minimum_iterations": 4, "maximum_iterations": 4},
         **tables,
     }
 
@@ -33,8 +33,10 @@ def with_kernel(name: str, support: float) -> dict[str, Any]:
 
 
 def projected(tables: dict[str, Any], **solver: Any) -> dict[str, Any]:
-    """The same scene by the projection, whose own kernel it has where it names none."""
-    return {**tables, "solver": {"kind": "projection", "time_step": tables["solver"]["time_step"], **solver}}
+    """The same scene by the projection, whose own viscosity it has, and whose own kernel where it names none."""
+    forces = {**tables["forces"], "viscosity": "stress"}
+    own = {"kind": "projection", "time_step": tables["solver"]["time_step"], **solver}
+    return {**tables, "forces": forces, "solver": own}
 
 
 def two_fluids(spacing: float, counts: tuple[int, ...]) -> dict[str, Any]:

@@ -275,7 +275,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Forces: `[forces]`",
         "",
-        (("Forces", "", '[forces]\ngravity = [0.0, -1.62, 0.0]\nviscosity = "laminar"\nsurface_tension = 0.07'),),
+        (("Forces", "", '[forces]\ngravity = [0.0, -1.62, 0.0]\nviscosity = "none"\nsurface_tension = 0.07'),),
     ),
     (
         "## Changes over time: `[schedule]`",

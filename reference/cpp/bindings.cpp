@@ -89,7 +89,6 @@ NB_MODULE(_engine, m) {
         .def_rw("volume", &Scene::volume)
         .def_rw("stiffness", &Scene::stiffness)
         .def_rw("response", &Scene::response)
-        .def_rw("laplacian_correction", &Scene::laplacian_correction)
         .def_rw("wall_positions", &Scene::wall_positions)
         .def_rw("wall_weights", &Scene::wall_weights)
         .def_rw("wall_feet", &Scene::wall_feet)

@@ -57,7 +57,6 @@ def check_scene(scene: Scene) -> None:
 def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
     """What the extension module is told of a scene and of its particles."""
     lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
-    no_slip = scene.sticks
     spacing = scene.discretisation.spacing
     values = {
         "dimension": scene.dimension,
@@ -68,7 +67,6 @@ def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "volume": lattice.volume,
         "stiffness": lattice.stiffness,
         "response": lattice.response,
-        "laplacian_correction": lattice.laplacian_correction,
         "wall_positions": discrete.walls.positions.ravel().tolist(),
         "wall_weights": discrete.walls.weights.tolist(),
         "wall_feet": discrete.walls.feet.ravel().tolist(),
@@ -76,7 +74,7 @@ def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "rest_density": scene.phase[0].rest_density,
         "time_step": solver.time_step,
         "viscosity": form,
-        "friction": (discrete.wall_layers.friction if form == "laminar" else 1.0) if no_slip else 0.0,
+        "friction": 1.0 if scene.sticks else 0.0,
         "control": stress_control(discrete.kernel, spacing, lattice.support, scene.dimension),
         "closest": CLOSEST * spacing,
         "pressure": scene.forces.pressure,

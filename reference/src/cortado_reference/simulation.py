@@ -127,9 +127,9 @@ class Simulation:
         form = self.scene.forces.viscosity
         if method.startswith("as_printed") and isinstance(self.scene.solver, ProjectionSolver):
             raise InputError("method is as printed, which must not be used with the projection: it is of PCISPH.")
-        if method.startswith("as_printed") and form in ("laminar", "stress"):
+        if method.startswith("as_printed") and form == "stress":
             raise InputError(
-                f"method is as printed, which must not be used with the {form} viscosity: (14) is pairwise."
+                "method is as printed, which must not be used with the stress viscosity: (14) is pairwise."
             )
         if method.startswith("as_printed") and "viscosity" in directions:
             raise InputError("directions has viscosity, but must not as printed: (14) has no such derivative.")

@@ -69,7 +69,7 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
-    """F = x . G / (|x|^2 + 0.01 h^2) of the laminar viscosity at separations (m, d) [m], (m,)."""
+    """F = x . G / (|x|^2 + 0.01 h^2) of diffusion at separations (m, d) [m], (m,)."""
     squares = (separations**2).sum(axis=1)
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 

@@ -89,6 +89,9 @@ def _check_phases(scene: SceneTables) -> None:
     if scene.phase[0].rheology is not None and scene.forces.viscosity != "stress":
         found = scene.forces.viscosity
         raise field_error(("forces", "viscosity"), found, '"stress", as the phase has a rheology')
+    if scene.forces.viscosity == "pairwise" and scene.solver.kind != "pcisph":
+        wanted = '"stress" or "none", as the solver is not "pcisph"'
+        raise field_error(("forces", "viscosity"), "pairwise", wanted)
     if len(names) == 1 and scene.mixture != MixtureTable():
         raise field_error(("mixture",), Words("given"), "left out, as the scene has only one phase")
 

@@ -57,8 +57,6 @@ def _idle(scene: SceneTables) -> Iterator[Idle]:
         yield ("mixture",), mixture, OF_DIFFUSION, "there is no mobility, without which nothing diffuses"
     if forces.viscosity != "stress":
         yield ("forces",), forces, ("viscous_solve",), f'viscosity is "{forces.viscosity}", and not "stress"'
-    if forces.surface_tension is None:
-        yield ("forces",), forces, ("surface_tension_form",), "there is no surface_tension"
     if np.all(getattr(scene.container, "periodic", False)):
         names = ("slip", "material", "colour")
         yield ("container",), scene.container, names, "it has no walls where all axes are periodic"
@@ -89,8 +87,6 @@ def _idle_in_picture(picture: Picture, dimension: int) -> Iterator[Idle]:
 def _turned_off(scene: SceneTables) -> Iterator[Idle]:
     forces, mixture = scene.forces, scene.mixture
     thick = any(phase.viscosity > 0.0 or phase.rheology for phase in scene.phase)
-    if forces.surface_tension == 0.0:
-        yield ("forces",), forces, ("surface_tension_form",), "surface_tension is 0"
     if mixture.mobility == 0.0:
         yield ("mixture",), mixture, OF_DIFFUSION, "mobility is 0 and nothing diffuses"
     if forces.viscosity == "none" or not thick:

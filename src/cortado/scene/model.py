@@ -78,23 +78,17 @@ class FixedForces(Table):
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
     """(d,) Acceleration that acts on all fluid [m/s2]; with schedule.gravity, the first row there, if given."""
-    viscosity: Literal["stress", "pairwise", "laminar", "none"] = "stress"
+    viscosity: Literal["stress", "pairwise", "none"] = "stress"
     """Form of the viscous force. "stress": a stress that has the asked viscosity within 1 %, with 40 particles across a
-    wave of shear, in every direction, and makes no force where fluid turns as a whole. For comparison, "pairwise":
-    Monaghan's (2005), whose fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear, and flows
-    1.6 to 1.9 times as fast between plates as it should; "laminar": that of Morris et al. (1997), whose fluid is 0.8 to
-    1 times as viscous as asked for and is braked where it turns as a whole."""
+    wave of shear, in every direction, and makes no force where fluid turns as a whole. "pairwise", with the
+    solver "pcisph" alone: Monaghan's (2005), whose fluid is 0.6 to 1.4 times as viscous as asked for, by the direction
+    of the shear, and flows 1.6 to 1.9 times as fast between plates as it should."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
     """When the viscous stress acts. "explicit": as velocities are at the start of a step, which limits the time step;
     "implicit": as they are at its end, for any time step, which takes a system of equations; "automatic": implicit
     where the time step is too long for the other."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
-    surface_tension_form: Literal["automatic", "curvature", "pairwise"] = "automatic"
-    """Form of surface tension, if there is any. "curvature": normals and a curvature of the surface, for the solver
-    "projection" and a support of at least 2.5: drops oscillate with a frequency that is right within 2 %, with 48
-    particles across; "pairwise": a stress of pairs, which keeps momentum, for PCISPH; "automatic": by curvature in a
-    projection with such a support, and of pairs otherwise."""
 
 
 _OPTIONAL: dict[str, Any] = {

@@ -102,13 +102,11 @@ class Scene(SceneTables):
 
     def computed_json(self) -> str:
         """What results depend on: not [picture], [[sensor]] and materials, nor an empty [[force]] or [[solid]], a
-        jitter of 0, the form of a surface tension that is not there, how a time step is chosen that is fixed, and
-        options of the projection that are off."""
+        jitter of 0, how a time step is chosen that is fixed, and options of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid") if not getattr(self, name)}
         jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
         aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
-        aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = {name for name in ("velocities_follow", "multilevel") if not getattr(self.solver, name, True)}
         aside["solver"] = unused | off

@@ -5,7 +5,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-from cortado.discretise.calibration import laplacian_rate, pairwise_rate, stress_rate
+from cortado.discretise.calibration import pairwise_rate, stress_rate
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.scene.model import SceneTables
@@ -17,7 +17,7 @@ from cortado.scene.rheology import greatest_viscosity
 from cortado.scene.room import solids_of
 from cortado.scene.solids import SolidTable
 
-VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
+VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
 step is taken. The rest is for fluid off the lattice and beside walls: with drops, jets that meet and dams, in the plane
 and in space, with every kernel, those steps held, and one a quarter to a half longer did not."""
@@ -105,7 +105,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
-    spline, and 0.043 of the laminar one.
+    spline.
 
     Depth: C s^(3/2) / (H sqrt(|g|)) of fluid that is H deep, see `DEPTH_FACTORS`, with the spacing s; it grows in
     proportion to the support. In a container that leans, H is the depth in the lowest corner once the surface is level:

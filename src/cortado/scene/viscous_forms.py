@@ -1,12 +1,9 @@
-"""What is said of the forms of the viscous force whose fluid is not as viscous as asked for."""
+"""What is said of the pairwise viscous force, whose fluid is not as viscous as asked for."""
 
 from cortado.scene.model import SceneTables
 
-FAULTS = {
-    "pairwise": "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear",
-    "laminar": "with which fluid is 0.8 to 1 times as viscous as asked for, and is braked where it turns as a whole",
-}
-"""By the form, as measured in waves of shear (`docs/discretisation.md`)."""
+FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
+"""As measured in waves of shear (`docs/discretisation.md`)."""
 
 
 def wall_sentence(scene: SceneTables) -> str | None:
@@ -20,7 +17,6 @@ def parameter_sentence(scene: SceneTables) -> str | None:
 
 
 def _sentence(scene: SceneTables, where: str) -> str | None:
-    form = scene.forces.viscosity
-    if form not in FAULTS:
+    if scene.forces.viscosity != "pairwise":
         return None
-    return f'{where} and forces.viscosity is "{form}", {FAULTS[form]}: viscosity = "stress" has it within 1 %.'
+    return f'{where} and forces.viscosity is "pairwise", {FAULT}: viscosity = "stress" has it within 1 %.'

@@ -1,10 +1,6 @@
-"""Forms of the viscous force phi(x, v) between a pair, as functions of Warp.
+"""The viscous force of a pair, phi(x, v) = B G with B = v . x / (|x|^2 + 0.01 h^2) (Monaghan 2005), as functions of
+Warp."""
 
-pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2)     (Monaghan 2005)
-laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2)     (Morris, Fox and Zhu 1997)
-"""
-
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,7 +12,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 
 @dataclass(frozen=True)
 class PairForce:
-    """phi(x, v) of one form with its derivatives, functions of Warp."""
+    """phi(x, v) with its derivatives, functions of Warp."""
 
     force: Any
     tangent: Any
@@ -26,12 +22,9 @@ class PairForce:
     """The same with respect to v."""
 
 
-PairForm = Callable[[Discretisation], PairForce]
-
-
 @cache
 def pairwise(discretisation: Discretisation) -> PairForce:
-    """phi of the pairwise form: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
+    """phi: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -59,32 +52,5 @@ def pairwise(discretisation: Discretisation) -> PairForce:
     @wp.func
     def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         return (slope(x, s) * per_size(x, s) * wp.dot(x, w)) * x
-
-    return PairForce(force, tangent, adjoint_x, adjoint_v)
-
-
-@cache
-def laminar(discretisation: Discretisation) -> PairForce:
-    """phi of the laminar form, as `pairwise`."""
-    vector = discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    factor, factor_gradient = pair.factor, pair.factor_gradient
-
-    @wp.func
-    def force(x: vector, v: vector, s: neighbourhood) -> vector:
-        return factor(x, s) * v
-
-    @wp.func
-    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: neighbourhood) -> vector:
-        return factor(x, s) * v_dot + wp.dot(factor_gradient(x, s), x_dot) * v
-
-    @wp.func
-    def adjoint_x(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
-        return wp.dot(v, w) * factor_gradient(x, s)
-
-    @wp.func
-    def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
-        return factor(x, s) * w
 
     return PairForce(force, tangent, adjoint_x, adjoint_v)

@@ -1,4 +1,4 @@
-"""Surface tension, in two forms: by curvature (`cortado.sph.curvature_kernels`), and as a force of pairs
+"""Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
 (`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
 Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis,
@@ -20,7 +20,6 @@ from cortado.errors import warn
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.scene.tension_form import LEAST_SUPPORT, tension_form
 from cortado.sph.curvature_constants import CurvatureConstants
 from cortado.sph.curvature_tension import CurvatureTension
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
@@ -30,8 +29,10 @@ from cortado.sph.surface_stress import surface_tension_kernels
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
 docs/discretisation.md."""
-LEAST_VISCOSITY = {"pairwise": 0.05, "curvature": 0.05}
-"""By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
+LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
+"""In spacings: below, drops fall apart in pairs, and curvatures are too noisy."""
+LEAST_VISCOSITY = 0.05
+"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
 particles across hold; by curvature, those of 24 and 48 across lose energy with it, but not all of them with 0.03."""
 
 
@@ -89,9 +90,9 @@ def tension_constants(spacing: float, support: float, dimension: int) -> tuple[f
 def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
-    form = tension_form(scene)
+    form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
     _check_support(scene, LEAST_SUPPORT[form])
-    _check_viscosity(scene, setting.layout.particles, LEAST_VISCOSITY[form])
+    _check_viscosity(scene, setting.layout.particles)
     if form == "curvature":
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
         known = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
@@ -109,11 +110,11 @@ def _check_support(scene: Scene, least: float) -> None:
         )
 
 
-def _check_viscosity(scene: Scene, particles: int, part: float) -> None:
+def _check_viscosity(scene: Scene, particles: int) -> None:
     spacing, tension, dimension = scene.discretisation.spacing, scene.forces.surface_tension, scene.dimension
     radius = spacing * (particles / (pi if dimension == 2 else 4.0 * pi / 3.0)) ** (1.0 / dimension)
     for phase in scene.phase:
-        least = part * sqrt(phase.rest_density * tension * radius)
+        least = LEAST_VISCOSITY * sqrt(phase.rest_density * tension * radius)
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
             warn(

@@ -1,14 +1,11 @@
-"""Viscous forces between pairs and with walls at rest:
+"""The viscous force of the report (eq. 10; Monaghan 2005) between pairs and with walls at rest, of PCISPH:
 
-a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + friction mu_i sum_b V_b phi(x_ib, v_i))
+a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V_b phi(x_ib, v_i)),   kappa = 2 (d + 2)
 
-pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2),  kappa = 2 (d + 2)     (Monaghan 2005)
-laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2),  kappa = 2             (Morris, Fox and Zhu 1997)
-
-mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a pair [Pa s] (Cleary and Monaghan 1999: the harmonic
-mean keeps the shear stress continuous between fluids); friction is 0 for a wall with free slip, else about 1
-(`WallLayer.friction`). phi is odd in (x, v) together, so that momentum is kept; the pairwise form is central and keeps
-angular momentum too, but carries no shear to a wall, which the laminar form does.
+phi = B G with B = v . x / (|x|^2 + 0.01 h^2). mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a pair
+[Pa s] (Cleary and Monaghan 1999: the harmonic mean keeps the shear stress continuous between fluids). The sum over b is
+there for walls without slip. phi is odd in (x, v) together and central, so that momentum and angular momentum are kept;
+it carries no shear to a wall.
 """
 
 from functools import cache
@@ -26,19 +23,19 @@ from cortado.particles.pair_sums import rubbing_sum
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.implicit_viscosity import stress_of
-from cortado.sph.pair_forces import PairForm, laminar, pairwise
+from cortado.sph.pair_forces import pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.viscous_stress import ViscousStress
 from cortado.sph.wall_sums import WallSums
 
 
 @cache
-def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bool) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi, and
-    with walls that have a ``friction`` or slip freely."""
+def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless fluid
+    ``sticks`` to some."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    phi = form(discretisation)
+    phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
@@ -46,7 +43,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     tiny = wp.constant(real(discretisation.precision.tiny))
     summed = rubbing_sum(discretisation, sticks)
-    name = form.__name__ + "_no_slip" * sticks  # a module for each: their functions have the same names
+    name = "pairwise" + "_no_slip" * sticks  # a module for each: their functions have the same names
 
     @wp.func
     def part(a: real, b: real) -> real:
@@ -69,9 +66,9 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         wp.adjoint[b] += pair_viscosity_derivative(b, a) * bar
 
     def wall_force(
-        x_ij: vector, v_ij: vector, n_i: real, m_i: real, mu_i: real, kappa: real, friction: real, s: neighbourhood
+        x_ij: vector, v_ij: vector, n_i: real, m_i: real, mu_i: real, kappa: real, s: neighbourhood
     ) -> vector:
-        return (kappa * friction * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
+        return (kappa * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
     @summed(wall_force)
     def force(
@@ -83,7 +80,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         mu_i: real,
         mu_j: real,
         kappa: real,
-        friction: real,
         s: neighbourhood,
     ) -> vector:
         weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
@@ -101,12 +97,11 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         mu_i: real,
         mu_dot_i: real,
         kappa: real,
-        friction: real,
         s: neighbourhood,
     ) -> vector:
         change = mu_dot_i - mu_i * (m_dot_i / m_i + n_dot_i / n_i)
         total = change * phi_force(x_ij, v_ij, s) + mu_i * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
-        return (kappa * friction * s.volume / (m_i * n_i)) * total
+        return (kappa * s.volume / (m_i * n_i)) * total
 
     @tangent_of(force)
     @summed(wall_tangent, ahead=False, grows=force)
@@ -126,7 +121,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         mu_dot_i: real,
         mu_dot_j: real,
         kappa: real,
-        friction: real,
         s: neighbourhood,
     ) -> vector:
         mu_ij = pair_viscosity(mu_i, mu_j)
@@ -144,10 +138,9 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         mu_i: real,
         bar_i: vector,
         kappa: real,
-        friction: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real, real, real]:
-        w_i = (kappa * friction * s.volume / (m_i * n_i)) * bar_i
+        w_i = (kappa * s.volume / (m_i * n_i)) * bar_i
         work = wp.dot(phi_force(x_ij, v_ij, s), w_i)
         x_part = phi_adjoint_x(x_ij, v_ij, mu_i * w_i, s)
         v_part = phi_adjoint_v(x_ij, v_ij, mu_i * w_i, s)
@@ -167,7 +160,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         bar_i: vector,
         bar_j: vector,
         kappa: real,
-        friction: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real, real, real]:
         """What the pair adds to i is what it adds to j, seen from i: to x, v, n, m and mu."""
@@ -187,7 +179,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     def viscosity(
         s: neighbourhood,
         kappa: real,
-        friction: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         n: wp.array(dtype=real),
@@ -198,7 +189,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         acceleration: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = force(i, x, v, n, m, mu, kappa, friction, s)
+        total = force(i, x, v, n, m, mu, kappa, s)
         if lane() > 0:
             return
         acceleration[i] = acceleration_in[i] + total
@@ -207,7 +198,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     def viscosity_tangent(
         s: neighbourhood,
         kappa: real,
-        friction: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         n: wp.array(dtype=real),
@@ -219,7 +209,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         acceleration_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = force_tangent(i, x, dot.x, v, dot.v, n, dot.n, m, dot.m, mu, dot.mu, kappa, friction, s)
+        total = force_tangent(i, x, dot.x, v, dot.v, n, dot.n, m, dot.m, mu, dot.mu, kappa, s)
         if lane() > 0:
             return
         acceleration_dot[i] = acceleration_in_dot[i] + total
@@ -228,7 +218,6 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     def viscosity_adjoint(
         s: neighbourhood,
         kappa: real,
-        friction: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         n: wp.array(dtype=real),
@@ -243,7 +232,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
         mu_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_sum, v_sum, n_sum, m_sum, mu_sum = force_adjoint(i, x, v, n, m, mu, acceleration_bar, kappa, friction, s)
+        x_sum, v_sum, n_sum, m_sum, mu_sum = force_adjoint(i, x, v, n, m, mu, acceleration_bar, kappa, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_sum
@@ -256,11 +245,11 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
 
 
 @cache
-def viscosity_term(discretisation: Discretisation, form: PairForm) -> WallTerm:
-    """The acceleration by the walls of a solid, with kappa times the friction as the first of the ``constants``."""
+def viscosity_term(discretisation: Discretisation) -> WallTerm:
+    """The acceleration by the walls of a solid, with kappa as the first of the ``constants``."""
 
     def made(d: Discretisation) -> Any:
-        real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, form(d).force
+        real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, pairwise(d).force
 
         def viscosity_work(
             x_ij: vector,
@@ -277,7 +266,7 @@ def viscosity_term(discretisation: Discretisation, form: PairForm) -> WallTerm:
 
         return viscosity_work
 
-    return WallTerm(discretisation, form.__name__, made, "acceleration_bar", rubs=True)
+    return WallTerm(discretisation, "pairwise", made, "acceleration_bar", rubs=True)
 
 
 class Viscosity:
@@ -286,13 +275,13 @@ class Viscosity:
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
-    def __init__(self, setting: Setting, form: PairForm, kappa: float, friction: float):
-        """``friction`` 0 lets walls slip freely."""
-        discretisation = setting.discretisation
-        self._kernels, self.friction = viscosity_kernels(discretisation, form, friction > 0.0), friction
-        self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
-        term, constants = viscosity_term(discretisation, form), (kappa * friction, 0.0)
-        self.wall_action = WallSums(term, setting.layout, constants) if friction > 0.0 else None
+    def __init__(self, setting: Setting):
+        discretisation, self.sticks = setting.discretisation, setting.scene.sticks
+        kappa = 2.0 * (setting.scene.dimension + 2)
+        self._kernels = viscosity_kernels(discretisation, self.sticks)
+        self._constants: dict[str, Any] = {"kappa": kappa}
+        action = WallSums(viscosity_term(discretisation), setting.layout, (kappa, 0.0))
+        self.wall_action = action if self.sticks else None
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, **self._constants, acceleration_in=before, acceleration=after)
@@ -308,13 +297,8 @@ class Viscosity:
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
-    """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
-    Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
-    scene, sticks = setting.scene, setting.scene.sticks
-    if scene.forces.viscosity == "stress":
-        return stress_of(scene)(setting)
-    if scene.forces.viscosity == "pairwise":
-        return Viscosity(setting, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
-    if scene.forces.viscosity == "laminar":
-        return Viscosity(setting, laminar, 2.0, friction=setting.walls.friction if sticks else 0.0)
-    return None
+    """The form that a scene names. None for a scene without."""
+    form = setting.scene.forces.viscosity
+    if form == "stress":
+        return stress_of(setting.scene)(setting)
+    return Viscosity(setting) if form == "pairwise" else None

@@ -27,14 +27,13 @@ struct Scene {
     double volume;          // V [m^d]
     double stiffness;       // k
     double response;        // of the yield beside walls
-    double laplacian_correction;
     std::vector<double> wall_positions;  // (b, d) [m]
     std::vector<double> wall_weights;    // (b,) w_b, a fluid particle being 1
     std::vector<double> wall_feet;       // (b, d) from wall particles to the surface [m]
     std::array<double, 3> periods;       // [m], 0 along an axis that is not periodic
     double rest_density;                 // [kg / m3]
     double time_step;                    // [s]
-    std::string viscosity;               // "stress", "pairwise", "laminar", "none"
+    std::string viscosity;               // "stress", "pairwise", "none"
     double friction;                     // of walls; 0 for free slip
     double control;                      // C of the stress
     double closest;                      // from where on a wall pulls no harder, by the stress [m]

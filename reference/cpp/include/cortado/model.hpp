@@ -8,7 +8,7 @@
 
 namespace cortado {
 
-enum class Viscosity { none, pairwise, laminar, stress };
+enum class Viscosity { none, pairwise, stress };
 
 template <class Scalar, int D>
 struct Model {
@@ -18,7 +18,7 @@ struct Model {
     Period<Scalar, D> period;
     std::array<double, 3> periods;
     double reach;
-    Scalar volume, self_weight, stiffness, response, laplacian_correction, size_floor;
+    Scalar volume, self_weight, stiffness, response, size_floor;
     Scalar rest_density, time_step, friction, control, closest, kappa;
     Viscosity viscosity;
     bool pressure;
@@ -45,18 +45,16 @@ struct Model {
           self_weight(smoothing.weight(Scalar(0))),
           stiffness(Real(s.stiffness)),
           response(Real(s.response)),
-          laplacian_correction(Real(s.laplacian_correction)),
           size_floor(Real(1) / Real(100) * smoothing.h_squared),
           rest_density(Real(s.rest_density)),
           time_step(Real(s.time_step)),
           friction(Real(s.friction)),
           control(Real(s.control)),
           closest(Real(s.closest)),
-          kappa(Real(s.viscosity == "pairwise" ? 2 * (D + 2) : s.viscosity == "stress" ? 1 : 2)),
-          viscosity(s.viscosity == "pairwise"  ? Viscosity::pairwise
-                    : s.viscosity == "stress"  ? Viscosity::stress
-                    : s.viscosity == "laminar" ? Viscosity::laminar
-                                               : Viscosity::none),
+          kappa(Real(s.viscosity == "pairwise" ? 2 * (D + 2) : 1)),
+          viscosity(s.viscosity == "pairwise" ? Viscosity::pairwise
+                    : s.viscosity == "stress" ? Viscosity::stress
+                                              : Viscosity::none),
           pressure(s.pressure),
           minimum_iterations(s.minimum_iterations),
           maximum_iterations(s.maximum_iterations),
@@ -89,11 +87,9 @@ struct Model {
         }
     }
 
-    // phi of the viscosity, of a pair at rest and its gradient: see docs/discretisation.md.
+    // phi of the pairwise viscosity, of a pair at rest and its gradient: see docs/discretisation.md.
     Vector<Scalar, D> phi(const Pair<Scalar, D>& pair, const Vector<Scalar, D>& v) const {
-        const Scalar r_squared = pair.x.dot(pair.x), size = r_squared + size_floor;
-        if (viscosity == Viscosity::pairwise) return (v.dot(pair.x) / size * pair.a) * pair.x;
-        return (laplacian_correction * pair.a * r_squared / size) * v;
+        return (v.dot(pair.x) / (pair.x.dot(pair.x) + size_floor) * pair.a) * pair.x;
     }
 
     // sum_j W(x_j) + sum_b w_b W(x_b) over lists, at other positions than those that the lists are of.

@@ -59,7 +59,7 @@ slip = "free"                       # "no" for walls that hold the fluid back
 
 [forces]
 gravity = $gravity        # m/s2
-viscosity = "stress"                # or "none"; "pairwise" and "laminar" are there to compare
+viscosity = "stress"                # or "none"
 #surface_tension = 0.07             # N/m
 
 [solver]

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cortado.discretise.calibration import lattice_offsets, shear_factor
+from cortado.discretise.calibration import lattice_offsets
 from cortado.discretise.smoothing import SmoothingKernel
 
 SHALLOW = 0.4
@@ -22,8 +22,6 @@ class WallLayers:
     """Distances behind the surface of the container [m]."""
     weights: tuple[float, ...]
     """What a particle of each layer counts for in the density, a fluid particle being 1."""
-    friction: float
-    """What the laminar viscous force of a wall without slip is multiplied with."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +53,13 @@ class Planes:
         """Its derivative by the distance."""
         return float(self.kernel.gradient(self.across(distance), self.support)[:, 0].sum())
 
-    def drag(self, distance: float) -> float:
-        """Sum of F = x . G / (|x|^2 + 0.01 h^2) over it."""
-        return float(shear_factor(self.kernel, self.across(distance), self.support).sum())
-
 
 def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayers:
     """The layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
 
     - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
     - a uniform pressure pushes no particle of the first layer: what a wall adds to the density of a particle is steep
-      enough to balance the pressure of the particle and that of all its neighbours;
-    - a uniform shear, at rest at the surface, drags no particle of the first layer (laminar viscosity, no slip).
+      enough to balance the pressure of the particle and that of all its neighbours.
 
     One layer is enough where the second layer of the fluid does not see the wall, with a support of up to two spacings.
     """
@@ -94,9 +87,4 @@ def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     from scipy.optimize import brentq
 
     deepest = brentq(push, 0.5 * spacing, support - (0.5 + 1e-3) * spacing, xtol=1e-14 * spacing)
-    layers = depths(deepest)
-    drag_of_wall = heights[0] * sum(
-        w * planes.drag(heights[0] + z) for z, w in zip(layers, weights(deepest), strict=True)
-    )
-    drag_of_fluid = sum(distance * planes.drag(distance) for distance in below)
-    return WallLayers(tuple(layers.tolist()), tuple(weights(deepest).tolist()), float(drag_of_fluid / drag_of_wall))
+    return WallLayers(tuple(depths(deepest).tolist()), tuple(weights(deepest).tolist()))

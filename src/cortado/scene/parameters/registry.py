@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.scene.parameters.parameter import Axis, Limit, Parameter, Range, Role, Source
-from cortado.scene.tension_form import tension_form
 
 
 def _vector(dimension: int, phases: int) -> int:
@@ -50,10 +49,10 @@ def _has_emitter(scene: Any) -> bool:
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
     """C sqrt(rho s^3 / sigma) of the lightest phase, with the spacing s (the form is that of Brackbill et al. 1992). C
-    is 0.08, as with PCISPH drops in space need many more iterations from 0.1 on; by curvature in a projection, 0.2."""
+    is 0.08, as with PCISPH drops in space need many more iterations from 0.1 on; by curvature, 0.2."""
     tension = float(values.get("surface_tension", scene.forces.surface_tension))
     density = float(np.min(values.get("rest_density", [phase.rest_density for phase in scene.phase])))
-    part = 0.2 if scene.solver.kind == "projection" and tension_form(scene) == "curvature" else 0.08
+    part = 0.08 if scene.solver.kind == "pcisph" else 0.2
     return part * float(np.sqrt(density * scene.discretisation.spacing**3 / tension)) if tension > 0.0 else inf
 
 
