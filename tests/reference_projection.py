@@ -1,6 +1,7 @@
 """Slow twin of a step of the projection: all pairs, NumPy, straight from the equations of `docs/projection.md`."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,6 +12,41 @@ from cortado.discretise.calibration import SKIN
 def between(H, first, second):
     t = np.clip((H - first) / (second - first), 0.0, 1.0)
     return 3 * t**2 - 2 * t**3
+
+
+@dataclass(frozen=True)
+class Body:
+    """A free body that begins at rest."""
+
+    walls: np.ndarray
+    """Which wall particles are its own."""
+    middle: np.ndarray
+    mobility: np.ndarray
+    """(6, 6) velocity and angular velocity for momentum and angular momentum, in volumes of a particle."""
+    greatest: float
+    """The largest eigenvalue of I^-1."""
+
+    @classmethod
+    def of(cls, held, solids, scene):
+        """Of one of the solver, in its scene."""
+        table, d, mass = held.body.table, scene.dimension, held.body.table.mass
+        solid = next(one for one in scene.solid if one.name == table.name)
+        turn, inverse = np.eye(3), np.linalg.pinv(mass.inertia)
+        turn[:d, :d] = solid.turn(d)
+        mobility = np.zeros((6, 6))
+        mobility[:3, :3], mobility[3:, 3:] = np.eye(3) / mass.volume, turn @ inverse @ turn.T
+        greatest = np.linalg.eigvalsh(inverse).max()
+        return cls(solids == table.number, np.array(solid.middle()), mobility / solid.density, greatest / solid.density)
+
+    def rows(self, gamma, x):
+        """(6, n) what pressures give to both momenta."""
+        arm, force = (np.pad(a, ((0, 0), (0, 3 - a.shape[1]))) for a in (x - self.middle, gamma))
+        return np.hstack([force, np.cross(arm, force)]).T
+
+    def diagonal(self, rows):
+        """What it adds to a."""
+        force, torque = np.linalg.norm(rows[:3], axis=0), np.linalg.norm(rows[3:], axis=0)
+        return self.mobility[0, 0] * force * force.sum() + self.greatest * torque * torque.sum()
 
 
 @dataclass(frozen=True)
@@ -32,6 +68,8 @@ class Projection:
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray] | None
     """Of the coarse grid: the place of the first node, 1 / the distance of two, and how many there are, along each
     axis."""
+    bodies: tuple[Body, ...] = ()
+    """Free ones: their walls are where the last step of the simulation had them."""
 
     @classmethod
     def of(cls, simulation):
@@ -51,7 +89,9 @@ class Projection:
         if getattr(solver, "coarse", None) is not None:
             grid = solver.coarse.grid["grid"]
             nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
-        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes)
+        held, solids = getattr(solver.bodies, "held", ()), search.walls["wall_solids"].numpy()
+        bodies = tuple(Body.of(one, solids, scene) for one in held)
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes, bodies)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -74,8 +114,10 @@ class Projection:
             W, wall = W * (near < reach), wall * (beside < reach)
         return W.sum(1) + wall @ self.wall_weights
 
-    def constants(self, d):
+    @cached_property
+    def constants(self):
         """omega and a_0 of the lattice."""
+        d = self.walls.shape[1]
         reach, steps = np.arange(-5, 6) * self.spacing, np.linspace(0, np.pi / self.spacing, 25)
         lattice, waves = (np.stack(np.meshgrid(*[a] * d, indexing="ij"), -1).reshape(-1, d) for a in (reach, steps))
         g = replace(self, periods=np.zeros(d)).pairs(np.zeros((1, d)), lattice)[2][0]
@@ -86,9 +128,7 @@ class Projection:
         """W, g, the sum of g, gamma, nu, M, H and the inverse of M."""
         d, (apart, W, g) = x.shape[1], self.pairs(x, x)
         _, wall_W, wall_g = self.pairs(x, self.walls)
-        normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
-        gamma = np.einsum("b,iba,ba,bc->ic", self.wall_weights, wall_g, normal, normal)
-        whole, least = np.einsum("b,iba->ia", self.wall_weights, wall_g), 5e-4 * self.constants(d)[1]
+        (gamma, whole), least = self.pushes(wall_g), 5e-4 * self.constants[1]
         off = ((whole**2).sum(1) - (gamma**2).sum(1)) / ((whole**2).sum(1) + least)
         gamma = gamma + between(off, 0.1, 0.4)[:, None] * (whole - gamma)
         nu = wall_W @ self.wall_weights
@@ -100,14 +140,31 @@ class Projection:
             H = 3 * np.linalg.det(M) / (squares + 1e-12)
         return W, g, g.sum(1), gamma, nu, M, H, 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
 
-    def step(self, x, v_star, before, m, dt):
+    def pushes(self, wall_g, own=True):
+        """gamma_n and gamma_w, of all wall particles or of a body's ``own``."""
+        normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
+        weights = self.wall_weights * own
+        return np.einsum("b,iba,ba,bc->ic", weights, wall_g, normal, normal), np.einsum("b,iba->ia", weights, wall_g)
+
+    def body_rows(self, x):
+        """(6, n) of each body."""
+        wall_g, least = self.pairs(x, self.walls)[2], 5e-4 * self.constants[1]
+        (normal, whole) = self.pushes(wall_g)
+        off = ((whole**2).sum(1) - (normal**2).sum(1)) / ((whole**2).sum(1) + least)
+        e, found = between(off, 0.1, 0.4)[:, None], []
+        for body in self.bodies:
+            normal, whole = self.pushes(wall_g, body.walls)
+            found.append(body.rows(normal + e * (whole - normal), x))
+        return found
+
+    def step(self, x, v_star, before, m, dt, gravity=0.0):
         """Positions, velocities, and k with what it adds to velocities, after the step, from predicted velocities and
-        those two of the step before."""
+        those two of the step before. Bodies begin at rest and fall with the ``gravity``."""
         (n, d), density = x.shape, self.density(x)
         _, g, total, gamma, nu, M, H, inverse = self.around(x)
         B = 1 / (1 + (nu / 0.05) ** 4)
         tension = between(H, 0.1, 0.5) * B
-        omega, square = self.constants(d)
+        omega, square = self.constants
         N = gamma[:, :, None] * gamma[:, None, :]
         N = N / ((gamma**2).sum(1) + 0.01 * 0.05 * square)[:, None, None]
         P = np.eye(d) - N
@@ -124,6 +181,13 @@ class Projection:
         unequal = 1 + 2 * ((m[:, None] - m) / (m[:, None] + m)) ** 2
         a += (unequal * (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1)) @ (1 / m)
 
+        rows = self.body_rows(x)
+        yielding = np.zeros((n, n))
+        for body, row in zip(self.bodies, rows, strict=True):
+            a += body.diagonal(row)
+            yielding += row.T @ body.mobility @ row
+        falls = sum((row[:d].T @ np.broadcast_to(gravity, d) * dt for row in rows), np.zeros(n))
+
         def force(k):
             pull = k[:, None, None] * L
             return np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g) + k[:, None] * gamma
@@ -132,22 +196,24 @@ class Projection:
             apart = v[:, None] - v[None, :]
             return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
 
-        correct = self.coarse(x, m, force, L, g, between(H + 2 * nu, 0.7, 0.95)) if self.nodes else None
+        share = between(H + 2 * nu, 0.7, 0.95)
+        correct = self.coarse(x, m, force, L, g, share, yielding) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         k = y = full * before[0]
         v = v_star + full[:, None] * before[1]
         t = 5.0
         for left in reversed(range(self.iterations)):
             if correct is not None:
-                r = divergence(v) - wanted
+                r = divergence(v) - falls - yielding @ y - wanted
                 r = np.where((y > 0) | (tension > 0.5) | (r > 0), r, 0)
                 z = y + correct(r)
                 change = np.where(z > 0, z, tension * z) - y
                 thrust = -force(change) / m[:, None]
-                alpha = np.clip((r * change).sum() / (m[:, None] * thrust**2).sum(), 0, 1)
+                energy = (m[:, None] * thrust**2).sum() + change @ yielding @ change
+                alpha = np.clip((r * change).sum() / energy, 0, 1)
                 k = y = y + alpha * change
                 v = v + alpha * thrust
-            u, D = v, divergence(v)
+            u, D = v, divergence(v) - falls - yielding @ y
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
@@ -166,7 +232,7 @@ class Projection:
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
         return now, v, (k, kick)
 
-    def coarse(self, x, m, force, L, g, c):
+    def coarse(self, x, m, force, L, g, c, yielding):
         """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""
         (first, frequency, counts), (n, d) = self.nodes, x.shape
         shape = counts.astype(int)
@@ -185,6 +251,7 @@ class Projection:
         q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * force(c)[:, None, :]
         lattice = 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
         A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(1e-5 * lattice / 4**d * touched)
+        A += (phi.T * c) @ yielding @ (phi.T * c).T
         live = touched > 0
 
         def correct(r):

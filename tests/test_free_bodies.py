@@ -14,6 +14,8 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.solid_shapes import AnySolid
 from cortado.solvers.contact_strength import STIFFNESS
 from floating_bodies import floating_box
+from reference_projection import Projection
+from scenes import thrown
 
 RAFT = {
     "name": "raft",
@@ -57,6 +59,10 @@ def space(*solids, **tables):
     fluid = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.3, 0.4], "phase": "water"}
     container = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.5, 0.6, 0.4]}
     return plane(*solids, **{"dimension": 3, "fluid": [fluid], "container": container, **tables})
+
+
+def multilevel(scene):
+    return scene.replaced("solver.multilevel=true")
 
 
 def begun(scene):
@@ -235,6 +241,17 @@ def test_a_box_floats_as_deep_as_it_should():
     assert floating_box(16)["draft over the exact one"] == pytest.approx(1.0, rel=0.03)
 
 
+@pytest.mark.parametrize("density", [250.0, 500.0, 750.0])
+def test_a_box_that_is_laid_into_water_at_its_draft_stays_where_a_coarse_grid_knows_it(density):
+    """From the first step on."""
+    box = {"name": "raft", "shape": "box", "lower": [0.3, 0.4 - 0.2e-3 * density], "motion": "free", "density": density}
+    box["upper"] = [0.7, box["lower"][1] + 0.2]
+    water = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}
+    scene = multilevel(plane(box, fluid=[water], discretisation={"spacing": 0.025}))
+    run = Simulation(scene, precision="float64").run(8, record_every=1)
+    assert np.abs(run.solids["raft"].velocities).max() < 0.001
+
+
 def test_a_body_lies_on_the_floor():
     """Held by its contact alone: n points as deep as d push it with n d^3 / sqrt(n d^4) = sqrt(n) d."""
     box = {"name": "raft", "shape": "box", "lower": [0.7, 0.0], "upper": [0.9, 0.1], "motion": "free", "density": 500.0}
@@ -278,8 +295,14 @@ def test_bodies_touch_across_a_period():
         (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
+        (lambda: multilevel(plane(RAFT)), CentreOfMass([0.5, 0.3])),
+        (lambda: multilevel(touching_across()), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
+        (lambda: multilevel(space(BRICK)), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
     ],
-    ids=["plane", "space", "touching", "touching across a period", "touching in space"],
+    ids=[
+        *("plane", "space", "touching", "touching across a period", "touching in space"),
+        *("multilevel", "multilevel across a period", "multilevel in space"),
+    ],
 )
 def test_derivatives_of_bodies(made, loss):
     """Reverse and forward mode to round-off, and differences, of all that a body begins with, of its density, and of
@@ -346,8 +369,9 @@ def test_bodies_are_drawn_where_they_are(made):
     assert np.abs(axes).max() > 1e-3
 
 
-def test_a_batch_has_the_bits_of_single_runs():
-    scene, loss = touching(), SolidPose("raft", [0.3, 0.2], 0.3)
+@pytest.mark.parametrize("made", [touching, lambda: multilevel(touching())], ids=["touching", "multilevel"])
+def test_a_batch_has_the_bits_of_single_runs(made):
+    scene, loss = made(), SolidPose("raft", [0.3, 0.2], 0.3)
     densities = [300.0, 700.0]
     single = [Problem(Simulation(scene), 8, loss).value_and_gradient({"raft.density": rho}) for rho in densities]
     several = Problem(Simulation(scene, batch=2), 8, loss).value_and_gradient({"raft.density": np.array(densities)})
@@ -423,3 +447,29 @@ def test_a_file_of_frames_tells_where_bodies_are(tmp_path):
         assert np.array_equal(read.solids[name].positions, motion.positions)
         assert np.array_equal(read.solids[name].rotations, motion.rotations)
     assert np.array_equal(read.solids["raft"].velocities, run.solids["raft"].velocities)
+
+
+@pytest.mark.parametrize(
+    ("made", "solver"), [(plane, "multilevel"), (plane, "iterations alone"), (space, "multilevel")]
+)
+def test_a_step_beside_bodies_is_that_of_the_twin(made, solver):
+    """Two light bodies at rest in water that is thrown about."""
+    flat, still = made is plane, {"velocity": [0.0] * (2 if made is plane else 3), "angular_velocity": None}
+    raft = {**(RAFT if flat else BRICK), **still, "density": 100.0}
+    ball = {"name": "ball", "shape": "sphere", "motion": "free", "radius": 0.08, "density": 300.0}
+    ball |= {"centre": [0.3, 0.12] if flat else [0.32, 0.1, 0.3]}
+    scene = made(*({key: v for key, v in one.items() if v is not None} for one in (raft, ball)))
+    scene = (multilevel(scene) if solver == "multilevel" else scene).replaced("phase[0].viscosity=0")
+    simulation = Simulation(scene, precision="float64")
+    given, gravity, dt = thrown(simulation), np.array(scene.forces.gravity), 0.001
+    x, v = given["initial_positions"], given["initial_velocities"]
+    run, m = simulation.run(1, given), simulation.state()["reference_density"]
+    twin = Projection.of(simulation)
+    x_new, v_new, (k, _) = twin.step(x, v + dt * gravity, (np.zeros(len(m)), np.zeros_like(x)), m, dt, gravity)
+    np.testing.assert_allclose(run.positions[-1], x_new, rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(run.velocities[-1], v_new, rtol=1e-10, atol=1e-11)
+    assert len(twin.bodies) == 2
+    for body, row, name in zip(twin.bodies, twin.body_rows(x), ("raft", "ball"), strict=True):
+        moved, d = body.mobility @ row @ k, scene.dimension
+        np.testing.assert_allclose(run.solids[name].velocities[-1], moved[:d] + dt * gravity, rtol=1e-9, atol=1e-11)
+        assert np.abs(moved[:d]).max() > dt * 9.81

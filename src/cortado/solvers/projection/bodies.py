@@ -1,12 +1,14 @@
 """Rigid bodies in a step of the projection, and derivatives: see `cortado.solvers.projection.body_kernels`."""
 
-from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from cortado.device.binding import Named
 from cortado.device.launching import add
+from cortado.particles.arrays import zeros
 from cortado.particles.state import Layout
 from cortado.scene.motions import density_name
 from cortado.solvers.projection.body_kernels import body_kernels
@@ -17,11 +19,33 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 Arrays = dict[str, wp.array]
 
 
+@dataclass(frozen=True)
+class Start:
+    """What the velocities of a body are before pressures push it, or tangents or adjoints of that."""
+
+    motion: Arrays
+    """V_0, W_0 and L_0, as kernels call them; it goes before all else that a step has."""
+    given: Arrays
+    """What contact gives to both momenta."""
+
+    @classmethod
+    def of(cls, body: FreeBody | Changes) -> "Start":
+        """Those of a step."""
+        return cls({f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}, body.given)
+
+    @classmethod
+    def at_rest(cls, layout: Layout, suffix: str) -> "Start":
+        """None, in a step of no length, in which nothing falls; what adjoints add up there is not read."""
+        kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), layout.precision.vector), "time_step": layout.precision.real}
+        sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
+        return cls(zeros(sizes, layout.device), {})
+
+
 class Held:
     """What particles know of one body in a step, or tangents or adjoints of it, by a ``suffix`` of their names."""
 
-    def __init__(self, body: FreeBody, layout: Layout, suffix: str = ""):
-        self.body, self._layout = body, layout
+    def __init__(self, body: FreeBody, layout: Layout, start: Start, suffix: str = ""):
+        self.body, self.start, self._layout = body, start, layout
         precision, vector, device = layout.precision, layout.precision.vector, layout.device
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
@@ -31,6 +55,12 @@ class Held:
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
         """The sums of the sizes."""
+
+    def at_rest(self) -> "Held":
+        """The same, with the same arrays, of a body that begins at rest."""
+        other = copy(self)
+        other.start = Start.at_rest(self._layout, self._suffix)
+        return other
 
     def add_sizes(self) -> None:
         """Of all particles of a scene."""
@@ -42,25 +72,25 @@ class Held:
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 
 
-def begun(motion: Mapping[str, wp.array]) -> Arrays:
-    """V, W and L at the start of a step as kernels call them: V_0, W_0 and L_0."""
-    return {f"{name[0]}_0{name[1:]}": array for name, array in motion.items()}
-
-
 class Bodies:
     """Those of one solver, forward."""
 
     def __init__(self, part: FreeSolidsPart, discretisation: Any, layout: Layout):
         self.part, self.layout = part, layout
         self.kernels, self.motion = body_kernels(discretisation), motion_kernels(layout.precision)
-        self.held = [Held(body, layout) for body in part.bodies]
+        self.held = [Held(body, layout, Start.of(body)) for body in part.bodies]
         self.drift = wp.zeros(layout.all_particles, dtype=layout.precision.real, device=layout.device)
+
+    def at_rest(self) -> "Bodies":
+        """The same bodies, which begin at rest and are pushed by pressures alone: `drifted` is linear in these."""
+        other = copy(self)
+        other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
+        return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
         """What kernels know of a body."""
-        body = held.body
-        own = held.known, held.shares, held.whole, begun(body.before), self.part.poses
-        return *own, *body.known(context)
+        own = held.known, held.shares, held.whole, held.start.motion, self.part.poses
+        return *own, *held.body.known(context)
 
     def begin(self, context: StepContext, around: Arrays) -> None:
         """Look at what is around them, and add to the diagonal."""
@@ -74,7 +104,7 @@ class Bodies:
         known = self.known(context, held)
         context.launch(self.kernels.pull.forward, *known, y=y)
         sums = held.sums()
-        for given, total in zip(held.body.given.values(), sums.values(), strict=True):
+        for given, total in zip(held.start.given.values(), sums.values(), strict=False):
             add(given, total)
         context.launch(self.motion.move.forward, sums, moved, *known, threads=self.layout.members)
         return sums
@@ -100,13 +130,20 @@ class BodiesTangent:
 
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
-        self._held = [Held(held.body, bodies.layout, "_dot") for held in bodies.held]
+        self._held = [Held(own.body, bodies.layout, Start.of(own), "_dot") for own in changes]
         self.drift = wp.zeros_like(bodies.drift)
+
+    def at_rest(self, bodies: Bodies) -> "BodiesTangent":
+        """Of ``bodies``, which are at rest."""
+        other = copy(self)
+        other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
+        other.drift = wp.zeros_like(self.drift)
+        return other
 
     def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
         rates = {"density_dot": dot.parameters[density_name(held.body.table.name)]}
-        dots = own.known, own.shares, own.whole, begun(self._changes[k].before), rates
+        dots = own.known, own.shares, own.whole, own.start.motion, rates
         return *dots, *dot.named, *bodies.known(context, held)
 
     def begin(self, context: StepContext, dot: Tangents, around: Arrays, around_dot: Arrays) -> None:
@@ -125,7 +162,7 @@ class BodiesTangent:
         known = self._known(context, dot, k)
         context.launch(bodies.kernels.pull.tangent, *known, y=y[0], y_dot=y[1])
         sums_dot = own.sums()
-        for given, total in zip(self._changes[k].given.values(), sums_dot.values(), strict=True):
+        for given, total in zip(own.start.given.values(), sums_dot.values(), strict=False):
             add(given, total)
         context.launch(bodies.motion.move.tangent, sums, sums_dot, moved, out, *known, threads=bodies.layout.members)
 
@@ -153,7 +190,7 @@ class BodiesAdjoint:
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
         layout = bodies.layout
-        self._held = [Held(held.body, layout, "_bar") for held in bodies.held]
+        self._held = [Held(own.body, layout, Start.of(own), "_bar") for own in changes]
         self.drift_bar = wp.zeros_like(bodies.drift)
         """That of the drift of one iteration."""
         self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
@@ -166,8 +203,14 @@ class BodiesAdjoint:
     def _known(self, context: StepContext, bar: Adjoints, k: int) -> tuple[Named, ...]:
         held, own, table = self._bodies.held[k], self._held[k], self._bodies.held[k].body.table
         rates = {"density_bar": bar.parameters[density_name(table.name)], "time_step_bar": bar.parameters["time_step"]}
-        bars = own.known, begun(self._changes[k].before), self._turned[k], self._sums_bar, rates
+        bars = own.known, own.start.motion, self._turned[k], self._sums_bar, rates
         return *bars, *bar.named, *self._bodies.known(context, held)
+
+    def at_rest(self, bodies: Bodies) -> "BodiesAdjoint":
+        """Of ``bodies``, which are at rest."""
+        other = copy(self)
+        other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
+        return other
 
     def begin(self) -> None:
         """Of a step."""
@@ -183,7 +226,7 @@ class BodiesAdjoint:
         sums = bodies.move(context, held, y, moved)
         known = self._known(context, bar, k)
         context.launch(bodies.motion.move.adjoint, bars, sums, moved, *known, threads=bodies.layout.members)
-        for total, given in zip(self._sums_bar.values(), self._changes[k].given.values(), strict=True):
+        for total, given in zip(self._sums_bar.values(), self._held[k].start.given.values(), strict=False):
             add(total, given)
         context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
 
@@ -194,19 +237,23 @@ class BodiesAdjoint:
 
     def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Of `Bodies.drifted`, for ``self.drift_bar``, which goes to ``drift_bar``, too, and is 0 again."""
+        self.carried(context, bar, self.drift_bar, y, y_bar)
+        add(self.drift_bar, drift_bar)
+        self.drift_bar.zero_()
+
+    def carried(self, context: StepContext, bar: Adjoints, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
+        """Of what `Bodies.drifted` adds to the drift."""
         bodies = self._bodies
         (adjoint, slower) = bodies.motion.carry.adjoint
         for k, held in enumerate(bodies.held):
             bodies.move(context, held, y, held.moved)
             known = self._known(context, bar, k)
-            context.launch(adjoint, held.moved, *known, carried_bar=self.drift_bar)
+            context.launch(adjoint, held.moved, *known, carried_bar=carried_bar)
             for array, total in zip(self._faster.values(), held.sums().values(), strict=True):
                 wp.copy(array, total)
             bars = {**self._faster, **self._none}
             context.launch(slower, bars, *known, threads=bodies.layout.members)
             self._move(context, bar, k, y, held.moved, bars, y_bar)
-        add(self.drift_bar, drift_bar)
-        self.drift_bar.zero_()
 
     def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
         """Of `Bodies.begin`, to what particles and poses are given."""

@@ -13,6 +13,8 @@ from cortado.device.grid import Grid
 from cortado.device.precision import FLOAT32
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
+from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
+from cortado.solvers.projection.coarse_bodies import CoarseBodies, CoarseBodiesAdjoint, CoarseBodiesTangent
 from cortado.solvers.projection.coarse_grid import SPACING
 from cortado.solvers.projection.coarse_length import length_kernels
 from cortado.solvers.projection.coarse_levels import Levels, half
@@ -23,7 +25,7 @@ from cortado.solvers.projection.coarse_sums import coarse_push_kernels
 from cortado.solvers.projection.velocity import velocity_kernels
 from cortado.sph.conjugate_gradients import round_off
 from cortado.sph.moment_functions import matrix_type, symmetric
-from cortado.sph.parts import StepContext
+from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5
 """eps of all particles around a node over what A_II is on the lattice. It takes 0.7 % off the correction of the longest
@@ -38,8 +40,16 @@ MOST = 1_000
 class Coarse:
     """The grid and the matrix of the particles of one solver, and the solves with it."""
 
-    def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, grid: Grid, spacing: float):
-        """Of particles with a ``spacing`` [m]."""
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        layout: Layout,
+        dimension: int,
+        grid: Grid,
+        spacing: float,
+        bodies: Bodies | None,
+    ):
+        """Of particles with a ``spacing`` [m], and of free ``bodies``."""
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector
         self.push = coarse_push_kernels(discretisation, dimension)
@@ -49,7 +59,10 @@ class Coarse:
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
         self._particles, self._kinds = layout, (real, vector, precision.pair)
         self._tolerance = CLOSE if precision is FLOAT32 else round_off(precision)
-        self._levels = Levels(precision, dimension, grid.shape, layout.members, device)
+        self.bodies = None if bodies is None else CoarseBodies(bodies, layout, dimension)
+        """Free ones; None without any."""
+        rows = 0 if self.bodies is None else self.bodies.rows
+        self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
@@ -62,6 +75,8 @@ class Coarse:
         """Nothing: what a correction left may not be finite, if its run was lost."""
         self.still = layout.arrays(still=vector)["still"]
         """No velocities."""
+        self.unmoved = {"carried": layout.arrays(carried=real)["carried"]}
+        """What a scene without bodies has of them."""
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
         """What is spread."""
 
@@ -82,6 +97,8 @@ class Coarse:
         self._sort(context.fields["x"])
         context.launch(self.nodes.fill, self.grid, self.pushed, A=self._levels.A, threads=half(self._levels.A))
         self._levels.begin(context)
+        if self.bodies is not None:
+            self.bodies.begin(context, self.grid, around, self._levels.B)
 
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
         """Write to ``e`` (nodes,) what solves A e = the `source`, spread with the e ``before``."""
@@ -98,19 +115,27 @@ class Coarse:
         context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
         thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
         context.launch(self.velocity.velocity.forward, around, thrown, v_star=self.still)
-        context.launch(self.length.share, own, self.parts)
+        context.launch(self.length.share, own, self.carried(context, new["change"]), self.parts)
         wp.copy(new["sums"], self.sums(self.parts["parts"]))
         out = {"k_out": new["k"], "y_out": new["y"], "u_out": new["u"]}
         context.launch(self.length.apply, out, own, at)
+
+    def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
+        """G d of free bodies."""
+        return self.unmoved if self.bodies is None else {"carried": self.bodies.carried(context, change)}
 
 
 class CoarseTangent:
     """Forward mode."""
 
-    def __init__(self, coarse: Coarse, layout: Layout):
+    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, dot: Tangents):
         precision = layout.precision
         real, vector, six = precision.real, precision.vector, symmetric(precision).kind
         self._coarse, self._e_dot = coarse, coarse.numbers()
+        self._bodies = None
+        if coarse.bodies is not None and bodies is not None:
+            self._bodies = CoarseBodiesTangent(coarse.bodies, bodies, dot)
+        self._unmoved = {**coarse.unmoved, "carried_dot": coarse.unmoved["carried"]}
         kinds = {"h": vector, "N": matrix_type(precision), "r": real, "change": real, "thrust": vector}
         self._change = layout.arrays("_dot", **kinds, T=six, u=vector)
         self._T = layout.arrays(T=six)
@@ -128,6 +153,8 @@ class CoarseTangent:
         context.launch(own.residual.residual_tangent, at, *known, found)
         every = (own.grid, left, own.pushed, self._change, *known)
         context.launch(own.pressure.source_tangent, *every, own.source)
+        if self._bodies is not None:
+            self._bodies.add_source(context, every, own.source)
         own.solve(context, new["e"], self._e_dot)
         context.launch(own.pressure.correct_tangent, at, *every, e_dot=self._e_dot)
         pull = {"y": new["change"], "y_dot": change["change"], **self._T, "T_dot": change["T"]}
@@ -135,7 +162,10 @@ class CoarseTangent:
         thrown = {"u": new["thrust"], "v_star": own.still, "v_star_dot": own.still}
         thrown |= {"kick_dot": change["thrust"], "u_dot": change["u"]}
         context.launch(own.velocity.velocity.tangent, pull, thrown, *known)
-        context.launch(own.length.share_tangent, found, left, own.parts, *known)
+        carried = self._unmoved
+        if self._bodies is not None:
+            carried = self._bodies.carried(context, new["change"], change["change"])
+        context.launch(own.length.share_tangent, found, left, carried, own.parts, *known)
         steps = {name: at[name] for name in ("k_dot", "y_dot", "u_dot")}
         context.launch(own.length.apply_tangent, steps, found, left, sums_dot=own.sums(own.parts["parts"]))
 
@@ -143,12 +173,15 @@ class CoarseTangent:
 class CoarseAdjoint:
     """Reverse mode."""
 
-    def __init__(self, coarse: Coarse, layout: Layout):
+    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints):
         precision = layout.precision
         real, vector, six = precision.real, precision.vector, symmetric(precision).kind
         self._coarse, self._multiplier = coarse, coarse.numbers()
+        self._bodies = None
+        if coarse.bodies is not None and bodies is not None:
+            self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies, bar)
         self._bars = layout.arrays("_bar", h=vector, N=matrix_type(precision))
-        self._steps = layout.arrays("_bar", r=real, change=real, thrust=vector, alpha=real)
+        self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, alpha=real)
         self._through = layout.arrays(T=six, f=vector, kick_bar=vector, v_bar=vector)
         self._sum = layout.sum_of(real)
 
@@ -165,7 +198,10 @@ class CoarseAdjoint:
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])
         total = self._sum(found["alpha_bar"])
+        left |= own.carried(context, new["change"])
         context.launch(own.length.apply_adjoint, {"alpha_bar": total}, left, steps, found, *known, u_bar=u_bar)
+        if self._bodies is not None:
+            self._bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
         thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}
         context.launch(own.velocity.own_adjoint, thrown, through, *known)
         context.launch(own.velocity.velocity.adjoint, thrown, through, *known, y_bar=found["change_bar"])
@@ -173,6 +209,8 @@ class CoarseAdjoint:
         context.launch(own.pressure.correct_adjoint, at, {"y_bar": steps["y_bar"]}, own.source, *every)
         own.solve(context, new["e"], self._multiplier)
         context.launch(own.pressure.source_adjoint, *every, multiplier=self._multiplier)
+        if self._bodies is not None:
+            self._bodies.add_source(context, every, new["e"], self._multiplier)
         context.launch(own.residual.residual_adjoint, steps, found, at, *known)
 
     def finish(self, context: StepContext, known: tuple[Named, ...]) -> None:

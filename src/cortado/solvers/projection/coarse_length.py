@@ -13,7 +13,8 @@ from cortado.device.precision import Precision
 
 @dataclass(frozen=True)
 class LengthKernels:
-    """Of alpha, given d and the thrust -D^T d / m."""
+    """Of alpha, given d, the thrust -D^T d / m, and as ``carried`` the G d of free bodies, see
+    `cortado.solvers.projection.coarse_bodies`."""
 
     share: Any
     share_tangent: Any
@@ -50,12 +51,14 @@ def length_kernels(precision: Precision) -> LengthKernels:
         m: wp.array(dtype=real),
         r: wp.array(dtype=real),
         change: wp.array(dtype=real),
+        carried: wp.array(dtype=real),
         thrust: wp.array(dtype=vector),
         # out
         parts: wp.array(dtype=pair_of),
     ):
         i = wp.tid()
-        parts[i] = pair_of(r[i] * change[i], m[i] * wp.dot(thrust[i], thrust[i]))
+        d = change[i]
+        parts[i] = pair_of(r[i] * d, m[i] * wp.dot(thrust[i], thrust[i]) + d * carried[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def apply(
@@ -81,14 +84,16 @@ def length_kernels(precision: Precision) -> LengthKernels:
     def share_tangent(
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
-        of: bundle(r=real, r_dot=real, change=real, change_dot=real, thrust=vector, thrust_dot=vector),
+        of: bundle(r=real, change=real, carried=real, thrust=vector),
+        dot: bundle(r=real, change=real, carried=real, thrust=vector),
         # out
         parts: wp.array(dtype=pair_of),
     ):
         i = wp.tid()
-        first = of.r_dot[i] * of.change[i] + of.r[i] * of.change_dot[i]
-        f, f_dot = of.thrust[i], of.thrust_dot[i]
-        parts[i] = pair_of(first, m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot))
+        first = dot.r[i] * of.change[i] + of.r[i] * dot.change[i]
+        f, f_dot = of.thrust[i], dot.thrust[i]
+        second = m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot)
+        parts[i] = pair_of(first, second + dot.change[i] * of.carried[i] + of.change[i] * dot.carried[i])
 
     @wp.kernel(module=module, enable_backward=False)
     def apply_tangent(
@@ -130,7 +135,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
         sums: wp.array(dtype=pair_of),
         alpha_bar: wp.array(dtype=real),
         m: wp.array(dtype=real),
-        of: bundle(r=real, change=real, thrust=vector),
+        of: bundle(r=real, change=real, carried=real, thrust=vector),
         u_bar: wp.array(dtype=vector),
         # in and out: at first those of k' and y', at last those of k and y
         k_bar: wp.array(dtype=real),
@@ -138,6 +143,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
         m_bar: wp.array(dtype=real),
         # out
         change_bar: wp.array(dtype=real),
+        carried_bar: wp.array(dtype=real),
         thrust_bar: wp.array(dtype=vector),
         r_bar: wp.array(dtype=real),
     ):
@@ -152,7 +158,8 @@ def length_kernels(precision: Precision) -> LengthKernels:
         k_bar[i] = no
         y_bar[i] = new_bar
         m_bar[i] = m_bar[i] + second_bar * wp.dot(f, f)
-        change_bar[i] = alpha * new_bar + first_bar * of.r[i]
+        change_bar[i] = alpha * new_bar + first_bar * of.r[i] + second_bar * of.carried[i]
+        carried_bar[i] = second_bar * of.change[i]
         thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * second_bar) * f
         r_bar[i] = first_bar * of.change[i]
 

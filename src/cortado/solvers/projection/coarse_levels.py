@@ -135,8 +135,16 @@ class Level(NamedTuple):
 class Levels:
     """All grids of the matrix of a solver."""
 
-    def __init__(self, precision: Precision, dimension: int, shape: tuple[int, int, int], members: int, device: Any):
-        """``shape``: of the finest."""
+    def __init__(
+        self,
+        precision: Precision,
+        dimension: int,
+        shape: tuple[int, int, int],
+        members: int,
+        device: Any,
+        rows: int = 0,
+    ):
+        """``shape``: of the finest, to whose matrix B^T B with so many ``rows`` is added."""
         self._kernels, self._device = level_kernels(precision, dimension), device
         self._solve = solve_kernel(precision, dimension, device.is_cpu)
         factors: list[tuple[int, ...]] = [(1, 1, 1)]
@@ -157,6 +165,8 @@ class Levels:
         ]
         self.A, self.r = self.levels[0].A, residual[: counts[0]]
         """The matrix of the finest grid, (3^d, nodes), and (nodes,) what is solved for."""
+        self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
+        """(rows, nodes) of which B^T B is added to that matrix."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
         """(members,) iterations of the last solve."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
@@ -174,6 +184,7 @@ class Levels:
         system.x_values, system.z_values = numbers(at[-1]), numbers(at[-1])
         system.direction, system.image = numbers(counts[0]), numbers(counts[0])
         system.partial = numbers(teams * blocks)
+        system.rows, system.B = rows, self.B.flatten()
         system.gate = wp.zeros(2 * teams, dtype=wp.int32, device=device)
 
     def begin(self, context: StepContext) -> None:
@@ -185,6 +196,6 @@ class Levels:
             context.launch(self._kernels.weigh, level._asdict(), threads=len(level.weight))
 
     def solve(self, e: wp.array, tolerance: float, most: int) -> None:
-        """Write to ``e`` (nodes,) what solves A e = `r`, which is overwritten."""
+        """Write to ``e`` (nodes,) what solves (A + B^T B) e = `r`, which is overwritten."""
         limits = {"tolerance": tolerance, "most": most}
         launch(self._solve, self._threads, self._device, limits, system=self._system, e=e, block=BLOCK)

@@ -9,7 +9,7 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
     y' = y + alpha d,   u' = u - alpha D^T d / m,   alpha = sum_i r_i d_i / sum_i |D^T d|^2 / m, from 0 to 1.
 
 alpha is the step along d after which the kinetic energy is least, so that a correction never adds any, whatever the
-clamp leaves of it.
+clamp leaves of it. Free bodies add to A and to what alpha divides by: `cortado.solvers.projection.coarse_bodies`.
 
 eps makes e small at nodes that few particles touch. Everything goes between nodes and particles in two ways: `spread`
 sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the cells around a node, in their

@@ -1,5 +1,6 @@
-"""Solves A e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel 1952) with
-a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`.
+"""Solves (A + B^T B) e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel
+1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle is that of A alone: the
+few rows of B cost an iteration each, or less.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks does, which wait
 for one another between the phases of an iteration; levels with few nodes are the work of the first block of a team. A
@@ -194,10 +195,17 @@ SOLVE = """
         int done = 0;
         if (size > T(0)) each(false, own.nodes, [&](int i) { p[i] = z[i]; });
         while (size > T(0)) {
-            const T curvature = sum(own.nodes, [&](int i) {
+            T curvature = sum(own.nodes, [&](int i) {
                 q[i] = w[i] > T(0) ? product(own, i, [&](int j) { return p[j]; }) : T(0);
                 return p[i] * q[i];
             });
+            for (int row = 0; row < system.rows; ++row) {
+                const T* b = system.B.data + ((long long)row * system.members + member) * own.nodes;
+                meet();
+                const T along = sum(own.nodes, [&](int i) { return b[i] * p[i]; });
+                each(false, own.nodes, [&](int i) { q[i] += along * b[i]; });
+                curvature += along * along;
+            }
             const T step = size / curvature;
             each(false, own.nodes, [&](int i) { y[i] += step * p[i]; r[i] -= step * q[i]; });
             const T next = cycle();
@@ -239,7 +247,11 @@ def system_type(precision: Precision) -> Any:
         direction: numbers
         """p of conjugate gradients, on the finest grid."""
         image: numbers
-        """A p"""
+        """(A + B^T B) p"""
+        rows: wp.int32
+        """Of B."""
+        B: numbers
+        """Row by row, each with the nodes of all scenes."""
         partial: numbers
         """Parts of sums."""
         gate: wp.array(dtype=wp.int32)

@@ -38,7 +38,8 @@ class ProjectionTangent(ParticleTangent):
         self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
-        self._coarse = None if solver.coarse is None else CoarseTangent(solver.coarse, solver.layout)
+        own = solver.layout, self._bodies, self.dot
+        self._coarse = None if solver.coarse is None else CoarseTangent(solver.coarse, *own)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Replace the tangent of the replayed step's state by that of its result."""
@@ -148,7 +149,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
-        self._coarse = None if solver.coarse is None else CoarseAdjoint(solver.coarse, solver.layout)
+        own = solver.layout, self._bodies, self.bar
+        self._coarse = None if solver.coarse is None else CoarseAdjoint(solver.coarse, *own)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""

@@ -107,7 +107,7 @@ class ProjectionSteps(ParticleSolver):
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
         own = self.discretisation, self.layout, system.walled.dimension
-        self.coarse = Coarse(*own, grid, constants.spacing) if grid is not None else None
+        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies) if grid is not None else None
         """What corrects the pressure before each iteration; None where nothing does."""
         self.corrected = [self._new_corrected()] if grid is not None else self.iterates
         """The iterates that an iteration of the pressure begins with: the corrected ones, or those themselves."""
