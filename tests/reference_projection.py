@@ -199,8 +199,10 @@ class Projection:
         share = between(H + 2 * nu, 0.7, 0.95)
         correct = self.coarse(x, m, force, L, g, share, yielding) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
-        k = y = full * before[0]
-        v = v_star + full[:, None] * before[1]
+        far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
+        taken = np.where(far & ((before[1] * gamma).sum(1) > 0), 0, full)
+        k = y = taken * before[0]
+        v = v_star + taken[:, None] * before[1]
         t = 5.0
         for left in reversed(range(self.iterations)):
             if correct is not None:
@@ -226,7 +228,8 @@ class Projection:
         for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
             z = c + omega * 3 / (2 - root) * (self.density(now, x) - 1) / a
             c = np.where(z > 0, z, low * z)
-            now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+            back = (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+            now = moved - back / np.maximum(np.linalg.norm(back, axis=1) / (self.spacing / 6), 1)[:, None]
         if self.follow:
             slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)

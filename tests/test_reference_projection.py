@@ -12,7 +12,7 @@ from cortado.scene.discrete_scene import discretise
 from cortado.solvers.projection.coarse_grid import coarse_grid
 from reference_projection import Projection
 from scenes import plane, scene
-from test_projection import C2, COARSE, PERIODIC, SOLVER, thrown
+from test_projection import C2, CASES, COARSE, HURLED, PERIODIC, SOLVER, begun, thrown
 from test_reference import distance, target_of
 
 CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
@@ -110,6 +110,24 @@ def test_it_is_the_projection_of_the_warp_engine(made):
     forward = (bar * tangent.position_tangents.high[-1]).sum()
     size = np.linalg.norm(bar) * tangent.position_norms[-1]
     assert abs(forward - problem.tangent(point, directions)) < 1e-10 * size
+
+
+@pytest.mark.parametrize("case", HURLED)
+def test_fluid_that_is_hurled_at_walls_is_that_of_the_warp_engine(case):
+    """With the bounds of what walls press together, and their derivatives."""
+    made, steps = CASES[case](), 6
+    simulation, warp = reference.Simulation(made), Simulation(made, precision="float64")
+    point, directions = point_and_direction(simulation, steps)
+    point |= begun(case, simulation)
+    wanted, found = warp.run(steps, point), simulation.run(steps, point)
+    np.testing.assert_allclose(found.positions.high, wanted.positions, rtol=0.0, atol=1e-12)
+    target = target_of(simulation)
+    _, bars = Problem(warp, steps, losses.FinalPositions(target)).value_and_gradient(point)
+    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
+    for name, bar in bars.items():
+        assert distance(mine.parameters[name].high, bar) < 1e-10, name
+    analytic, dual = (simulation.tangent(point, directions, steps, method) for method in ("analytic", "dual"))
+    assert distance(dual.position_tangents[-1], analytic.position_tangents[-1]) < 1e-12
 
 
 @pytest.mark.parametrize("name", ["plane", "free space", "multilevel"])

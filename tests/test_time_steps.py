@@ -546,7 +546,7 @@ def wedge(gap, **solver):
     )
 
 
-def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monkeypatch):
+def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
     simulation = Simulation(wedge(0.02))
     whole = simulation.run(65)
     sizes = sizes_of(whole)
@@ -557,9 +557,6 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(monk
     assert rest.positions.tobytes() == whole.positions[before:].tobytes()
     pair = Simulation(wedge(0.02), batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
     assert pair[0].positions.tobytes() == whole.positions.tobytes()
-    monkeypatch.setattr(retaking, "TIMES", 0)
-    with pytest.raises(cortado.DivergedError, match=r"entered the solid 'disc'.* shut in by .*, or try a smaller"):
-        simulation.run(65)
     assert whole.diagnostics["greatest_density_errors"].max() < 0.3
 
 
@@ -619,9 +616,14 @@ def lowered(gap, kind="projection", **changes):
     )
 
 
-@pytest.mark.parametrize("kind", SOLVERS)
-def test_walls_that_close_to_less_than_a_spacing_are_the_cause_that_is_named(kind):
-    simulation = Simulation(lowered(0.5, kind))
+@pytest.mark.parametrize("gap", [0.0, 0.3, 0.5])
+def test_between_walls_that_close_to_less_than_a_spacing_the_projection_loses_nothing(gap):
+    run = Simulation(lowered(gap)).run(time=0.3)
+    assert run.times[-1] >= 0.3
+
+
+def test_walls_that_close_to_less_than_a_spacing_are_the_cause_that_is_named():
+    simulation = Simulation(lowered(0.5, "pcisph"))
     with pytest.raises(cortado.DivergedError) as found:
         simulation.run(time=0.3)
     assert "fluid is shut in by the container and the solid 'plate'" in str(found.value)

@@ -39,6 +39,7 @@ struct Projection {
     std::vector<Vectors<Scalar, D>> x_now;    // [i]: before repair i; the last is the result
     std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
     std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
+    std::vector<Values<Scalar>> held;         // [i]: the part of its way that a particle goes in repair i
     double error = 0;                         // average compression as the last repair found it
 
     State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back(), kick}; }
@@ -54,6 +55,20 @@ struct Projection {
     }
     // How much a particle is pulled after all iterations, by which it is shifted.
     Scalar pulled(std::size_t i) const { return effects[i].repaired * k.back()[i]; }
+    // f, by which the pressure of the step before is taken on; 0 where its kick would throw a particle at a wall.
+    Scalar taken(const Model<Scalar, D>& model, const State<Scalar, D>& state, std::size_t i) const {
+        const Vector<Scalar, D> way = model.time_step * state.kick[i];
+        const Scalar towards = model.spacing / Scalar(10);
+        const bool thrown = way.dot(moments[i].gamma) > Scalar(0) && way.dot(way) > towards * towards;
+        return thrown ? Scalar(0) : effects[i].full;
+    }
+    // Of a change of the way that a particle would go in a repair, that of the way that it goes, and its transpose.
+    Vector<Scalar, D> along(std::size_t repair, std::size_t i, const Vector<Scalar, D>& change) const {
+        const Scalar part = held[repair][i];
+        if (!(part < Scalar(1))) return change;
+        const Vector<Scalar, D> way = x_now[repair + 1][i] - x_moved[i];
+        return part * (change - (way.dot(change) / way.dot(way)) * way);
+    }
     // The velocities of the last iteration, by whose A particles are shifted.
     const Vectors<Scalar, D>& flow() const { return u[u.size() - 2]; }
     // b, for a density n
@@ -77,11 +92,13 @@ struct Projection {
         sized(x_now, repairs + 1);
         sized(c, repairs + 1);
         sized(excess, repairs);
+        sized(held, repairs);
         find(model, fluid, walls, count);
         kick.resize(count);
         for (std::size_t i = 0; i < count; ++i) {
-            k[0][i] = y[0][i] = effects[i].full * state.k[i];
-            u[0][i] = v_star[i] + effects[i].full * state.kick[i];
+            const Scalar full = taken(model, state, i);
+            k[0][i] = y[0][i] = full * state.k[i];
+            u[0][i] = v_star[i] + full * state.kick[i];
         }
         corrections.resize(model.nodes.count() > 0 ? iterations : 0);
         if (!corrections.empty()) spread(model, fluid, state.x);
@@ -249,7 +266,10 @@ private:
             Vector<Scalar, D> total = c[at + 1][i] * moments[i].gamma;
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
                 total += (model.volume * (c[at + 1][i] + c[at + 1][pair->other])) * pair->gradient();
-            x_now[at + 1][i] = x_moved[i] - total / model.rest_density;
+            const Vector<Scalar, D> back = total / model.rest_density;
+            const Scalar farthest = model.spacing / Scalar(6), square = back.dot(back);
+            held[at][i] = square > farthest * farthest ? Scalar(farthest / square_root(square)) : Scalar(1);
+            x_now[at + 1][i] = x_moved[i] - held[at][i] * back;
         });
     }
 };

@@ -32,10 +32,10 @@ public:
         Values<Real> y_bar(count_, Real(0));
         project(bar, y_bar, n_bar);
         each([&](std::size_t i) {
-            const Real first_bar = bar.k[i] + y_bar[i], full = at_.effects[i].full;
+            const Real first_bar = bar.k[i] + y_bar[i], full = at_.taken(model_, state_, i);
             bar.k[i] = full * first_bar;
             bar.kick[i] = full * bar.v[i];
-            effects_bar_[i].full += state_.k[i] * first_bar + state_.kick[i].dot(bar.v[i]);
+            if (full > 0) effects_bar_[i].full += state_.k[i] * first_bar + state_.kick[i].dot(bar.v[i]);
             v_star_bar_[i] += bar.v[i];
         });
         surroundings();
@@ -66,7 +66,7 @@ private:
             const Values<Real>& c = at_.c[k + 1];
             each([&](std::size_t i) {
                 moved_bar[i] += now_bar[i];
-                f_[i] = -now_bar[i] / model_.rest_density;
+                f_[i] = -at_.along(k, i, now_bar[i]) / model_.rest_density;
             });
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];

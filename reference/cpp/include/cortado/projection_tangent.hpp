@@ -102,7 +102,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     Vectors<Real, D> dv(count), du(count), dkick;  // du: before the last iteration
     each_particle(count, model.threads, [&](std::size_t i) {
         effects_dot[i] = SurroundingsSlope<Real, D>(model, at.moments[i]).tangent(moments_dot[i]);
-        const Real full = at.effects[i].full, dfull = effects_dot[i].full;
+        const Real full = at.taken(model, state, i), dfull = full > 0 ? effects_dot[i].full : Real(0);
         dk[i] = dy[i] = dfull * state.k[i] + full * dot.k[i];
         dv[i] = dv_star[i] + dfull * state.kick[i] + full * dot.kick[i];
     });
@@ -202,7 +202,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
                 const Vector<Real, D> dg = pair->hessian_product(dot.x[i] - dot.x[j]);
                 total += model.volume * ((dc[i] + dc[j]) * pair->gradient() + (c[i] + c[j]) * dg);
             }
-            dx_now[i] = dx_moved[i] - total / m;
+            dx_now[i] = dx_moved[i] - at.along(k, i, total / m);
         });
     }
     return {dx_now, dv, dk, dkick};

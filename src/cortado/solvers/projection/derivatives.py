@@ -63,7 +63,7 @@ class ProjectionTangent(ParticleTangent):
             measured = {"x_now": at["x_now"], "c_in": at["c"], "excess": at["excess"]}
             change = {"x_now_dot": self._x_now_dot, "c_in_dot": self._c_dot, "c_out_dot": self._c_dot}
             context.launch(kernels.repair.measure.tangent, *known, measured, change, omega=omegas[k])
-            there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"]}
+            there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"], "held": new["held"]}
             change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
             context.launch(kernels.repair.move.tangent, *known, there, change)
         if solver.following is not None:
@@ -93,10 +93,11 @@ class ProjectionTangent(ParticleTangent):
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """The first k and the iterations."""
         solver, kernels = self._solver, self._solver.kernels.pressure
+        beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
         before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
         change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
-        context.launch(kernels.start.tangent, *known, before, change, v_star_dot=self._v_star_dot)
+        context.launch(beginning.tangent, *known, solver.spaced, before, change, v_star_dot=self._v_star_dot)
         if self._coarse is not None:
             self._coarse.begin(context, known)
         for k in range(iterations):
@@ -219,7 +220,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         before |= {"kick_before": solver.carried[KICK], "kick_before_bar": self._kick_before_bar}
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar}
-        context.launch(kernels.pressure.start.adjoint, *known, before, steps)
+        context.launch(kernels.beginning.adjoint, *known, solver.spaced, before, steps)
         if self._bodies is not None:
             self._bodies.finish(context, self.bar, solver.around, self._around)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
@@ -234,7 +235,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         for k in reversed(range(repairs)):
             at, new = solver.repaired[k], solver.repaired[k + 1]
             bars = {"x_now_bar": self._x_now_bar, "x_moved_bar": self._x_moved_bar, "f": self._f}
-            context.launch(begin, *known, bars, x_now=new["x_now"], x_moved=solver.x_moved)
+            context.launch(begin, *known, bars, x_now=new["x_now"], held=new["held"], x_moved=solver.x_moved)
             measured = {"c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
             own = {"c_bar": self._c_bar, "n_now_bar": self._n_now_bar, "f": self._f}
             context.launch(move, *known, measured, own, omega=solver.repair_relaxations[k])

@@ -10,10 +10,9 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k is f times
-that of the step before, and the first v is v* + f w, with the kick w = -D^T k / m of the step before. Tension is let
-through by sigma, where particles are surrounded. Slopes of the clamp and of the maximum have corners, at which one of
-the two derivatives is taken. The result is v* - D^T k / m.
+b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are those
+of `cortado.solvers.projection.beginning`. Tension is let through by sigma, where particles are surrounded. Slopes of
+the clamp and of the maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
 """
 
 from collections.abc import Callable
@@ -38,8 +37,6 @@ from cortado.sph.moment_functions import matrix_type, symmetric
 class PressureKernels:
     """Of the projection."""
 
-    start: Kernels
-    """The first k of a step."""
     update: Kernels
     """k' and y'; its adjoint are three kernels, that of the clamp, and that of D without and with an adjoint of A from
     elsewhere."""
@@ -67,65 +64,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     clamp, LANES = clamp_functions(precision), discretisation.lanes
     wanted, parts = clamp.wanted, clamp.parts
     lane = lane_functions(precision, LANES).lane
-
-    @wp.kernel(module=module)
-    def start(
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
-        v_star: wp.array(dtype=vector),
-        # out
-        k: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        u: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        first = weights[i][1] * k_before[i]
-        k[i] = first
-        y[i] = first
-        u[i] = v_star[i] + weights[i][1] * kick_before[i]
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def start_tangent(
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
-        dot: bundle(k_before=real, kick_before=vector, weights=weights4, v_star=vector),
-        # out
-        k_dot: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        u_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        full, full_dot = weights[i][1], dot.weights[i][1]
-        first = full_dot * k_before[i] + full * dot.k_before[i]
-        k_dot[i] = first
-        y_dot[i] = first
-        u_dot[i] = dot.v_star[i] + full_dot * kick_before[i] + full * dot.kick_before[i]
-
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def start_adjoint(
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        u_bar: wp.array(dtype=vector),
-        # in and out
-        weights_bar: wp.array(dtype=weights4),
-        v_bar: wp.array(dtype=vector),
-        # out
-        k_before_bar: wp.array(dtype=real),
-        kick_before_bar: wp.array(dtype=vector),
-    ):
-        """``v_bar`` is the adjoint of v*."""
-        i = wp.tid()
-        bar, no = k_bar[i] + y_bar[i], real(0.0)
-        k_before_bar[i] = weights[i][1] * bar
-        kick_before_bar[i] = weights[i][1] * u_bar[i]
-        full_bar = k_before[i] * bar + wp.dot(kick_before[i], u_bar[i])
-        weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
-        v_bar[i] = v_bar[i] + u_bar[i]
 
     @wp.kernel(module=module)
     def update(
@@ -302,7 +240,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     even = divergence_adjoint_of("divergence_adjoint", sums.divergence_back, six, packed.times)
     uneven = divergence_adjoint_of("divergence_adjoint_whole", sums.velocity_gradient_back, matrix, whole_times)
     return PressureKernels(
-        Kernels(start, start_tangent, start_adjoint),
         Kernels(update, update_tangent, (clamp_adjoint, even, uneven)),
         whole_adjoint,
     )

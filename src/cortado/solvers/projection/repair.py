@@ -1,7 +1,10 @@
 """Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
 
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
-    x_k+1 = x' - (sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m.
+    d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|).
+
+No repair takes a particle further than a sixth of a spacing s: where walls leave no room, or where they press on what
+is in them, densities cannot be right, and a particle would be thrown through a wall.
 
 omega_k is another one in each (`cortado.solvers.projection.constants`). Velocities stay as they are: in them a repair
 would be a force that acts once more in the next step. r of `cortado.solvers.projection.effects` lets low densities
@@ -22,6 +25,10 @@ from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.density import density_sums
+
+FARTHEST = 1.0 / 6.0
+"""In spacings: how far the repairs of a step take a particle at most. In dams, with an obstacle, on a beach and with a
+cube that falls they went 0.155 at most."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,14 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
+    farthest = wp.constant(real(FARTHEST))
+
+    @wp.func
+    def along(change: vector, back: vector, held: real) -> vector:
+        """The change of ``held`` times ``back`` with that of ``back``, and its transpose. Held back, it only turns."""
+        if held < real(1.0):
+            return held * (change - (wp.dot(back, change) / wp.dot(back, back)) * back)
+        return change
 
     @wp.kernel(module=module)
     def measure(
@@ -128,14 +143,22 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         gamma: wp.array(dtype=vector),
         c: wp.array(dtype=real),
         x_moved: wp.array(dtype=vector),
+        spacing: real,
         # out
         x_now: wp.array(dtype=vector),
+        held: wp.array(dtype=real),
     ):
+        """``held`` is the part of its way that a particle goes."""
         i = s.first + wp.tid() // LANES
         total = push(i, x, c, s)
         if lane() > 0:
             return
-        x_now[i] = x_moved[i] - (total + c[i] * gamma[i]) / m[i]
+        back = (total + c[i] * gamma[i]) / m[i]
+        most, length, part = farthest * spacing, wp.length(back), real(1.0)
+        if length > most:
+            part = most / length
+        held[i] = part
+        x_now[i] = x_moved[i] - part * back
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def move_tangent(
@@ -146,6 +169,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         c: wp.array(dtype=real),
         x_moved: wp.array(dtype=vector),
         x_now: wp.array(dtype=vector),
+        held: wp.array(dtype=real),
         dot: bundle(x=vector, m=real, gamma=vector, c=real, x_moved=vector),
         # out
         x_now_dot: wp.array(dtype=vector),
@@ -155,13 +179,15 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         if lane() > 0:
             return
         change = total + dot.c[i] * gamma[i] + c[i] * dot.gamma[i]
-        x_now_dot[i] = dot.x_moved[i] - (change + dot.m[i] * (x_now[i] - x_moved[i])) / m[i]
+        back = (x_moved[i] - x_now[i]) / held[i]
+        x_now_dot[i] = dot.x_moved[i] - along((change - dot.m[i] * back) / m[i], back, held[i])
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def begin_adjoint(
         m: wp.array(dtype=real),
         x_now: wp.array(dtype=vector),
         x_moved: wp.array(dtype=vector),
+        held: wp.array(dtype=real),
         x_now_bar: wp.array(dtype=vector),
         # in and out
         m_bar: wp.array(dtype=real),
@@ -171,9 +197,10 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     ):
         """Of a particle's own part in x_k+1; f is the adjoint of the sum."""
         i = wp.tid()
-        bar = x_now_bar[i]
-        x_moved_bar[i] = x_moved_bar[i] + bar
-        m_bar[i] = m_bar[i] + wp.dot(bar, x_moved[i] - x_now[i]) / m[i]
+        back = (x_moved[i] - x_now[i]) / held[i]
+        bar = along(x_now_bar[i], back, held[i])
+        x_moved_bar[i] = x_moved_bar[i] + x_now_bar[i]
+        m_bar[i] = m_bar[i] + wp.dot(bar, back) / m[i]
         f[i] = -bar / m[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)

@@ -17,6 +17,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
+from cortado.solvers.projection.beginning import beginning_kernels
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
 from cortado.solvers.projection.constants import ProjectionConstants
@@ -49,6 +50,7 @@ times the stiffest wave of the lattice, and two of them up to 1.6 times."""
 class ProjectionKernels:
     """The kernels that only the projection needs."""
 
+    beginning: Any
     velocity: VelocityKernels
     pressure: PressureKernels
     shift: Any
@@ -60,6 +62,7 @@ class ProjectionKernels:
         """In 2 or 3 dimensions."""
         own = discretisation, dimension
         return cls(
+            beginning_kernels(*own),
             velocity_kernels(*own),
             pressure_kernels(*own),
             shift_kernels(*own),
@@ -95,11 +98,11 @@ class ProjectionSteps(ParticleSolver):
         self.pull = self.layout.arrays(T=symmetric(precision).kind)["T"]
         """y L of the present iteration."""
         kinds = {"u": vector, "A": matrix_type(precision), "d": real, "y": real, "k": real}
-        self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real}
+        self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
         """u, A and the divergence of u, y and k before each iteration; the last has u and y = k of all."""
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
-        """x_k, lambda and n - 1 before each repair."""
+        """x_k, lambda and n - 1 before each repair, and which part of its way a particle has gone to x_k."""
         self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.following = following_kernels(self.discretisation, system.walled.dimension) if follow else None
         """Those of velocities that follow the shift and the repairs; None where they do not."""
@@ -139,7 +142,7 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def spaced(self) -> dict[str, float]:
-        """Constants of the shift, as kernels call them."""
+        """Constants with the spacing, as kernels call them."""
         return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
@@ -210,7 +213,7 @@ class ProjectionSteps(ParticleSolver):
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
-        context.launch(kernels.pressure.start.forward, self.around, before, first)
+        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first)
         if self.coarse is not None:
             self.coarse.begin(context, self.around)
         return context
@@ -261,8 +264,8 @@ class ProjectionSteps(ParticleSolver):
         measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
         relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}
         context.launch(kernels.measure.forward, self.around, measured, relaxed)
-        moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"]}
-        context.launch(kernels.move.forward, self.around, moved)
+        moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"], "held": new["held"]}
+        context.launch(kernels.move.forward, self.around, self.spaced, moved)
 
     def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> wp.array:
         """Write the new state, and return its velocities, sorted."""
