@@ -28,7 +28,7 @@ def task(tmp_path):
     for path in EXAMPLES.glob("fit_heights_*.csv"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     file = tmp_path / "task.toml"
-    file.write_text((EXAMPLES / "fit_heights.toml").read_text("utf-8").replace("spacing = 0.02 ", "spacing = 0.04 "))
+    file.write_text((EXAMPLES / "fit_heights.toml").read_text("utf-8").replace("spacing = 0.02 ", "spacing = 0.026 "))
     return file
 
 
