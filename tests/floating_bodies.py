@@ -1,5 +1,7 @@
 """How deep does a body float, and how much water goes along with one that gets faster?"""
 
+from typing import Any
+
 import numpy as np
 
 from cortado import Scene, Simulation
@@ -42,6 +44,34 @@ def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
         "particles": len(simulation.positions),
         "draft over the exact one": float(drafts[len(drafts) // 2 :].mean() / wanted),
     }
+
+
+def disc_in_a_round_tank(density: float, file: str, spacing: float, steps: int, **solver: Any) -> np.ndarray:
+    """How much faster a disc of the radius a = 0.15 m gets in each step, in the middle of a round tank of the radius
+    b = 0.45 m that is full of water in rings, which a ``file`` takes on: over g (rho_0 - rho) / (rho + C rho_0) with
+    the added mass C = (b^2 + a^2) / (b^2 - a^2) of theory."""
+    inner, outer = 0.15, 0.45
+    radii = np.arange(inner + 0.5 * spacing, outer, spacing)
+    angles = [2.0 * np.pi * (np.arange(n) + 0.3 * n) / n for n in np.round(2.0 * np.pi * radii / spacing)]
+    rings = [r * np.stack([np.cos(angle), np.sin(angle)], axis=1) for r, angle in zip(radii, angles, strict=True)]
+    np.save(file, np.concatenate(rings))
+    round_about = {"shape": "sphere", "centre": [0.0, 0.0]}
+    scene = Scene(
+        dimension=2,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[{"shape": "points", "file": file, "phase": "water"}],
+        container={"shape": "none"},
+        solid=[
+            {"name": "tank", **round_about, "radius": outer, "side": "inside"},
+            {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density},
+        ],
+        solver={"kind": "projection", "time_step": STEP, **solver},
+    )
+    faster = np.diff(Simulation(scene, precision="float64").run(steps, record_every=1).solids["disc"].velocities[:, 1])
+    part = (outer**2 + inner**2) / (outer**2 - inner**2)
+    found: np.ndarray = faster / (9.81 * STEP * (1000.0 - density) / (density + 1000.0 * part))
+    return found
 
 
 def added_mass(across: int, deep: int, settling: int, iterations: int, steps: int = 1) -> dict[str, float]:

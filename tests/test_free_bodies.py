@@ -13,7 +13,7 @@ from cortado.runs.solid_motion import posed
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.solid_shapes import AnySolid
 from cortado.solvers.contact_strength import STIFFNESS
-from floating_bodies import floating_box
+from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
 from scenes import thrown
 
@@ -250,6 +250,14 @@ def test_a_box_that_is_laid_into_water_at_its_draft_stays_where_a_coarse_grid_kn
     scene = multilevel(plane(box, fluid=[water], discretisation={"spacing": 0.025}))
     run = Simulation(scene, precision="float64").run(8, record_every=1)
     assert np.abs(run.solids["raft"].velocities).max() < 0.001
+
+
+@pytest.mark.parametrize("density", [50.0, 200.0, 3000.0])
+def test_a_disc_gets_faster_as_its_added_mass_says(density, tmp_path):
+    """From the second step on; a light one is thrown about by a coarse grid that does not know its mass."""
+    solver = {"multilevel": True, "iterations": 10}
+    faster = disc_in_a_round_tank(density, str(tmp_path / "rings.npy"), 0.03, 6, **solver)
+    assert np.abs(faster[1:] - 1.0).max() < 0.15
 
 
 def test_a_body_lies_on_the_floor():
