@@ -159,7 +159,8 @@ class Projection:
 
     def step(self, x, v_star, before, m, dt, gravity=0.0):
         """Positions, velocities, and k with what it adds to velocities, after the step, from predicted velocities and
-        those two of the step before. Bodies begin at rest and fall with the ``gravity``."""
+        those two of the step before; and the divergence that the last iteration found, times the step. Bodies begin at
+        rest and fall with the ``gravity``."""
         (n, d), density = x.shape, self.density(x)
         _, g, total, gamma, nu, M, H, inverse = self.around(x)
         B = 1 / (1 + (nu / 0.05) ** 4)
@@ -218,6 +219,7 @@ class Projection:
             u, D = v, divergence(v) - falls - yielding @ y
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
+            missed = dt * np.where(up > 0, D - wanted, np.where(down < 0, tension * D, 0))
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
             y, k, t = new + (t - 1) / later * (new - k) * (left > 0), new, later
             kick = -force(y) / m[:, None]
@@ -233,7 +235,8 @@ class Projection:
         if self.follow:
             slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
             v = v + np.einsum("iab,ib->ia", slopes, now - x - dt * v)
-        return now, v, (k, kick)
+        share = between(H + 2 * nu, 0.7, 0.95)
+        return now, v, (k, kick), np.sqrt((share * missed**2).sum() / share.sum())
 
     def coarse(self, x, m, force, L, g, c, yielding):
         """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""

@@ -1,9 +1,12 @@
 """The projection against its slow twin, its derivatives against one another and differences, and what it promises."""
 
+import warnings
+
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
+from cortado.rollout.outcome import divergence_sentence
 from reference_projection import Projection
 from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 
@@ -64,8 +67,9 @@ def test_a_step_is_that_of_the_twin(case):
     x, v = given["initial_positions"], given["initial_velocities"]
     ends = np.zeros(len(m)), np.zeros_like(x)
     for step in range(1, 4):
-        x, v, ends = twin.step(x, v + dt * gravity, ends, m, dt)
+        x, v, ends, divergence = twin.step(x, v + dt * gravity, ends, m, dt)
         k, kick = ends
+        assert run.diagnostics["divergence"][step - 1] == pytest.approx(divergence, rel=1e-9, abs=0.0)
         for found, wanted in ((run.positions[step], x), (run.velocities[step], v)):
             np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-11)
         np.testing.assert_allclose(run.others["pressure_impulse"][step], k, rtol=1e-8, atol=1e-9)
@@ -86,6 +90,35 @@ def test_water_that_is_shut_in_stays_where_a_coarse_grid_knows_it(multilevel, le
     )
     run = Simulation(shut, precision="float64").run(10)
     assert least < run.velocities[-1][:, 0].mean() / (9.81 * 10 * 0.002) < most
+
+
+def resting(**solver):
+    """Water 10 deep."""
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+    room = {**box, "upper": [1.0, 1.5]}
+    return plane(
+        discretisation={"spacing": 0.1},
+        fluid=[{**box, "phase": "water"}],
+        container=room,
+        solver={**SOLVER, **solver},
+    )
+
+
+@pytest.mark.filterwarnings("ignore:solver.time_step is")
+def test_a_divergence_that_is_left_is_told():
+    """In steps that are too long for a pressure that travels, and not for one that is there at once."""
+    with pytest.warns(CortadoWarning, match=r"left a divergence of 0\.02 in step 6, .* and more than 0\.01 in 8 of 12"):
+        run = Simulation(resting(time_step=0.02), precision="float64").run(12)
+    told = divergence_sentence(run.diagnostics, run.scene)
+    assert told is not None and run.diagnostics["divergence"].argmax() == 5
+    batch = {"divergence": np.array([[0.0, 0.01], [np.nan, 0.03]])}
+    assert "0.03 in step 2 of scene 1, times the step, and more than 0.01 in 1 of 4 steps" in divergence_sentence(
+        batch, run.scene
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        at_once = Simulation(resting(time_step=0.019, multilevel=True), precision="float64").run(12)
+    assert at_once.diagnostics["divergence"].max() < 0.2 * run.diagnostics["divergence"].max()
 
 
 def test_what_a_lost_run_left_on_the_coarse_grid_is_not_read():

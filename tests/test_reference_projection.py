@@ -82,7 +82,7 @@ def test_steps_are_those_of_the_twin(make, smoothing, solver):
     x, v = given["initial_positions"], given["initial_velocities"]
     ends = np.zeros(len(x)), np.zeros_like(x)
     for step in range(1, 6):
-        x, v, ends = twin.step(x, v + dt * np.array(made.forces.gravity), ends, np.full(len(x), 1000.0), dt)
+        x, v, ends, _ = twin.step(x, v + dt * np.array(made.forces.gravity), ends, np.full(len(x), 1000.0), dt)
         np.testing.assert_allclose(run.positions.high[step], x, rtol=0.0, atol=1e-13)
         np.testing.assert_allclose(run.velocities.high[step], v, rtol=0.0, atol=1e-11)
     assert (ends[0] > 0.0).any() and (ends[0] < 0.0).any()

@@ -15,6 +15,21 @@ UNKNOWN = 2**31 - 1
 
 
 @dataclass(frozen=True)
+class Measure:
+    """What the errors of particles, in pairs, come to in a step."""
+
+    columns: tuple[str, ...]
+    """Names in the diagnostics of a run, made of that of the loop; the first is what a tolerance bounds."""
+    is_weighted: bool
+    """Whether a pair is a weighted square and its weight, of which the root of the mean is taken. Otherwise both are
+    the error, of which the average and the maximum are."""
+
+
+AVERAGE = Measure(("{}", "greatest_{}"), is_weighted=False)
+ROOT_MEAN_SQUARE = Measure(("{}",), is_weighted=True)
+
+
+@dataclass(frozen=True)
 class ConvergenceKernels:
     """The kernels of one thread a scene that count iterations and steps."""
 
@@ -29,10 +44,24 @@ class ConvergenceKernels:
 
 
 @cache
-def convergence_kernels(precision: Precision) -> ConvergenceKernels:
-    """The kernels for a precision."""
+def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> ConvergenceKernels:
+    """The kernels for a precision and what is measured."""
     real, pair = precision.real, precision.pair
-    module = kernel_module(f"convergence_{precision.name}")
+    module = kernel_module(f"convergence_{precision.name}{'_weighted' * measure.is_weighted}")
+
+    @wp.func
+    def average_and_maximum(sums: pair, particles: int) -> pair:
+        return pair(sums[0] / real(particles), sums[1])
+
+    @wp.func
+    def root_of_mean(sums: pair, particles: int) -> pair:
+        """Without any weight, 0."""
+        mean = real(0.0)
+        if sums[1] != real(0.0):
+            mean = sums[0] / sums[1]
+        return pair(wp.sqrt(mean), real(0.0))
+
+    reached = root_of_mean if measure.is_weighted else average_and_maximum
 
     @wp.kernel(module=module, enable_backward=False)
     def decide(
@@ -53,9 +82,9 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         if rounds[b] != wp.static(UNKNOWN):
             return
         count = iteration[b] + done
-        average = sums[b][0] / real(particles)
+        found = reached(sums[b], particles)
         iteration[b] = count
-        if count >= most or not (average > tolerance or sums[b][1] > greatest_tolerance):
+        if count >= most or not (found[0] > tolerance or found[1] > greatest_tolerance):
             rounds[b] = count
             wp.atomic_sub(active, 0, 1)
 
@@ -84,12 +113,12 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         iterations: wp.array2d(dtype=wp.int32),
         errors: wp.array2d(dtype=pair),
     ):
-        """Record the loop's iterations, those that were ``undecided`` included, and its (average, greatest) error, and
-        after the last loop count the step. The next loop begins with all scenes."""
+        """Record the loop's iterations, those that were ``undecided`` included, and what its errors come to, and after
+        the last loop count the step. The next loop begins with all scenes."""
         b = wp.tid()
         n = step[b]
         iterations[n, b] = iteration[b] + undecided
-        errors[n, b] = pair(sums[b][0] / real(particles), sums[b][1])
+        errors[n, b] = reached(sums[b], particles)
         iteration[b] = 0
         rounds[b] = wp.static(UNKNOWN)
         if b == 0:

@@ -12,7 +12,7 @@ from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher, sum_and_maximum
 from cortado.particles.state import Layout
 from cortado.solvers.containment import Containment
-from cortado.solvers.convergence import UNKNOWN, convergence_kernels
+from cortado.solvers.convergence import AVERAGE, UNKNOWN, Measure, convergence_kernels
 from cortado.solvers.solve_record import IterativeSolve, SolveRecord
 from cortado.solvers.solver import Counts
 
@@ -24,7 +24,7 @@ class LoopLimits:
     minimum_iterations: int
     maximum_iterations: int
     tolerance: float
-    """Bound on the average of the particles' errors."""
+    """Bound on the average of the particles' errors, or on what else the loop's measure has first."""
     greatest_tolerance: float
     """Bound on the maximum of the same; infinite where none is asked for."""
 
@@ -37,7 +37,7 @@ class LoopRecord:
         self.iterations = wp.zeros(shape, dtype=wp.int32, device=layout.device)
         """(steps, members) on the device."""
         self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
-        """(steps, members) average and greatest error, on the device."""
+        """(steps, members) what errors come to, as the loop's measure says, on the device."""
         self.loop = loop
         self._seen = HostCopy(self.iterations), HostCopy(self.errors)
         self.read(0)
@@ -49,11 +49,9 @@ class LoopRecord:
         iterations = iterations.astype(int)
         self.counts = iterations.max(axis=1)
         """(steps,) how often the loop went round, in the scene of a batch that took most."""
-        self.diagnostics: dict[str, NDArray] = {
-            loop.iterations_name: iterations[kept],
-            loop.errors_name: errors[..., 0][kept].astype(np.float64),
-            f"greatest_{loop.errors_name}": errors[..., 1][kept].astype(np.float64),
-        }
+        self.diagnostics: dict[str, NDArray] = {loop.iterations_name: iterations[kept]}
+        for number, name in enumerate(loop.columns):
+            self.diagnostics[name] = errors[..., number][kept].astype(np.float64)
         """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "LoopRecord") -> None:
@@ -66,11 +64,11 @@ class LoopRecord:
     def converged(self) -> NDArray:
         """(steps,) or (steps, batch) whether the errors came below the tolerances; always, with a fixed number of
         iterations."""
-        limits, name = self.loop.limits, self.loop.errors_name
-        average, greatest = self.diagnostics[name], self.diagnostics[f"greatest_{name}"]
+        limits, found = self.loop.limits, [self.diagnostics[name] for name in self.loop.columns]
         if limits is None or limits.minimum_iterations == limits.maximum_iterations:
-            return np.ones(average.shape, dtype=bool)
-        return (average <= limits.tolerance) & (greatest <= limits.greatest_tolerance)
+            return np.ones(found[0].shape, dtype=bool)
+        bounds = limits.tolerance, limits.greatest_tolerance
+        return np.logical_and.reduce([column <= bound for column, bound in zip(found, bounds, strict=False)])
 
 
 class IterationLog:
@@ -121,17 +119,24 @@ class Loop:
         launch: KernelLauncher,
         iterations_name: str = "iterations",
         errors_name: str = "density_errors",
+        measure: Measure = AVERAGE,
     ):
         """``limits`` None: it never goes round. The names are those of the diagnostics of a run."""
         precision, device = layout.precision, layout.device
-        self.limits, self.iterations_name, self.errors_name, self.layout = limits, iterations_name, errors_name, layout
+        self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
+        self.columns = [column.format(errors_name) for column in measure.columns]
+        """The names of what errors come to."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """(n,) the error of a particle, twice (for a sum and a maximum): every iteration writes it."""
+        """(n,) the error of a particle, as the `Measure` has it: every iteration writes it."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
         """(members,) how often the loop goes round in each scene of a batch, `UNKNOWN` until that is known: iteration k
         must leave a scene as it is where k is not below."""
-        self._launch, self._kernels = launch, convergence_kernels(precision)
-        self._sum = sum_and_maximum(layout.particles, precision, device, layout.members)
+        self._launch, self._kernels = launch, convergence_kernels(precision, measure)
+        self._sum = (
+            layout.sum_of(precision.pair)
+            if measure.is_weighted
+            else sum_and_maximum(layout.particles, precision, device, layout.members)
+        )
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0

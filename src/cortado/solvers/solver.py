@@ -30,7 +30,8 @@ class StepLog(Protocol):
     def diagnostics(self) -> Mapping[str, NDArray]:
         """(steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has ``converged``;
         PCISPH also ``iterations``, ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and
-        ``greatest_density_errors``. Reports draw ``density_errors``, and whole numbers as the iterations of loops.
+        ``greatest_density_errors``. The projection has ``divergence`` too. Reports draw ``density_errors``, and whole
+        numbers as the iterations of loops.
         """
 
     def read(self, steps: int) -> None:

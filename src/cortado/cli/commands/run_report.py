@@ -13,7 +13,7 @@ from cortado.pictures.figures import images, particles
 from cortado.pictures.film import lacking
 from cortado.pictures.pace import Pace
 from cortado.pictures.solid_lines import solid_outline
-from cortado.rollout.outcome import not_converged_sentence
+from cortado.rollout.outcome import divergence_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.supply import dry_sentence
 from cortado.runs.colouring import coloured_by
@@ -133,6 +133,6 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
     if not len(converged):
         return Section("The solver", figures=figures)
     every = "The pressure converged in every step."
-    return Section(
-        "The solver", [every if converged.all() else not_converged_sentence(converged, scene)], figures=figures
-    )
+    told = [every if converged.all() else not_converged_sentence(converged, scene)]
+    torn = divergence_sentence(rollout.diagnostics, scene)
+    return Section("The solver", [*told, torn] if torn else told, figures=figures)

@@ -73,7 +73,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         n: wp.array(dtype=real),
-        of: seen,
+        of: bundle(coarse=real, **own),
         at: iterate,
         # out
         k_out: wp.array(dtype=real),
@@ -81,8 +81,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         T: wp.array(dtype=six),
         error: wp.array(dtype=pair_of),
     ):
-        """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). A and the
-        divergence are written to ``at``; T is y' L."""
+        """``error``: the square of the divergence that is not wanted times the time step, weighted with c, which is 1
+        inside and beside walls and 0 at free surfaces, and c. A and the divergence are written to ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
         if lane() > 0:
@@ -109,7 +109,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         k_out[i] = new
         y_out[i] = later
         T[i] = later * pack(of.L[i])
-        error[i] = pair_of(dt * wp.abs(left), dt * wp.abs(left))
+        error[i] = pair_of(of.coarse[i] * (dt * left) * (dt * left), of.coarse[i])
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def update_tangent(

@@ -15,6 +15,7 @@ from cortado.device.grid import Grid
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
+from cortado.solvers.convergence import AVERAGE, ROOT_MEAN_SQUARE
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.beginning import beginning_kernels
@@ -118,9 +119,9 @@ class ProjectionSteps(ParticleSolver):
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
         limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
-        names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
+        named = ("iterations", "divergence", ROOT_MEAN_SQUARE), ("repairs", "density_errors", AVERAGE)
         self.loops = tuple(
-            Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, names, strict=True)
+            Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, named, strict=True)
         )
 
     def new_density(self) -> Surroundings:
