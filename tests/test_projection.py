@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
+from cortado.errors import SceneError
 from cortado.rollout.outcome import divergence_sentence
 from reference_projection import Projection
 from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
@@ -119,6 +120,60 @@ def test_a_divergence_that_is_left_is_told():
         warnings.simplefilter("error", CortadoWarning)
         at_once = Simulation(resting(time_step=0.019, multilevel=True), precision="float64").run(12)
     assert at_once.diagnostics["divergence"].max() < 0.2 * run.diagnostics["divergence"].max()
+
+
+MET = {**SOLVER, "tolerance": 3e-4, "maximum_iterations": 40}
+
+
+@pytest.mark.parametrize("multilevel", [False, True])
+def test_iterations_go_on_to_a_tolerance(multilevel):
+    """In a run that is taken up again too; where there are too few, the run says so."""
+    met = {**MET, "multilevel": multilevel}
+    simulation = Simulation(plane(solver=met), precision="float64")
+    given = thrown(simulation)
+    run, fixed = simulation.run(8, given), Simulation(plane(solver=SOLVER), precision="float64").run(8, given)
+    left, counts = run.diagnostics["divergence"], run.iterations
+    assert fixed.diagnostics["divergence"].max() > 3e-4 >= left.max() and run.converged.all()
+    assert counts.min() >= 2 and len(set(counts)) > 1
+    rest = simulation.run(4, state=run[:5].last_state)
+    np.testing.assert_array_equal(rest.iterations, counts[4:])
+    np.testing.assert_array_equal(rest.positions[-1], run.positions[-1])
+    with pytest.warns(CortadoWarning, match="the pressure did not converge in"):
+        few = Simulation(plane(solver={**met, "maximum_iterations": 3}), precision="float64").run(8, given)
+    assert few.iterations.max() == 3 and not few.converged.all()
+
+
+@pytest.mark.parametrize("multilevel", [False, True])
+def test_derivatives_are_those_of_as_many_iterations_as_a_step_took(multilevel):
+    simulation = Simulation(plane(solver={**MET, "multilevel": multilevel}), precision="float64")
+    given, rng = thrown(simulation), np.random.default_rng(4)
+    problem = Problem(simulation, 6, losses.CentreOfMass([0.3, 0.25]))
+    ways = {name: rng.normal(size=value.shape) for name, value in given.items()}
+    _, gradient = problem.value_and_gradient(given)
+    assert len(set(problem.diagnostics["iterations"])) > 1
+    reverse = sum((gradient[name] * way).sum() for name, way in ways.items())
+    assert problem.tangent(given, ways) == pytest.approx(reverse, rel=1e-10)
+    h = 1e-8
+    ends = [problem.value({name: value + s * h * ways[name] for name, value in given.items()}) for s in (1, -1)]
+    assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(reverse, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "solver, words",
+    [
+        ({"maximum_iterations": 9}, "maximum_iterations is 9, but must be left out, as there is no tolerance"),
+        ({"tolerance": 0.0}, "tolerance is 0.0, but must be greater than 0"),
+        ({"tolerance": 1e-3, "iterations": 60}, "maximum_iterations is 50, but must be at least iterations, 60"),
+    ],
+)
+def test_tolerances_that_mean_nothing_are_a_sentence(solver, words):
+    with pytest.raises(SceneError, match=words):
+        plane(solver={**SOLVER, **solver})
+
+
+def test_a_tolerance_is_that_of_one_scene():
+    with pytest.raises(InputError, match=r"batch is 2, .* as solver\.tolerance is that of one scene"):
+        Simulation(plane(solver=MET), batch=2)
 
 
 def test_what_a_lost_run_left_on_the_coarse_grid_is_not_read():

@@ -109,7 +109,8 @@ class Scene(SceneTables):
         aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
         off = {name for name in ("velocities_follow", "multilevel") if not getattr(self.solver, name, True)}
-        aside["solver"] = unused | off
+        endless = {"tolerance", "maximum_iterations"} if getattr(self.solver, "tolerance", 0.0) is None else set()
+        aside["solver"] = unused | off | endless
         if self.emitter and self.emitter.duration is None:
             aside["emitter"] = {*aside.get("emitter", ()), "duration"}
         aside |= {name: {"__all__": {"material"}} for name in ("phase", "solid") if name not in aside}

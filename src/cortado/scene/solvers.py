@@ -77,7 +77,12 @@ class ProjectionSolver(SolverTable):
     kind: Literal["projection"]
     """Name of the algorithm."""
     iterations: Annotated[int, count(1, 1_000)] = 2
-    """Iterations of the pressure in every step, each from that of the step before."""
+    """Iterations of the pressure in every step, each from that of the step before; at least, with a tolerance."""
+    tolerance: Annotated[float, quantity(gt=0.0)] | None = None
+    """Iterations end once the divergence that one finds is below it: times the step, its root mean square inside of the
+    fluid; left out, there are always as many."""
+    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
+    """Iterations of the pressure in a step at most, with a tolerance."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
     multilevel: Flag = False
@@ -91,6 +96,15 @@ class ProjectionSolver(SolverTable):
         "emitter": {"jitter": 0.05},
     }
     """What other tables have if they name none of it; `docs/projection.md` has the figures of each kernel."""
+
+    @model_validator(mode="after")
+    def _check_iterations(self) -> Self:
+        most, wanted = self.maximum_iterations, f"at least iterations, {self.iterations}"
+        if self.tolerance is None and most != type(self).model_fields["maximum_iterations"].default:
+            raise field_error(("maximum_iterations",), most, "left out, as there is no tolerance")
+        if self.tolerance is not None and self.iterations > most:
+            raise field_error(("maximum_iterations",), most, wanted)
+        return self
 
 
 class PackageSolver(SolverTable, PackageTable):

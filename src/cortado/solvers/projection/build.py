@@ -1,7 +1,11 @@
 """The projection as the solver of a scene."""
 
+from math import inf
+
+from cortado.errors import InputError
 from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import particle_system
+from cortado.solvers.loop import LoopLimits
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.projection.coarse_grid import coarse_grid
@@ -24,10 +28,20 @@ class ProjectionMaker:
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
-        counts = table.iterations, table.repairs
+        if setting.batch is not None and table.tolerance is not None:
+            raise InputError(
+                f"batch is {setting.batch}, but must be left out, as solver.tolerance is that of one scene."
+            )
         grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles) if table.multilevel else None
         constants = lattice_constants(setting.scene, setting.discrete)
-        return Projection(system, constants, *counts, table.velocities_follow, grid)
+        return Projection(system, constants, pressure_limits(table), table.repairs, table.velocities_follow, grid)
 
 
 maker = ProjectionMaker
+
+
+def pressure_limits(table: ProjectionSolver) -> LoopLimits:
+    """When the pressure loop may stop."""
+    if table.tolerance is None:
+        return LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
+    return LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)

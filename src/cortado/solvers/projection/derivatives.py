@@ -108,7 +108,7 @@ class ProjectionTangent(ParticleTangent):
                 self._coarse.correct(context, (drift, *known), before, at)
             drift = self._drift(context, at)
             new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
-            beta = solver.momenta[k]
+            beta = solver.momentum(k)
             context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift, beta=beta)
             self._press(context, known, solver.iterates[k + 1])
         if self._bodies is not None:
@@ -254,7 +254,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             self._coarse.begin()
         for k in reversed(range(iterations)):
             self._press(context, known, solver.iterates[k + 1], self._y_bar)
-            self._back(context, known, solver.corrected[k], solver.momenta[k], moves=k == iterations - 1)
+            self._back(context, known, solver.corrected[k], solver.momentum(k), moves=k == iterations - 1)
             if self._coarse is not None:
                 self._correct(context, known, k)
         if self._coarse is not None:

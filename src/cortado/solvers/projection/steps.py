@@ -15,7 +15,7 @@ from cortado.device.grid import Grid
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
-from cortado.solvers.convergence import AVERAGE, ROOT_MEAN_SQUARE
+from cortado.solvers.convergence import ROOT_MEAN_SQUARE
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.beginning import beginning_kernels
@@ -84,13 +84,14 @@ class ProjectionSteps(ParticleSolver):
         self,
         system: ParticleSystem,
         constants: ProjectionConstants,
-        iterations: int,
+        limits: LoopLimits,
         repairs: int,
         follow: bool,
         grid: Grid | None,
     ):
-        """Of so many iterations of the pressure and of the repair of density in every step; velocities ``follow`` the
-        shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure before each iteration."""
+        """Of iterations of the pressure within ``limits`` and so many repairs of density in every step; velocities
+        ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure before each
+        iteration."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -115,13 +116,12 @@ class ProjectionSteps(ParticleSolver):
         """What corrects the pressure before each iteration; None where nothing does."""
         self.corrected = [self._new_corrected()] if grid is not None else self.iterates
         """The iterates that an iteration of the pressure begins with: the corrected ones, or those themselves."""
-        self.momenta = momenta(iterations)
+        self._momenta = momenta(limits.minimum_iterations)
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
-        limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
-        named = ("iterations", "divergence", ROOT_MEAN_SQUARE), ("repairs", "density_errors", AVERAGE)
-        self.loops = tuple(
-            Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, named, strict=True)
+        self.loops = (
+            Loop(limits, self.layout, self.launch, "iterations", "divergence", ROOT_MEAN_SQUARE),
+            Loop(LoopLimits(repairs, repairs, 0.0, 0.0), self.layout, self.launch, "repairs", "density_errors"),
         )
 
     def new_density(self) -> Surroundings:
@@ -229,8 +229,12 @@ class ProjectionSteps(ParticleSolver):
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
         out["drift"] = self._drift(context, at)
         update = self.kernels.pressure.update.forward
-        context.launch(update, out, self.around, at, self.relaxed, beta=self.momenta[k])
+        context.launch(update, out, self.around, at, self.relaxed, beta=self.momentum(k))
         self.press(context, new)
+
+    def momentum(self, k: int) -> float:
+        """beta of iteration k; beyond the least number of them 0, as each may be the last."""
+        return self._momenta[k] if k < len(self._momenta) else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
         """That of walls, where bodies move as the y of an iterate pushes them."""
