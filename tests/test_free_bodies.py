@@ -473,7 +473,7 @@ def test_a_step_beside_bodies_is_that_of_the_twin(made, solver):
     x, v = given["initial_positions"], given["initial_velocities"]
     run, m = simulation.run(1, given), simulation.state()["reference_density"]
     twin = Projection.of(simulation)
-    x_new, v_new, (k, _) = twin.step(x, v + dt * gravity, (np.zeros(len(m)), np.zeros_like(x)), m, dt, gravity)
+    x_new, v_new, (k, _), _ = twin.step(x, v + dt * gravity, (np.zeros(len(m)), np.zeros_like(x)), m, dt, gravity)
     np.testing.assert_allclose(run.positions[-1], x_new, rtol=1e-10, atol=1e-11)
     np.testing.assert_allclose(run.velocities[-1], v_new, rtol=1e-10, atol=1e-11)
     assert len(twin.bodies) == 2
