@@ -90,7 +90,7 @@ BASES = {
     "projection": lambda: jet(
         container=ROOM,
         emitter={**jet().emitter.model_dump(), "duration": 0.5},
-        solver={"kind": "projection", "time_step": 0.001, "velocities_follow": True},
+        solver={"kind": "projection", "tolerance": 3e-5, "time_step": 0.001, "velocities_follow": True},
         schedule={
             "tilt": {"times": [0.0, 1.0], "values": [[5.0], [20.0]]},
             "nozzle_path": {"times": [0.0, 0.01], "values": [[0.3, 0.26], [0.31, 0.26]]},
@@ -166,6 +166,7 @@ ASIDE = {
     ("PcisphSolver", "density_tolerance"): "only where more iterations are taken: tests/test_solver.py",
     ("PcisphSolver", "maximum_density_tolerance"): "only where more iterations are taken: tests/test_solver.py",
     ("PcisphSolver", "maximum_iterations"): "only where the pressure does not converge: tests/test_solver.py",
+    ("ProjectionSolver", "maximum_iterations"): "only where the tolerance is not reached: tests/test_projection.py",
 }
 """Keys that others look at, or that cannot show here."""
 
