@@ -150,10 +150,15 @@ SCENES = {
         forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
     ),
 }
+SCENES |= {
+    f"{name}, multilevel": SCENES[name].replaced("solver.multilevel=true")
+    for name in ("projection in the plane", "free bodies in the plane", "a free body in space")
+}
 BATCHED = {
     "tolerance": splash(**TOLERANT),
     **{name: SCENES[name] for name in ("two fluids", "plane", "projection", "projection in the plane")},
     **{name: SCENES[name] for name in ("solids in the plane", "solids in space", "free bodies in the plane")},
+    **{name: one for name, one in SCENES.items() if name.endswith("in the plane, multilevel")},
 }
 
 
