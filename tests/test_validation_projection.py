@@ -5,6 +5,7 @@ import pytest
 from falling_jets import falling_jet
 from projected_flows import dam_break, elliptical_drop, hung_block, rotating_patch, taylor_green
 from sloping_films import sloping_film
+from standing_waves import standing_wave
 from still_fluids import still_water
 
 PCISPH = {"kind": "pcisph", "minimum_iterations": 3, "maximum_iterations": 60, "density_tolerance": 0.001}
@@ -75,3 +76,9 @@ def test_a_dam_break_makes_no_energy_and_is_not_compressed(time_step):
 def test_water_at_rest_has_no_lasting_vortex():
     """A metre of it, 20 particles deep, between upright walls, along which it sank with 0.3 m/s; PCISPH has 0.10."""
     assert still_water(20, 5.0).speed < 0.1
+
+
+def test_a_standing_wave_in_deep_water_lasts_as_it_must():
+    """Lamb (1932). It reaches no wall: rows beside walls damp it."""
+    wave = standing_wave(24, solver={"kind": "projection", "multilevel": True})
+    assert abs(wave.frequency - 1.0) < 0.005 and 0.9 < wave.damping < 1.1

@@ -17,6 +17,7 @@ from falling_jets import falling_jet
 from oscillating_drops import C2, C4, CUBIC
 from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, taylor_green
 from sloping_films import sloping_film
+from standing_waves import standing_wave
 from still_fluids import still_water, two_layers
 from viscous_flows import Channel
 
@@ -68,6 +69,15 @@ CASES: dict[str, Case] = {
             )
         )
         for n, seconds, kernel in product((20, 40), (2.5, 10.0), (C2, CUBIC, C4))
+    },
+    **{
+        f"standing wave, {n} deep, {long:g} depths long, {'between walls' if walls else 'periodic'}": (
+            lambda device, n=n, long=long, walls=walls: standing_wave(
+                n, long, walls, solver={"kind": "projection", "multilevel": True}, time_step=0.072 / n, device=device
+            )
+        )
+        for n in (24, 48)
+        for long, walls in ((2.0, False), (4.0, False), (4.0, True))
     },
     "water at rest in space, 20 deep": lambda device: still_water(20, device=device, dimension=3),
     **{
