@@ -47,7 +47,7 @@ def scene(name: str) -> dict[str, Any]:
             for k, phase in enumerate(names)
         ],
         "container": {"shape": "box", "lower": corner(0.0, 0.0, 0.0), "upper": corner(1.0, 1.0, 0.5)},
-        "solver": {"time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
+        "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
         **({"mixture": {"mobility": 1e-6}} if several else {}),
     }
 

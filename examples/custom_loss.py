@@ -38,7 +38,7 @@ scene = cortado.Scene(
     phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
     fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.3], "phase": "water"}],
     container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.2, 0.6]},
-    solver={"time_step": 0.002, "minimum_iterations": 4, "maximum_iterations": 4},
+    solver={"time_step": 0.002},
 )
 loss = ShareBeyond(wanted=1 / 3)
 problem = cortado.Problem(cortado.Simulation(scene, precision="float64"), steps=120, loss=loss)

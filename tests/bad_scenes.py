@@ -56,7 +56,7 @@ def plane(**changes) -> dict:
         "discretisation": {"spacing": 0.1},
         "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.001}],
         "fluid": [{"shape": "box", "lower": [0, 0], "upper": [1, 0.5], "phase": "water"}],
-        "solver": {"time_step": 1e-3},
+        "solver": {"kind": "pcisph", "time_step": 1e-3},
     }
     return data | changes
 

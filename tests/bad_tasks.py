@@ -24,6 +24,7 @@ lower = [0.0, 0.0]
 upper = [0.7, 0.8]
 
 [solver]
+kind = "pcisph"
 time_step = 0.0021
 minimum_iterations = 3
 maximum_iterations = 3
@@ -279,6 +280,7 @@ height = 0.03
 mobility = 1e-5
 
 [solver]
+kind = "pcisph"
 time_step = 0.002
 minimum_iterations = 3
 maximum_iterations = 3

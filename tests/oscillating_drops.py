@@ -56,7 +56,7 @@ def packed_disc(spacing, discretisation, dimension):
     made = {
         "dimension": dimension,
         "discretisation": {"spacing": spacing, **discretisation},
-        "solver": {"time_step": 0.001},
+        "solver": {"kind": "pcisph", "time_step": 0.001},
     }
     return Simulation(Scene(**made, phase=[water], fluid=[ball]), precision="float64").positions
 

@@ -11,11 +11,11 @@ def splash(**solver: Any) -> Scene:
     """125 particles that fall from rest and splash in a box (the report's gradient analysis)."""
     block = {"shape": "box", "lower": [0.0, 0.3, 0.0], "upper": [0.25, 0.55, 0.25], "phase": "water"}
     fixed = {} if "kind" in solver else {"minimum_iterations": 5, "maximum_iterations": 5}
-    return scene(name="splash", fluid=[block], solver={"time_step": 0.0021, **fixed, **solver})
+    return scene(name="splash", fluid=[block], solver={"kind": "pcisph", "time_step": 0.0021, **fixed, **solver})
 
 
 def scene(**changes: Any) -> Scene:
-    """125 particles that collapse from rest on the floor of a box, with tables replaced."""
+    """125 particles that collapse from rest on the floor of a box, by PCISPH, with tables replaced."""
     tables: dict[str, Any] = {
         "name": "collapse",
         "dimension": 3,
@@ -24,10 +24,17 @@ def scene(**changes: Any) -> Scene:
         "fluid": [{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.25, 0.25], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.6, 0.25]},
         "forces": {"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": True},
-        "solver": {"time_step": 0.0021, "minimum_iterations": 5, "maximum_iterations": 5, "density_tolerance": 0.01},
+        "solver": {
+            "kind": "pcisph",
+            "time_step": 0.0021,
+            "minimum_iterations": 5,
+            "maximum_iterations": 5,
+            "density_tolerance": 0.01,
+        },
     }
     tables |= changes
-    if tables["solver"].get("kind") == "projection" and "forces" not in changes:
+    tables["solver"] = {"kind": "pcisph", **tables["solver"]}
+    if tables["solver"]["kind"] == "projection" and "forces" not in changes:
         tables["forces"] = {**tables["forces"], "viscosity": "stress"}  # the only one that it has
     return Scene(**tables)
 

@@ -11,7 +11,13 @@ from cortado import CortadoWarning, InputError, Problem, Simulation, gradients
 from cortado.losses import CentreOfMass, FinalPositions, Frames
 
 STEPS = 8
-FREE = {"time_step": 0.0021, "minimum_iterations": 3, "maximum_iterations": 12, "density_tolerance": 1e-3}
+FREE = {
+    "kind": "pcisph",
+    "time_step": 0.0021,
+    "minimum_iterations": 3,
+    "maximum_iterations": 12,
+    "density_tolerance": 1e-3,
+}
 """As many pressure iterations as a scene needs, which differ between the scenes of a batch."""
 RANDOM = np.random.default_rng(3)
 ESTIMATORS = [

@@ -42,7 +42,13 @@ RIGHT = {
     "2-D": plane,
     "2-D, Wendland C2, iterations by tolerance": lambda: plane(
         discretisation=SPLINES["wendland_c2"],
-        solver={"time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 30, "density_tolerance": 0.001},
+        solver={
+            "kind": "pcisph",
+            "time_step": 0.002,
+            "minimum_iterations": 2,
+            "maximum_iterations": 30,
+            "density_tolerance": 0.001,
+        },
     ),
     "2-D, periodic, pairwise": lambda: plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},

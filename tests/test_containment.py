@@ -38,7 +38,7 @@ def cup(kernel: str = "cubic_spline") -> Scene:
         "fluid": [{"shape": "cylinder", "base": [0.0, 0.6, 0.0], "radius": 0.6, "height": 0.9, "phase": "water"}],
         "container": {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.65, "height": 1.6, "lid": True},
         "forces": {"gravity": [3.0, -9.81, 0.0]},
-        "solver": {"time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
+        "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
     }
     return _with_kernel(tables, kernel)
 
@@ -103,14 +103,14 @@ def test_a_column_that_touches_walls_starts_with_no_more_than_its_energy(round_w
         "fluid": [{**({**in_a_cup, "height": 1.0} if round_walls else column), "phase": "water"}],
         "container": {**in_a_cup, "height": 1.5} if round_walls else {**column, "upper": [2.0, 2.0, 1.0]},
         "forces": {"gravity": [0.0, -9.81, 0.0]},
-        "solver": {"time_step": 0.0005, "maximum_iterations": 100, "density_tolerance": 1e-4},
+        "solver": {"kind": "pcisph", "time_step": 0.0005, "maximum_iterations": 100, "density_tolerance": 1e-4},
     }
     made = _with_kernel(tables, kernel)
     energy = energies(made, Simulation(made, precision=precision).run(60))
     assert energy.max() <= 1.001 * energy[0]
 
 
-FAST = {"time_step": 0.05, "minimum_iterations": 3, "maximum_iterations": 3}
+FAST = {"kind": "pcisph", "time_step": 0.05, "minimum_iterations": 3, "maximum_iterations": 3}
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -260,7 +260,7 @@ def test_scenes_that_a_precision_does_not_resolve_are_refused():
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_particles_that_go_further_than_a_precision_resolves_are_lost():
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "velocity": [490.0, 0.0], "phase": "water"}
-    solver = {"time_step": 0.1, "minimum_iterations": 3, "maximum_iterations": 3}
+    solver = {"kind": "pcisph", "time_step": 0.1, "minimum_iterations": 3, "maximum_iterations": 3}
     with pytest.warns(CortadoWarning, match="limit of stability"):
         fast = plane(fluid=[block], container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}, solver=solver)
     assert Simulation(fast, precision="float64").run(12).positions[-1].max() > 500.0

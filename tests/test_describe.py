@@ -120,7 +120,7 @@ def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
 
 
 def test_steps_that_are_chosen_are_estimated():
-    simulation = cortado.Simulation(plane(solver={"time_step": "auto"}))
+    simulation = cortado.Simulation(plane(solver={"kind": "pcisph", "time_step": "auto"}))
     told, taken = RunLength.of(simulation, None, 0.2, EverySteps(1)), len(simulation.run(time=0.2).converged)
     assert told.is_about and told.time == 0.2 and told.frames == told.steps + 1 and told.film is not None
     assert 0.5 * taken < told.steps < 2.5 * taken
@@ -242,7 +242,7 @@ def test_densities_are_those_of_the_rest_lattice():
         fluid=[{"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "phase": "water"}],
         container={"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "periodic": [True, True]},
         forces={"gravity": [0, 0]},
-        solver={"time_step": 0.001},
+        solver={"kind": "pcisph", "time_step": 0.001},
     )
     simulation = cortado.Simulation(scene, precision="float64")
     rollout = simulation.rollout(2)
@@ -326,6 +326,7 @@ def test_what_went_over_the_rim_is_counted(folder, capsys):
         [forces]
         gravity = [0.0, 9.81, 0.0]
         [solver]
+        kind = "pcisph"
         time_step = 0.004
         """
     )

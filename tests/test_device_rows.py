@@ -22,7 +22,7 @@ def simulation(precision: str = "float64", **changes: Any) -> cortado.Simulation
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.5}],
         "fluid": [{"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "phase": "water"}],
         "container": {"shape": "box", "lower": [0, 0], "upper": [1, 1]},
-        "solver": {"time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 2},
+        "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 2},
     }
     return cortado.Simulation(cortado.Scene(**{**scene, **changes}), precision=precision)
 

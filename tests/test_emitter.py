@@ -319,7 +319,7 @@ def test_a_column_in_a_wall_is_named_where_the_pressure_does_not_converge():
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
         "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.4]},
         "forces": {"gravity": [0.0, -9.81]},
-        "solver": {"time_step": 0.001},
+        "solver": {"kind": "pcisph", "time_step": 0.001},
     }
     with pytest.warns(CortadoWarning, match=r"did not converge.*Shorten emitter\.length"):
         Simulation(Scene(**box, emitter={**nozzle, "length": 0.3})).run(3)

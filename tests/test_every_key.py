@@ -98,7 +98,7 @@ BASES = {
     ),
     "chosen": lambda: jet(
         phase=[{**WATER, "rheology": {"kind": "power_law", "flow_index": 0.6, "least_shear_rate": 0.1}}],
-        solver={"time_step": "auto", "courant": 0.02},
+        solver={"kind": "pcisph", "time_step": "auto", "courant": 0.02},
         forces={"surface_tension": 0.07},
     ),
     "mixture": lambda: plane_of_three(
@@ -153,7 +153,7 @@ BASES = {
     ),
     "alone": lambda: scene(
         container={"shape": "none"},
-        solver={"time_step": "auto", "greatest_time_step": 0.001},
+        solver={"kind": "pcisph", "time_step": "auto", "greatest_time_step": 0.001},
         picture={"width": 64, "height": 64, "camera_path": {"kind": "orbit"}},
     ),
 }

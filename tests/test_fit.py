@@ -36,7 +36,7 @@ SCENE = cortado.Scene(
     fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.18, 0.24], "phase": "syrup"}],
     container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.48, 0.36], "slip": "no"},
     forces={"gravity": [0.0, -9.81], "viscosity": "stress"},
-    solver={"time_step": TIME_STEP, "minimum_iterations": 3, "maximum_iterations": 3},
+    solver={"kind": "pcisph", "time_step": TIME_STEP, "minimum_iterations": 3, "maximum_iterations": 3},
 )
 
 

@@ -399,7 +399,11 @@ def test_a_batch_has_the_bits_of_single_runs(made):
         ({"times": [0.0, 1.0]}, {}, r"solid\[0\]\.times"),
         ({"surface_velocity": [1.0, 0.0]}, {}, r"solid\[0\]\.surface_velocity"),
         ({"lower": [-0.1, 0.3]}, {}, r"solid\[0\] is .* m deep in the container at"),
-        ({}, {"solver": {"time_step": 0.001}}, r"solver\.kind is 'pcisph', but must be \"projection\""),
+        (
+            {},
+            {"solver": {"kind": "pcisph", "time_step": 0.001}},
+            r"solver\.kind is 'pcisph', but must be \"projection\"",
+        ),
         ({}, {"forces": {"pressure": False}}, r"forces\.pressure"),
     ],
 )

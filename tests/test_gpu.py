@@ -56,7 +56,7 @@ SCENES = {
     "fixed": splash(),
     "tolerance": splash(**TOLERANT),
     "plane": plane(),
-    "steps that are chosen": plane(solver={"time_step": "auto"}),
+    "steps that are chosen": plane(solver={"kind": "pcisph", "time_step": "auto"}),
     "two fluids": two_layers(),
     "three fluids": plane_of_three(),
     "stress": plane(forces={"gravity": [0.0, -9.81], "viscosity": "stress"}),

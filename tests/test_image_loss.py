@@ -219,7 +219,7 @@ def cup() -> Scene:
         container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": radius, "height": 0.05},
         mixture={"mobility": 1e-5},
         forces={"gravity": [0.0, -9.81, 0.0]},
-        solver={"time_step": 0.0018, "minimum_iterations": 5, "maximum_iterations": 5},
+        solver={"kind": "pcisph", "time_step": 0.0018, "minimum_iterations": 5, "maximum_iterations": 5},
         render={"view": "top", "resolution": [32, 32]},
     )
 

@@ -25,7 +25,7 @@ ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.6], "slip": "no"}
 
 
 def thick(solve="implicit", time_step=0.002, viscosity=20.0, **changes):
-    solver = {"time_step": time_step, "minimum_iterations": 3, "maximum_iterations": 3}
+    solver = {"kind": "pcisph", "time_step": time_step, "minimum_iterations": 3, "maximum_iterations": 3}
     forces = {"gravity": [0.3, -9.81], "viscosity": "stress", "viscous_solve": solve}
     phase = {**HONEY, "rest_density": 1000.0, "viscosity": viscosity}
     return plane(
@@ -39,7 +39,7 @@ def cube(**changes):
         fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.2, 0.2, 0.2], "phase": "honey"}],
         container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.4, 0.2]},
         forces={"gravity": [0.3, -9.81, 0.1], "viscosity": "stress", "viscous_solve": "implicit"},
-        solver={"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3},
+        solver={"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3},
         **changes,
     )
 

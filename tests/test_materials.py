@@ -37,7 +37,7 @@ def scene_of(*materials, depth=0.02, picture=None, container=None, **tables):
         "phase": phases,
         "fluid": [{**body, "phase": f"p{k}"} for k, body in enumerate(bodies)],
         "container": {"shape": "box", "lower": [0.0] * 3, "upper": [0.06, 0.12, depth], **(container or {})},
-        "solver": {"time_step": 0.001},
+        "solver": {"kind": "pcisph", "time_step": 0.001},
         "picture": {"width": 64, "height": 64, "floor": False, "background": DARK, **FRONT, **(picture or {})},
     }
     return cortado.Scene(**{**given, **tables})

@@ -109,7 +109,7 @@ def test_walls_are_where_the_path_says_and_move_as_it_does(scene, scale):
 
 def test_a_run_goes_on_where_fluid_is_where_a_solid_was_at_the_start():
     block = {"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.7, 0.3], "motion": "path"}
-    scene = plane({**block, "velocity": [0.0, 2.0]}, solver={"time_step": 0.001})
+    scene = plane({**block, "velocity": [0.0, 2.0]}, solver={"kind": "pcisph", "time_step": 0.001})
     whole = Simulation(scene).run(300)
     assert ((np.abs(whole.positions[250] - [0.6, 0.1]) < [0.07, 0.07]).all(axis=1)).any()
     rest = Simulation(scene).run(50, state=whole[:251].last_state)
@@ -306,7 +306,9 @@ def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
     angles = np.interp(run.times, RESTING["times"], [0.0, 0.0, 1.0])
     assert np.diff(angles).max() * np.hypot(0.1, 0.1) == pytest.approx(0.2 * 0.05, rel=1e-4)
     course = {"times": [0.05, 0.051], "values": [[0.3, 0.26], [0.4, 0.26]]}
-    run = Simulation(jet(solver={"time_step": "auto"}, schedule={"nozzle_path": course})).run(time=0.06)
+    run = Simulation(jet(solver={"kind": "pcisph", "time_step": "auto"}, schedule={"nozzle_path": course})).run(
+        time=0.06
+    )
     ways = np.diff(np.interp(run.times, course["times"], [0.3, 0.4]))
     assert ways.max() == pytest.approx(0.2 * jet().discretisation.spacing, rel=1e-4)
     assert np.count_nonzero(run.times < 0.05) < 30
@@ -337,7 +339,10 @@ def test_a_path_that_jumps_is_one_step_and_said(length):
 
 
 def test_a_path_bounds_all_steps_where_nothing_else_does():
-    tables = {"container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}, "solver": {"time_step": "auto"}}
+    tables = {
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+        "solver": {"kind": "pcisph", "time_step": "auto"},
+    }
     scene = plane(RESTING, **tables, forces={"gravity": [0.0, 0.0], "viscosity": "none"})
     assert Simulation(scene).run(2).times[1] == pytest.approx(0.2 * 0.05 / 100.0)
 

@@ -18,7 +18,7 @@ def scene(dimension, *boxes, lower=0.0, upper=2.0):
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.01}],
         fluid=fluid,
         container={"shape": "box", "lower": [lower] * dimension, "upper": [upper] * dimension},
-        solver={"time_step": 0.001},
+        solver={"kind": "pcisph", "time_step": 0.001},
     )
 
 

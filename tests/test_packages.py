@@ -160,7 +160,7 @@ def force(*lines):
         (force('kind = "drg"'), r"force\[0\].kind is .drg., but must be a name that an installed package registers "),
         (
             solver('kind = "dfsph"'),
-            r'solver.kind is .dfsph., but must be "pcisph" or "projection", or a name .*"falling", "remembering"',
+            r'solver.kind is .dfsph., but must be "projection" or "pcisph", or a name .*"falling", "remembering"',
         ),
         (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, courant"),
         (solver('kind = "remembering"', "minimum_iterations = 2"), r"solver.minimum_iterations is not a key .* rate\."),

@@ -36,7 +36,7 @@ def scene_of(dimension: int, fluid, container=None, kernel="cubic_spline", suppo
         discretisation={"spacing": SPACING, "kernel": kernel, "support": support},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.1}],
         fluid=[{"phase": "water"} | body for body in fluid],
-        solver={"time_step": 5e-4},
+        solver={"kind": "pcisph", "time_step": 5e-4},
         **({} if container is None else {"container": container}),
     )
 

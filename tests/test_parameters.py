@@ -43,7 +43,7 @@ def test_values_of_a_scene_have_the_shapes_of_the_registry(made):
 
 @pytest.mark.parametrize("name", [p.name for p in PARAMETERS if p.absent])
 def test_a_parameter_that_a_scene_lacks_is_refused(name):
-    chosen = {"time_step": "auto", "greatest_time_step": 0.01}
+    chosen = {"kind": "pcisph", "time_step": "auto", "greatest_time_step": 0.01}
     made = plane(forces={"gravity": [0.0, 0.0], "viscosity": "none"}, solver=chosen)
     simulation = Simulation(made)
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))

@@ -164,7 +164,7 @@ THICK = {
 }
 IMPLICIT = {"gravity": [1.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
 PROJECTION = {"kind": "projection", "time_step": 0.002}
-SOLVER = {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
+SOLVER = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
 
 
 def small(viscosity: str, **changes):

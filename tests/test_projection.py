@@ -331,5 +331,9 @@ def test_a_scene_without_pressure_has_nothing_to_project():
     forces = {"gravity": [0.0, -9.81], "pressure": False}
     free = Simulation(plane(solver=SOLVER, forces=forces)).run(10).positions[-1]
     assert (
-        free.tobytes() == Simulation(plane(solver={"time_step": 0.002}, forces=forces)).run(10).positions[-1].tobytes()
+        free.tobytes()
+        == Simulation(plane(solver={"kind": "pcisph", "time_step": 0.002}, forces=forces))
+        .run(10)
+        .positions[-1]
+        .tobytes()
     )

@@ -237,7 +237,7 @@ def test_printed_equations_against_numpy(method):
     made = plane(
         container={"shape": "none"},
         forces=PAIRWISE,
-        solver={"time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1},
+        solver={"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1},
     )
     simulation, warp = reference.Simulation(made), Simulation(made, precision="float64")
     lattice, mass, mu, dt = warp.solver.lattice, 1000.0, 0.05, 0.002

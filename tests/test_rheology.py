@@ -163,7 +163,7 @@ def test_a_film_that_does_not_yield_creeps_as_slowly_as_is_said(kind):
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, depth], "phase": "mud"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [8 * spacing, 1.5 * depth], **sides},
             forces={"gravity": [9.81 * slope / size, -9.81 / size], "viscosity": "stress"},
-            solver={"time_step": 0.002},
+            solver={"kind": "pcisph", "time_step": 0.002},
         )
     end = Simulation(made, precision="float64").run(200)
     heights, speeds = end.positions[-1][:, 1] / depth, end.velocities[-1][:, 0]

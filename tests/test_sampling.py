@@ -24,7 +24,7 @@ def scene_of(dimension: int, fluid, container=None, spacing: float = SPACING) ->
     data = {"dimension": dimension, "discretisation": {"spacing": spacing}, "phase": phases, "fluid": fluids}
     if container is not None:
         data["container"] = container
-    return Scene(**data, solver={"time_step": 1e-4})
+    return Scene(**data, solver={"kind": "pcisph", "time_step": 1e-4})
 
 
 def box(lower, upper, **more) -> dict:

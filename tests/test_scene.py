@@ -166,7 +166,7 @@ def test_fluid_in_millimetres_is_asked_about(spacing, told):
     phase = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        Scene(dimension=3, phase=[phase], solver={"time_step": "auto"}, **tables)
+        Scene(dimension=3, phase=[phase], solver={"kind": "pcisph", "time_step": "auto"}, **tables)
     sentence = "the fluid weighs about 9.1e+10 kg: are its lengths in millimetres? A scene has metres."
     assert (sentence in [str(one.message) for one in caught]) is told
 
@@ -337,7 +337,9 @@ def test_the_stability_limit_is_the_smallest_of_three():
     assert stability_limit(falling) == pytest.approx(0.4 * 0.2 / sqrt(2 * 9.81 * 2))
     shallow = plane(fluid=[{"shape": "box", "lower": [0, 0], "upper": [1, 0.1], "phase": "water"}])
     assert stability_limit(Scene(**shallow)) == pytest.approx(0.25 * sqrt(0.2 / 9.81))
-    thick = plane(phase=[{"name": "water", "rest_density": 500, "viscosity": 5000}], solver={"time_step": 1e-5})
+    thick = plane(
+        phase=[{"name": "water", "rest_density": 500, "viscosity": 5000}], solver={"kind": "pcisph", "time_step": 1e-5}
+    )
     stress = 0.5 * 2 / stress_rate(CUBIC_SPLINE, 0.1, 0.2, 2) * 500 / 5000
     assert stability_limit(Scene(**thick)) == pytest.approx(stress)
     pairwise = thick | {"forces": {"gravity": [0, 0], "viscosity": "pairwise"}}
@@ -345,7 +347,9 @@ def test_the_stability_limit_is_the_smallest_of_three():
     assert stability_limit(Scene(**pairwise)) == pytest.approx(viscous)
     oil = {"name": "oil", "rest_density": 250, "viscosity": 0.0}
     above = {"shape": "box", "lower": [0, 0.5], "upper": [1, 1], "phase": "oil"}
-    both = plane(phase=[*thick["phase"], oil], fluid=[*thick["fluid"], above], solver={"time_step": 1e-5})
+    both = plane(
+        phase=[*thick["phase"], oil], fluid=[*thick["fluid"], above], solver={"kind": "pcisph", "time_step": 1e-5}
+    )
     assert stability_limit(Scene(**both)) == pytest.approx(stress / 2)
     assert stability_limit(Scene(**(both | {"fluid": thick["fluid"]}))) == stability_limit(Scene(**thick))
     assert stability_limit(Scene(**plane(forces={"gravity": [0, 0], "viscosity": "none"}))) == np.inf
@@ -355,10 +359,10 @@ def test_a_large_time_step_is_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
         limit = stability_limit(Scene(**plane()))
-        Scene(**plane(solver={"time_step": limit}))
+        Scene(**plane(solver={"kind": "pcisph", "time_step": limit}))
     sentence = r"solver\.time_step is .* s, but the limit of stability is .* s, which comes from \w+\."
     with pytest.warns(CortadoWarning, match=sentence):
-        Scene(**plane(solver={"time_step": 1.01 * limit}))
+        Scene(**plane(solver={"kind": "pcisph", "time_step": 1.01 * limit}))
 
 
 def lock_exchange(time_step):
@@ -372,7 +376,7 @@ def lock_exchange(time_step):
         fluid=[{"shape": "box", "lower": a, "upper": b, "phase": name} for name, (a, b) in ends.items()],
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4]},
         forces={"gravity": [0.0, -9.81]},
-        solver={"time_step": time_step},
+        solver={"kind": "pcisph", "time_step": time_step},
     )
 
 
@@ -390,7 +394,7 @@ def test_a_step_too_long_for_deep_fluid_is_warned_of():
 def test_the_depth_is_that_of_the_fluid():
     def depth(fluids, **tables):
         box = {"shape": "box", "lower": [0, 0], "upper": [1, 4]}
-        given = {"fluid": fluids, "container": box, "solver": {"time_step": 1e-5}, **tables}
+        given = {"fluid": fluids, "container": box, "solver": {"kind": "pcisph", "time_step": 1e-5}, **tables}
         return 1.8 * 0.1**1.5 / sqrt(9.81) / stability_limits(Scene(**plane(**given)))["depth"]
 
     def slab(lower, upper):
@@ -439,7 +443,7 @@ def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
         fluid=[drop],
         container={"shape": "box", "lower": [0, 0], "upper": [0.32, 0.32], "slip": "no"},
         forces={"gravity": [0, -9.81], "viscosity": form},
-        solver={"time_step": 1e-5},
+        solver={"kind": "pcisph", "time_step": 1e-5},
     )
     limit = stability_limits(scene)["viscosity"]
 
@@ -454,6 +458,43 @@ def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
     advice = r"viscosity limits the time step to about .* s, but it is .* s: try"
     with pytest.warns(CortadoWarning, match="from viscosity"), pytest.raises(DivergedError, match=advice):
         speed(3.0 * limit)
+
+
+def test_a_scene_that_names_no_solver_has_the_projection_with_what_suits_it():
+    made = Scene(**plane(solver={"time_step": 0.001}))
+    assert made.solver.kind == "projection"
+    assert (made.discretisation.kernel, made.discretisation.support) == ("wendland_c2", 2.6)
+    given = {"spacing": 0.1, "kernel": "wendland_c4", "support": 3.0}
+    told = Scene(**plane(solver={"time_step": 0.001}, discretisation=given)).discretisation
+    assert (told.kernel, told.support) == ("wendland_c4", 3.0)
+    other = Scene(**plane(solver={"kind": "pcisph", "time_step": 0.001})).discretisation
+    assert (other.kernel, other.support) == ("cubic_spline", 2.0)
+
+
+@pytest.mark.parametrize(
+    "kind, periodic, given, jitter",
+    [
+        ("projection", [True, True], {}, 0.05),
+        ("projection", [True, True], {"jitter": 0.0}, 0.0),
+        ("projection", [True, False], {}, 0.0),
+        ("pcisph", [True, True], {}, 0.0),
+    ],
+)
+def test_fluid_without_walls_or_surface_is_jittered_with_the_projection(kind, periodic, given, jitter):
+    full = {"shape": "box", "lower": [0, 0], "upper": [1, 1], "periodic": periodic}
+    solver = {"kind": kind, "time_step": 0.001}
+    made = Scene(
+        **plane(solver=solver, container=full, discretisation={"spacing": 0.1, **given}, forces={"gravity": [0, 0]})
+    )
+    assert made.discretisation.jitter == jitter and Scene.from_json(made.to_json()) == made
+
+
+@pytest.mark.parametrize(
+    "given, kind", [({"minimum_iterations": 4}, "pcisph"), ({"kind": "pcisph", "iterations": 4}, "projection")]
+)
+def test_keys_of_another_solver_are_refused_by_its_name(given, kind):
+    with pytest.raises(SceneError, match=f'iterations is 4, but must be left out, as only the solver "{kind}" has it'):
+        Scene(**plane(solver={"time_step": 0.001, **given}))
 
 
 def test_the_pairwise_viscosity_is_of_pcisph_alone():
@@ -478,7 +519,7 @@ def test_forms_that_are_not_as_viscous_as_asked_are_told_once(form, told):
         assert sentences(caught, 'slip is "no" at walls') == told
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        simulation = Simulation(Scene(**plane(forces=forces, solver={"time_step": 1e-4})))
+        simulation = Simulation(Scene(**plane(forces=forces, solver={"kind": "pcisph", "time_step": 1e-4})))
         problem = Problem(simulation, 2, CentreOfMass([0.0, 0.0]))
         problem.value({"viscosity": 0.2})
         problem.value_and_gradient({"gravity": [0.0, -9.81]})

@@ -29,7 +29,7 @@ def space(**emitter) -> Scene:
         phase=[{"name": name, "rest_density": 1000, "viscosity": 0.0} for name in ("water", "oil")],
         fluid=[block],
         emitter=NOZZLE | emitter,
-        solver={"time_step": 1e-4},
+        solver={"kind": "pcisph", "time_step": 1e-4},
     )
 
 
@@ -171,7 +171,7 @@ def alone(**tables) -> dict:
         "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.1}],
         "emitter": SLOT | {"flow_rate": 0.5, "outlet": [0.5, 1.5]},
         "container": {"shape": "box", "lower": [0, 0], "upper": [1, 2]},
-        "solver": {"time_step": 0.004},
+        "solver": {"kind": "pcisph", "time_step": 0.004},
         **tables,
     }
 

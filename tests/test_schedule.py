@@ -159,7 +159,7 @@ def test_in_free_fall_fluid_gains_what_gravity_gives():
     made = plane(
         container={"shape": "none"},
         forces={"viscosity": "none", "pressure": False},
-        solver={"time_step": DT},
+        solver={"kind": "pcisph", "time_step": DT},
         schedule={"gravity": table},
     )
     gained = np.diff(Simulation(made, precision="float64").run(6).velocities[[0, -1]], axis=0)[0]

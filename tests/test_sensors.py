@@ -106,7 +106,7 @@ def still_water(precision="float64", **changes):
         "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.8]},
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
         "discretisation": {"spacing": 0.025, "support": 3.0, "kernel": "wendland_c2"},
-        "solver": {"time_step": 0.001, "maximum_iterations": 100, "density_tolerance": 0.001},
+        "solver": {"kind": "pcisph", "time_step": 0.001, "maximum_iterations": 100, "density_tolerance": 0.001},
     }
     return cortado.Simulation(plane(**{**tables, **changes}), precision=precision)
 
@@ -227,7 +227,13 @@ def test_the_flow_of_an_emitter_is_its_flow_rate():
     outlet = {"phase": "water", "outlet": [0.3, 0.9], "radius": 0.075, "length": 0.5, "flow_rate": 0.3}
     room = {"shape": "box", "lower": [0.0, -3.0], "upper": [0.6, 1.6]}
     simulation = cortado.Simulation(
-        jet(emitter=outlet, fluid=[], container=room, forces={"gravity": [0.0, 0.0]}, solver={"time_step": 0.001})
+        jet(
+            emitter=outlet,
+            fluid=[],
+            container=room,
+            forces={"gravity": [0.0, 0.0]},
+            solver={"kind": "pcisph", "time_step": 0.001},
+        )
     )
     read = simulation.run(200, record_every=200, sensors={"jet": FlowRate([0.0, 0.7], [0.0, -1.0], 0.1)}).sensors["jet"]
     assert read["flow_rate"][-20:].mean() == pytest.approx(0.3, rel=0.01)
@@ -569,7 +575,7 @@ def within_plates(dimension, gap):
             {"name": name, "shape": "box", "lower": [*lower, *(0.0 for _ in deep)], "upper": [*upper, *deep]}
             for name, (lower, upper) in plates.items()
         ],
-        solver={"time_step": 0.002},
+        solver={"kind": "pcisph", "time_step": 0.002},
     )
 
 

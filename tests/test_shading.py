@@ -57,7 +57,7 @@ def scene_of(dimension=3, fluids=1, picture=None, **tables):
         "phase": phases,
         "fluid": [{"shape": "box", **body} for body in bodies],
         "container": {"shape": "box", "lower": [0.0] * dimension, "upper": [0.6, 0.5, 0.4][:dimension]},
-        "solver": {"time_step": 0.002},
+        "solver": {"kind": "pcisph", "time_step": 0.002},
         "picture": {**SMALL, **(picture or {})},
     }
     return cortado.Scene(**{**given, **tables})
@@ -483,7 +483,7 @@ def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
         del phase["material"]
     assert json.loads(plain.computed_json()) == former
     with pytest.raises(InputError, match=r"was begun with solver\.time_step"):
-        folder.require(scene_of(solver={"time_step": 0.001}).to_json(), "optimise")
+        folder.require(scene_of(solver={"kind": "pcisph", "time_step": 0.001}).to_json(), "optimise")
 
 
 @pytest.mark.parametrize(

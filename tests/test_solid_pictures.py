@@ -43,7 +43,7 @@ def scene_of(dimension, *solids, picture=None, **tables):
         "fluid": [{"shape": "box", "lower": [0.0] * d, "upper": [0.2, 0.3, 0.4][:d], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0] * d, "upper": [0.6, 0.5, 0.4][:d]},
         "solid": cut,
-        "solver": {"time_step": 0.002},
+        "solver": {"kind": "pcisph", "time_step": 0.002},
         "picture": {"width": 240, "height": 160, **(picture or {})},
     }
     return cortado.Scene(**{**given, **tables})

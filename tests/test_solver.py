@@ -28,7 +28,7 @@ MEMORY_NAMES = ["memory_iterations", "memory_errors", "greatest_memory_errors"]
 def moving(**changes):
     """Fluid that pushes towards a wall, so that its memory has something to forget."""
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water", "velocity": [0.8, 0.1]}
-    solver = {"time_step": 0.0021, "minimum_iterations": 2, "maximum_iterations": 20}
+    solver = {"kind": "pcisph", "time_step": 0.0021, "minimum_iterations": 2, "maximum_iterations": 20}
     return plane(**{"fluid": [block], "solver": solver, **changes})
 
 

@@ -12,7 +12,7 @@ WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.0}
 def scene(dimension, *fluid, **more):
     forces = {"gravity": [0.0] * dimension, "viscosity": "none"}
     tables = {
-        "solver": {"time_step": 0.001},
+        "solver": {"kind": "pcisph", "time_step": 0.001},
         "discretisation": {"spacing": 0.1},
         "phase": [WATER],
         "forces": forces,

@@ -200,7 +200,13 @@ SCENE = {
     "fluid": [{"shape": "box", "lower": [0.0, 0.05], "upper": [0.2, 0.25], "phase": "water"}],
     "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.35, 0.5]},
     "forces": {"gravity": [0.0, -9.81], "viscosity": "pairwise", "pressure": True},
-    "solver": {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3, "density_tolerance": 0.01},
+    "solver": {
+        "kind": "pcisph",
+        "time_step": 0.002,
+        "minimum_iterations": 3,
+        "maximum_iterations": 3,
+        "density_tolerance": 0.01,
+    },
 }
 
 

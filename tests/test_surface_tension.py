@@ -31,6 +31,7 @@ def drop(dimension: int, across: int, ohnesorge: float = 0.1, **changes) -> Scen
         "fluid": [{"shape": "sphere", "centre": [0.0] * dimension, "radius": RADIUS, "phase": "water"}],
         "forces": {"gravity": [0.0] * dimension, "surface_tension": SIGMA},
         "solver": {
+            "kind": "pcisph",
             "time_step": 0.075 * float(np.sqrt(DENSITY * spacing**3 / SIGMA)),
             "density_tolerance": 1e-3,
             "maximum_iterations": 100,

@@ -69,7 +69,7 @@ def test_steps_are_as_long_as_the_speed_lets_them(kind):
 
 def test_a_fall_that_no_fixed_step_of_its_first_size_survives():
     with pytest.warns(cortado.CortadoWarning, match="limit of stability"):
-        fixed = plane(solver={"time_step": min(chosen_limits(plane(solver=CHOSEN)).values())})
+        fixed = plane(solver={"kind": "pcisph", "time_step": min(chosen_limits(plane(solver=CHOSEN)).values())})
     with pytest.raises(cortado.DivergedError):
         Simulation(fixed).run(60)
     run = Simulation(plane(solver=CHOSEN)).run(time=1.0)
@@ -182,7 +182,7 @@ def test_a_schedule_is_read_at_the_true_times(name):
     maker, course = COURSES[name]
     scene = maker(solver=CHOSEN, schedule={name: course})
     run = Simulation(scene, precision="float64").run(STEPS)
-    fixed = Simulation(maker(solver={"time_step": 0.001}), precision="float64")
+    fixed = Simulation(maker(solver={"kind": "pcisph", "time_step": 0.001}), precision="float64")
     state = fixed.state()
     for time, size in zip(run.times, sizes_of(run), strict=False):
         at = time + (1.0 if name == "nozzle_path" else 0.5) * size
@@ -327,12 +327,12 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
     rows = np.tile(jet().emitter.outlet, (3, 1))
     for call, error, what in [
         (
-            lambda: plane(solver={"time_step": "fast"}),
+            lambda: plane(solver={"kind": "pcisph", "time_step": "fast"}),
             SceneError,
             'time_step is .fast., but must be a finite number, .* or "auto"',
         ),
         (
-            lambda: plane(solver={"time_step": 0.001, "courant": 0.2}),
+            lambda: plane(solver={"kind": "pcisph", "time_step": 0.001, "courant": 0.2}),
             SceneError,
             "courant is 0.2, but must be left out",
         ),

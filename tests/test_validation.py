@@ -76,7 +76,12 @@ def column_at_rest(
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.5]},
             forces={"gravity": [0.0, -GRAVITY], "viscosity": "pairwise"},  # see validation/README.md
-            solver={"time_step": time_step, "maximum_iterations": 100, "density_tolerance": tolerance},
+            solver={
+                "kind": "pcisph",
+                "time_step": time_step,
+                "maximum_iterations": 100,
+                "density_tolerance": tolerance,
+            },
         ),
         precision=precision,
     )
@@ -147,7 +152,7 @@ def dam_break(across: int = 20, length: float = 4.0, until: float = 3.15, **chan
         "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [wide, 2.0 * wide], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [length * wide, 3.0 * wide]},
         "forces": {"gravity": [0.0, -GRAVITY]},
-        "solver": {"time_step": time_step},
+        "solver": {"kind": "pcisph", "time_step": time_step},
     }
     steps = int(np.ceil(until * unit / time_step))
     places = [wide]
@@ -279,7 +284,7 @@ def poiseuille(times: np.ndarray, across: int, kernel: str = "cubic_spline", sup
                 "slip": "no",
             },
             forces={"gravity": [PUSH, 0.0]},
-            solver={"time_step": time_step, "density_tolerance": 0.001},
+            solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
         ),
         precision="float64",
     )
@@ -363,7 +368,12 @@ def taylor_green(
             fluid=[{"shape": "points", "file": str(file), "phase": "water"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, True]},
             forces={"gravity": [0.0, 0.0]},
-            solver={"time_step": until / steps, "maximum_iterations": 100, "density_tolerance": DENSITY_TOLERANCE},
+            solver={
+                "kind": "pcisph",
+                "time_step": until / steps,
+                "maximum_iterations": 100,
+                "density_tolerance": DENSITY_TOLERANCE,
+            },
         ),
         precision="float64",
     )

@@ -38,7 +38,7 @@ def resting(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": upper, "periodic": [True, True]},
         forces={"gravity": [0.0, 0.0], "viscosity": "none", "pressure": False},
         mixture={"mobility": 1.0, "mobility_form": "constant", "interface_width": width, **mixture},
-        solver={"time_step": 1.0},
+        solver={"kind": "pcisph", "time_step": 1.0},
     )
     return Simulation(scene, device=device, precision="float64")
 

@@ -3,12 +3,17 @@
 import pytest
 
 from falling_jets import falling_jet
-from projected_flows import dam_break, elliptical_drop, hung_block, rotating_patch, taylor_green
+from projected_flows import dam_break, elliptical_drop, hung_block, oblique_wave, rotating_patch, taylor_green
 from sloping_films import sloping_film
 from standing_waves import standing_wave
 from still_fluids import still_water
 
 PCISPH = {"kind": "pcisph", "minimum_iterations": 3, "maximum_iterations": 60, "density_tolerance": 0.001}
+
+
+def test_a_wave_of_shear_that_moves_decays_as_it_must_in_a_scene_that_names_no_solver():
+    found, exact = oblique_wave()
+    assert abs(found - exact) < 0.01
 
 
 @pytest.mark.parametrize(("across", "reynolds", "time", "most"), [(32, 100.0, 1.0, 0.035), (32, 10.0, 0.1, 0.01)])

@@ -217,7 +217,13 @@ def rayleigh_taylor(
                 "periodic": [True, False],
             },
             forces={"gravity": [0.0, -GRAVITY]},
-            solver={"time_step": time_step, "maximum_iterations": 50, "density_tolerance": 0.001, **solver},
+            solver={
+                "kind": "pcisph",
+                "time_step": time_step,
+                "maximum_iterations": 50,
+                "density_tolerance": 0.001,
+                **solver,
+            },
         )
     )
     heavy = simulation.mass_fractions[:, 0] > 0.5

@@ -28,7 +28,7 @@ def channel(viscosity, rheology, speeds, time_step, steps):
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": upper, "phase": "paste"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": upper, "periodic": [True, False], "slip": "no"},
             forces={"gravity": [PUSH, 0.0]},
-            solver={"time_step": time_step, "density_tolerance": 0.001},
+            solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
         ),
         precision="float64",
     )

@@ -112,7 +112,7 @@ def filled(container: dict[str, Any], kernel: str, support: float, solid: Any = 
         fluid=[{**body, "phase": "water", **fluid}],
         container=container,
         solid=list(solid),
-        solver={"time_step": 1e-4},
+        solver={"kind": "pcisph", "time_step": 1e-4},
     )
     return discretise(scene)
 

@@ -45,7 +45,7 @@ def simulation(
         "fluid": [{**box, "phase": "fluid"}],
         "container": container,
         "forces": forces,
-        "solver": {"time_step": 0.05 * spacing**2 / NU},
+        "solver": {"kind": "pcisph", "time_step": 0.05 * spacing**2 / NU},
     }
     return Simulation(Scene(**given | tables), precision="float64", forces=own)
 
@@ -62,7 +62,8 @@ def disordered(one: Simulation, disorder: float | None) -> np.ndarray:
         return (one.positions + disorder * spacing * random.uniform(-1.0, 1.0, one.positions.shape)) % lengths
     forces = {"viscosity": "none", "pressure": True, "gravity": [0.0] * scene.dimension}
     stirred = Simulation(
-        Scene(**scene.model_dump() | {"forces": forces, "solver": {"time_step": 0.05 * spacing}}), precision="float64"
+        Scene(**scene.model_dump() | {"forces": forces, "solver": {"kind": "pcisph", "time_step": 0.05 * spacing}}),
+        precision="float64",
     )
     v = random.uniform(-1.0, 1.0, one.positions.shape)
     return stirred.step(stirred.state({"initial_velocities": v}), {}, steps=60)["positions"] % lengths
@@ -170,7 +171,7 @@ class Channel:
             [Body(band, push=self.push, low=self.low, high=1.0 - self.low)],
             container={"periodic": [True, False], "slip": "no"},
             forces={"pressure": self.pressure},
-            solver={"time_step": self.time / steps, **SOLVERS[self.solver]},
+            solver={"kind": "pcisph", "time_step": self.time / steps, **SOLVERS[self.solver]},
         )
         y = one.positions[:, 1]
         v = np.column_stack([self.exact(y), np.zeros(len(y))])

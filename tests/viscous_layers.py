@@ -25,7 +25,7 @@ def two_layers(across: int, ratio: float, form: str = "stress") -> Simulation:
         {"shape": "box", "lower": [0.0, low], "upper": [long, low + 0.5], "phase": name}
         for name, low in (("thin", 0.0), ("thick", 0.5))
     ]
-    step = {"time_step": 0.05 * spacing**2 / (ratio * NU)}
+    step = {"kind": "pcisph", "time_step": 0.05 * spacing**2 / (ratio * NU)}
     return simulation([long, 1.0], spacing, form=form, phase=phases, fluid=layers, solver=step)
 
 

@@ -67,7 +67,7 @@ class Flow:
             fluid=self.blocks,
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.9]},
             forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
-            solver={"time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
+            solver={"kind": "pcisph", "time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
             render={"view": "plane", "resolution": [24, 36]},
             **({} if self.nozzle is None else {"emitter": self.nozzle}),
         )

@@ -44,7 +44,7 @@ def dam_break(kernel: str, support: float, round_walls: bool, **solver: Any) -> 
         0.0,
         fluid={"lower": lower, "upper": [x + 1.0 for x in lower]},
         container=cup if round_walls else tank,
-        solver={"time_step": 0.0005, "maximum_iterations": 100, **solver},
+        solver={"kind": "pcisph", "time_step": 0.0005, "maximum_iterations": 100, **solver},
     )
 
 
@@ -70,7 +70,7 @@ def at_rest(kernel: str, support: float, dimension: int) -> tuple[float, float, 
             0.001,
             fluid={"lower": lower, "upper": upper},
             container={"shape": "box", "lower": lower, "upper": [wide, 1.5, wide][:dimension]},
-            solver={"time_step": time_step, "maximum_iterations": 100, "density_tolerance": 0.001},
+            solver={"kind": "pcisph", "time_step": time_step, "maximum_iterations": 100, "density_tolerance": 0.001},
         )
     )
     first, last = round(2.0 / time_step), round(3.0 / time_step)

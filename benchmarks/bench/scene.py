@@ -25,7 +25,9 @@ def dam_break(particles: int) -> Scene:
         fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
         container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),
         forces=Forces(gravity=(0.0, -9.81, 0.0), viscosity="pairwise"),
-        solver=PcisphSolver(time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS),
+        solver=PcisphSolver(
+            kind="pcisph", time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS
+        ),
     )
 
 

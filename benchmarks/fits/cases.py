@@ -64,7 +64,8 @@ def two_fluids(viscosity: float, spacing: float = 0.02, **solver: Any) -> cortad
         "fluid": [{"shape": "box", "lower": [x, 0.0], "upper": [x + 0.1, 0.26], "phase": n} for n, _, _, x in fluids],
         "container": CONTAINER,
         "forces": {"gravity": [0.0, -9.81], "viscosity": "stress"},
-        "solver": solver or {"time_step": TIME_STEP, "minimum_iterations": 4, "maximum_iterations": 4},
+        "solver": solver
+        or {"kind": "pcisph", "time_step": TIME_STEP, "minimum_iterations": 4, "maximum_iterations": 4},
     }
     return cortado.Simulation(cortado.Scene(**tables))
 
@@ -104,7 +105,7 @@ def drop() -> Case:
         "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.036, 0.014], "phase": "oil"}],
         "container": {"shape": "none"},
         "forces": {"gravity": [0.0, 0.0], "viscosity": "stress", "surface_tension": 0.05},
-        "solver": {"time_step": 0.0008, "minimum_iterations": 4, "maximum_iterations": 4},
+        "solver": {"kind": "pcisph", "time_step": 0.0008, "minimum_iterations": 4, "maximum_iterations": 4},
     }
     simulation = cortado.Simulation(cortado.Scene(**tables))
     first, times = simulation.positions[::6], 0.0008 * np.linspace(2, STEPS, 10)

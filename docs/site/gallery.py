@@ -22,9 +22,8 @@ FRAMES, LASTS = 72, 3.6
 """Of a film, and how many seconds it takes to see them."""
 PICTURE = ("picture.width=640", "picture.height=360")
 ORBIT = "picture.camera_path={kind = 'orbit', turns = 0.25}"
-PROJECTION = ("solver={kind = 'projection', time_step = 'auto'}",)
 NEW = ("solver.time_step=auto",)
-"""Templates have steps for wider spacings."""
+"""Scenes have steps for wider spacings."""
 
 MIXED = "mixture={free_energy = 'miscible', mobility = 5e-7, mobility_form = 'constant'}"
 """Milk and coffee that mix by Fick's law, where single particles of either would be dots."""
@@ -69,8 +68,8 @@ class Entry:
 ENTRIES = {
     "shear": Entry(FIGURES / "shear.toml", 0.01, 3.0, 0.6),
     "pillar": Entry(TEMPLATES / "pillar.toml", 0.0125, 1.3, 0.35, NEW),
-    "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, PROJECTION),
-    "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, PROJECTION),
+    "dam": Entry(FIGURES / "dam_break_large.toml", 0.014, 1.6, 0.5, NEW),
+    "two_dams": Entry(FIGURES / "two_dams.toml", 0.016, 1.3, 0.5, NEW),
     "honey": Entry(FIGURES / "honey.toml", 0.0016, 1.2, 1.0, ("solver.time_step=0.0005", ORBIT)),
     "jug": Entry(FIGURES / "jug.toml", 0.00125, 1.8, 0.5),
     "turned_cup": Entry(FIGURES / "turned_cup.toml", 0.0018, 1.6, 0.4),
@@ -80,7 +79,7 @@ ENTRIES = {
     "drop": Entry(TEMPLATES / "drop.toml", 0.0028, 0.2, 0.4, (*NEW, *DROP)),
     "raft": Entry(TEMPLATES / "raft.toml", 0.016, 1.8, 0.5, NEW),
     "baffles": Entry(FIGURES / "baffles.toml", 0.0065, 1.7, 0.4),
-    "shaken": Entry(FIGURES / "shaken.toml", 0.0045, 0.75, 0.5, PROJECTION),
+    "shaken": Entry(FIGURES / "shaken.toml", 0.0045, 0.75, 0.5, NEW),
     "ring": Entry(FIGURES / "ring.toml", 0.002, 2.3, 0.9),
     "beach": Entry(FIGURES / "beach.toml", 0.015, 3.0, 0.5),
     "two_layers": Entry(TEMPLATES / "rayleigh_taylor.toml", 0.004, 1.4, 0.7, NEW),

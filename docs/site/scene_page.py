@@ -316,16 +316,16 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "## Time steps: `[solver]`",
         "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability "
         'is warned of; with `time_step = "auto"` it is [chosen before each step](steps.md#steps-that-are-chosen). '
-        "Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed package "
+        "A scene that names no `kind` has the projection. With the name of a solver that an installed package "
         "registers as `kind`, the table has the first four keys below and those of that solver.",
         (
+            ("ProjectionSolver", "### The projection", "[solver]\ntime_step = 0.002\niterations = 4"),
             (
                 "PcisphSolver",
                 "### PCISPH",
-                "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
+                '[solver]\nkind = "pcisph"\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n'
                 "density_tolerance = 0.001",
             ),
-            ("ProjectionSolver", "### The projection", '[solver]\nkind = "projection"\ntime_step = 0.002'),
         ),
     ),
     (

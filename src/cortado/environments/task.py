@@ -95,6 +95,6 @@ class Task(ABC):
         common: dict[str, Any] = {
             "name": self.name,
             "discretisation": {"spacing": self.spacing},
-            "solver": {"kind": "projection", "time_step": self.time_step},
+            "solver": {"time_step": self.time_step},
         }
         return Scene(dimension=2, **{**common, **tables})

@@ -41,7 +41,7 @@ class FrozenGeometry(AdjointEstimator):
 
     Bias: restoring forces are missing, such as those of gravity waves, so that the direction of the gradient is lost
     over times in which the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel.
-    Prior art: the default of DiffFR (Li et al. 2023).
+    Prior art: the default of DiffFR (Li et al. 2023). Only for scenes with the solver ``"pcisph"``; others say so.
     """
 
     batches = True
@@ -54,7 +54,8 @@ class FrozenGeometry(AdjointEstimator):
 class Tape(AdjointEstimator):
     """The exact adjoint by Warp's own automatic differentiation of the forward kernels.
 
-    It is slower than `Exact`, with atomics on a GPU, and is kept to check it.
+    It is slower than `Exact`, with atomics on a GPU, and is kept to check it. Only for scenes with the solver
+    ``"pcisph"``; others say so.
     """
 
     batches = True

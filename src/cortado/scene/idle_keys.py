@@ -15,6 +15,7 @@ from cortado.scene.model import SceneTables
 from cortado.scene.picture import Picture
 from cortado.scene.rheology import Carreau, Thinning, Yielding
 from cortado.scene.sentences import field_name
+from cortado.scene.solvers import what_suits
 from cortado.scene.tables import Table
 
 OF_DIFFUSION = ("free_energy", "strength", "mobility_form", "interface_width")
@@ -96,8 +97,9 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
             yield path, table, ("slip",), "no viscous force acts"
     if not forces.pressure:
         yield ("solver",), scene.solver, OF_ITERATIONS, "forces.pressure is false"
-    if all(isinstance(fluid, PointsFluid) for fluid in scene.fluid):
-        cut = scene.discretisation
+    cut = scene.discretisation
+    suited = ("discretisation", {"jitter": cut.jitter}) in what_suits(scene.solver, scene.container)
+    if all(isinstance(fluid, PointsFluid) for fluid in scene.fluid) and not suited:
         yield ("discretisation",), cut, ("jitter",), "points of files and an emitter's particles stay where they are"
     emitter, spacing = scene.emitter, scene.discretisation.spacing
     if (

@@ -43,7 +43,8 @@ class DiscretisationTable(Table):
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """How far a particle of a body is from its first place at most, along each axis and in spacings, at random but the
     same in every run: a fluid on a lattice is stiffer than one without order, and its derivatives at rest have corners.
-    Points of files stay where they are, and an emitter has a jitter of its own."""
+    With the solver "projection" it is 0.05 if not given where all axes are periodic. Points of files stay where they
+    are, and an emitter has a jitter of its own."""
 
     @property
     def support_radius(self) -> float:
@@ -145,11 +146,11 @@ class SceneTables(Table):
     @model_validator(mode="before")
     @classmethod
     def _choose_for_solver(cls, data: Any) -> Any:
-        """The kernel with its support, and the jitter of an emitter, that suit the solver, where they are not given."""
+        """The kernel with its support, and the jitters, that suit the solver, where they are not given."""
         if not isinstance(data, Mapping):
             return data
         data = dict(data)
-        for name, chosen in what_suits(data.get("solver")).items():
+        for name, chosen in what_suits(data.get("solver"), data.get("container")):
             given = data.get(name)
             if isinstance(given, Table) and not given.model_fields_set & set(chosen):
                 data[name] = given.model_copy(update=chosen)

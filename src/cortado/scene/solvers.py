@@ -1,8 +1,9 @@
 """The table [solver] of a scene: which algorithm takes a step, with the keys of that algorithm."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
+import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from cortado.errors import InputError
@@ -10,11 +11,15 @@ from cortado.scene.fields import Flag, OrWord, Text, count, field_error, quantit
 from cortado.scene.package_tables import Inline, PackageTable
 from cortado.scene.tables import Table
 
-OWN = ("pcisph", "projection")
-"""The kinds that are Cortado's own."""
+OWN = ("projection", "pcisph")
+"""The kinds that are Cortado's own; a scene that names none has the first."""
 COURANT = 0.2
 """The Courant number of a scene that gives none. With it PCISPH took 600 steps of seven scenes, dams, a drop, a jet and
 layers of 64 to 600 particles, in the plane and in space; with 0.3 it lost one of them, with 0.4 four."""
+
+
+Suits = tuple[tuple[str, Mapping[str, Any]], ...]
+"""Names of tables, with keys that go together and their values."""
 
 
 class SolverTable(Table):
@@ -29,6 +34,17 @@ class SolverTable(Table):
     smoothing lengths, of which the support radius has two; 0.2 if left out."""
     greatest_time_step: Annotated[float, quantity("s", gt=0.0)] | None = None
     """A time step that is chosen is no longer [s]; needed where nothing else bounds it, without gravity."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_keys_of_others(cls, data: Any) -> Any:
+        """Raises a `field_error` for a key that another solver of Cortado's own has."""
+        own = (ProjectionSolver, PcisphSolver)
+        for other in own if cls in own and isinstance(data, Mapping) else ():
+            for name in [name for name in data if name in other.model_fields and name not in cls.model_fields]:
+                kind = get_args(other.model_fields["kind"].annotation)[0]
+                raise field_error((name,), data[name], f'left out, as only the solver "{kind}" has it')
+        return data
 
     @model_validator(mode="after")
     def _check_time_step(self) -> Self:
@@ -49,10 +65,48 @@ class SolverTable(Table):
         return self.time_step
 
 
+class ProjectionSolver(SolverTable):
+    """How a step is solved by a projection of velocities, which pulls where fluid is on all sides."""
+
+    kind: Literal["projection"] = "projection"
+    """Name of the algorithm."""
+    iterations: Annotated[int, count(1, 1_000)] = 2
+    """Iterations of the pressure in every step, each from that of the step before; at least, with a tolerance."""
+    tolerance: Annotated[float, quantity(gt=0.0)] | None = None
+    """Iterations end once the divergence that one finds is below it: times the step, its root mean square inside of the
+    fluid; left out, there are always as many."""
+    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
+    """Iterations of the pressure in a step at most, with a tolerance."""
+    repairs: Annotated[int, count(1, 1_000)] = 2
+    """Iterations in every step that bring positions back to the rest density."""
+    multilevel: Flag = False
+    """Whether the smooth part of the pressure is found at once, on a grid with nodes two spacings apart, before each
+    iteration: water that is shut in or deep then has its pressure in the first step, and steps may be longer."""
+    velocities_follow: Flag = False
+    """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
+    containers lose less of their speed, and those with a surface can gain energy."""
+    suits: ClassVar[Suits] = (
+        ("discretisation", {"kernel": "wendland_c2", "support": 2.6}),
+        ("emitter", {"jitter": 0.05}),
+    )
+    """What other tables have if they name none of it; `docs/projection.md` has the figures."""
+    suits_without_surface: ClassVar[Suits] = (("discretisation", {"jitter": 0.05}),)
+    """The same where all axes are periodic, so that the order of a lattice never ends at a surface."""
+
+    @model_validator(mode="after")
+    def _check_iterations(self) -> Self:
+        most, wanted = self.maximum_iterations, f"at least iterations, {self.iterations}"
+        if self.tolerance is None and most != type(self).model_fields["maximum_iterations"].default:
+            raise field_error(("maximum_iterations",), most, "left out, as there is no tolerance")
+        if self.tolerance is not None and self.iterations > most:
+            raise field_error(("maximum_iterations",), most, wanted)
+        return self
+
+
 class PcisphSolver(SolverTable):
     """How a step is solved by PCISPH."""
 
-    kind: Literal["pcisph"] = "pcisph"
+    kind: Literal["pcisph"]
     """Name of the algorithm."""
     minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
     """Pressure iterations of a step, at least."""
@@ -71,42 +125,6 @@ class PcisphSolver(SolverTable):
         return self
 
 
-class ProjectionSolver(SolverTable):
-    """How a step is solved by a projection of velocities, which pulls where fluid is on all sides."""
-
-    kind: Literal["projection"]
-    """Name of the algorithm."""
-    iterations: Annotated[int, count(1, 1_000)] = 2
-    """Iterations of the pressure in every step, each from that of the step before; at least, with a tolerance."""
-    tolerance: Annotated[float, quantity(gt=0.0)] | None = None
-    """Iterations end once the divergence that one finds is below it: times the step, its root mean square inside of the
-    fluid; left out, there are always as many."""
-    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
-    """Iterations of the pressure in a step at most, with a tolerance."""
-    repairs: Annotated[int, count(1, 1_000)] = 2
-    """Iterations in every step that bring positions back to the rest density."""
-    multilevel: Flag = False
-    """Whether the smooth part of the pressure is found at once, on a grid with nodes two spacings apart, before each
-    iteration: water that is shut in or deep then has its pressure in the first step, and steps may be longer."""
-    velocities_follow: Flag = False
-    """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
-    containers lose less of their speed, and those with a surface can gain energy."""
-    suits: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "discretisation": {"kernel": "wendland_c2", "support": 2.6},
-        "emitter": {"jitter": 0.05},
-    }
-    """What other tables have if they name none of it; `docs/projection.md` has the figures of each kernel."""
-
-    @model_validator(mode="after")
-    def _check_iterations(self) -> Self:
-        most, wanted = self.maximum_iterations, f"at least iterations, {self.iterations}"
-        if self.tolerance is None and most != type(self).model_fields["maximum_iterations"].default:
-            raise field_error(("maximum_iterations",), most, "left out, as there is no tolerance")
-        if self.tolerance is not None and self.iterations > most:
-            raise field_error(("maximum_iterations",), most, wanted)
-        return self
-
-
 class PackageSolver(SolverTable, PackageTable):
     """How a step is solved by a solver that an installed package registers."""
 
@@ -118,22 +136,26 @@ class PackageSolver(SolverTable, PackageTable):
     advice = f"{' or '.join(f'{chr(34)}{name}{chr(34)}' for name in OWN)}, or "
 
 
-def what_suits(solver: Any) -> Mapping[str, Mapping[str, Any]]:
-    """What a solver, or a table that will be one, wants of other tables, by their names, where none of it is given."""
-    return ProjectionSolver.suits if _table_of(solver) == "ProjectionSolver" else {}
+def what_suits(solver: Any, container: Any) -> Suits:
+    """What a solver, or a table that will be one, wants of other tables where none of the keys of an entry is given."""
+    if _table_of(solver) != "ProjectionSolver":
+        return ()
+    periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)
+    full = periodic is not None and np.all(periodic)
+    return (*ProjectionSolver.suits, *(ProjectionSolver.suits_without_surface if full else ()))
 
 
 def _table_of(solver: Any) -> str:
     """Which table a solver is, by its kind."""
     kind = solver.get("kind", OWN[0]) if isinstance(solver, Mapping) else getattr(solver, "kind", OWN[0])
-    if kind == "projection":
-        return "ProjectionSolver"
-    return "PackageSolver" if isinstance(kind, str) and kind.strip() and kind not in OWN else "PcisphSolver"
+    if kind == "pcisph":
+        return "PcisphSolver"
+    return "PackageSolver" if isinstance(kind, str) and kind.strip() and kind not in OWN else "ProjectionSolver"
 
 
 AnySolver = Annotated[
-    Annotated[PcisphSolver, Tag("PcisphSolver")]
-    | Annotated[ProjectionSolver, Tag("ProjectionSolver")]
+    Annotated[ProjectionSolver, Tag("ProjectionSolver")]
+    | Annotated[PcisphSolver, Tag("PcisphSolver")]
     | Annotated[PackageSolver, Tag("PackageSolver"), Inline()],
     Discriminator(_table_of),
 ]
