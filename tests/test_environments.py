@@ -53,6 +53,12 @@ def checked_by_gymnasium(env, recwarn):
     assert not [sentence for sentence in said if "infinity" not in sentence]
 
 
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.filterwarnings("error::cortado.CortadoWarning")
+def test_the_scene_of_a_task_is_nothing_to_warn_of(name):
+    assert TASKS[name]().scene.solver.time_step > 0.0
+
+
 @pytest.mark.parametrize("name", SOME)
 def test_gymnasium_has_nothing_to_say(environments, name, recwarn):
     checked_by_gymnasium(environments(name), recwarn)

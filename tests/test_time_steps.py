@@ -675,6 +675,45 @@ def test_the_fall_through_a_funnel_bounds_the_step():
     assert stability_limits(scene)["speed"] == pytest.approx(0.4 * scene.discretisation.support_radius / fall)
 
 
+BLOCK = {"name": "block", "shape": "box", "lower": [0.5, 0.1], "upper": [0.6, 0.6]}
+OUTLET = {"phase": "water", "outlet": [0.2, 0.7], "radius": 0.1, "flow_rate": 0.1, "length": 0.3}
+TURNING = {"gravity": {"times": [0.0, 1.0], "values": [[0.0, -9.81], [0.0, -9.0]]}}
+FALLS = {
+    "rests": (0.3, {}, {}),
+    "reaches beneath the floor": (0.4, {"lower": [0.5, -0.1]}, {}),
+    "stays where it is": (0.3, {"motion": "path", "velocity": [0.0, 0.0]}, {}),
+    "beneath an outlet": (0.6, {}, {"emitter": OUTLET}),
+    "moves": (0.8, {"motion": "path", "velocity": [0.0, 0.1]}, {}),
+    "is free": (0.8, {"motion": "free", "density": 900.0}, {}),
+    "conveys": (0.8, {"surface_velocity": [0.0, 1.0]}, {}),
+    "while gravity changes": (0.8, {}, {"schedule": TURNING}),
+}
+
+
+@pytest.mark.parametrize("name", FALLS)
+def test_fluid_falls_to_the_foot_of_a_solid_from_where_it_is_highest_at_the_start(name):
+    """And through the whole container where something raises it or takes the solid down."""
+    fall, changes, tables = FALLS[name]
+    scene = plane(solid=[{**BLOCK, **changes}], solver={"kind": "projection", "time_step": 1e-4}, **tables)
+    speed = np.sqrt(2.0 * 9.81 * fall) + (0.1 / 0.2 if "emitter" in tables else 0.0)
+    assert stability_limits(scene)["solids"] == pytest.approx(0.25 * min(0.1, 1.6 * 0.05) / speed)
+
+
+def test_fluid_falls_from_where_it_is_put():
+    scene = plane(solid=[BLOCK], solver={"kind": "projection", "time_step": 1e-4})
+    limits = stability_limits(scene, {"initial_positions": np.array([[0.1, 0.675], [0.2, 0.1]])})
+    assert limits["solids"] == pytest.approx(0.4 * 0.05 / np.sqrt(2.0 * 9.81 * 0.6))
+
+
+def test_each_solid_bounds_the_step_by_its_own_thickness_and_its_own_foot():
+    """None does above all fluid."""
+    thin = {**BLOCK, "name": "thin", "lower": [0.5, 0.3], "upper": [0.56, 0.6]}
+    above = {**BLOCK, "name": "above", "lower": [0.1, 0.45], "upper": [0.16, 0.6]}
+    limits = [stability_limits(plane(solid=solids))["solids"] for solids in ([BLOCK], [thin], [BLOCK, thin], [above])]
+    steps = [0.4 * 0.05 / np.sqrt(2.0 * 9.81 * 0.3), 0.25 * 0.06 / np.sqrt(2.0 * 9.81 * 0.1)]
+    assert limits == pytest.approx([*steps, min(steps), np.inf])
+
+
 def funnel(thickness, kind, share=1.0):
     """Two slanted sides, three spacings apart below, that water runs through; a share of the greatest step."""
     low, high = np.array([0.03, 0.0]), np.array([0.4, 0.5])

@@ -8,13 +8,13 @@ import numpy as np
 from cortado.discretise.calibration import pairwise_rate, stress_rate
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import smoothing_kernel
+from cortado.scene.falls import fall_to, greatest_fall
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import greatest_speed
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.rheology import greatest_viscosity
-from cortado.scene.room import solids_of
 from cortado.scene.solids import SolidTable
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
@@ -108,8 +108,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
     outlet.
-    Solids: with that speed fluid goes no further than 0.4 spacings in a step, nor than a quarter of the thickness of
-    the thinnest.
+    Solids: beside each of them fluid goes no further than 0.4 spacings in a step, nor than a quarter of its thickness,
+    with the speed of a fall to its foot from where fluid is highest at the start, see `cortado.scene.falls`.
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
@@ -127,10 +127,10 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     counts.
     """
     values = values or {}
-    gravity, (lower, upper) = np.atleast_2d(values.get("gravity", _gravity(scene))), _extent(scene)
-    speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
+    gravity, first = np.atleast_2d(values.get("gravity", _gravity(scene))), _first_speed(scene, values)
+    speed = first + sqrt(2.0 * greatest_fall(scene, gravity))
     courant = 0.4 * scene.discretisation.support_radius / speed if speed > 0.0 else inf
-    beside = {"solids": _step_beside_solids(scene) / speed} if scene.solid and speed > 0.0 else {}
+    beside = {"solids": _beside_solids(scene, first, gravity, values)} if scene.solid and speed > 0.0 else {}
     return {"speed": courant, **beside, **standing_limits(scene, values, scene.solid)}
 
 
@@ -216,11 +216,15 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
     return part * 2.0 * density / (viscosity * greatest)
 
 
-def _step_beside_solids(scene: SceneTables) -> float:
-    """How far fluid may move in a step beside its solids [m]; infinite beside those alone that it is inside of."""
-    spacing = scene.discretisation.spacing
-    around = [THROUGH * solid.thinnest(spacing) for solid in scene.solid if solid.side == "outside"]
-    return min(*around, BESIDE * spacing) if around else inf
+def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
+    """The longest step [s] of fluid, of a first speed [m/s], beside its solids; infinite beside those alone that it is
+    inside of, or does not come to."""
+    spacing, found = scene.discretisation.spacing, [inf]
+    for solid in scene.solid:
+        speed = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
+        if solid.side == "outside" and speed > 0.0:
+            found.append(min(THROUGH * solid.thinnest(spacing), BESIDE * spacing) / speed)
+    return min(found)
 
 
 def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
@@ -267,27 +271,3 @@ def _covered(ends: Points, spacing: float) -> float:
         total += max(upper - max(lower, reached), 0.0)
         reached = max(reached, upper)
     return total
-
-
-def _extent(scene: SceneTables) -> tuple[Points, Points]:
-    """The box through which fluid may fall: lower and upper, each (d,) [m]."""
-    lower, upper = _room(scene)
-    if scene.emitter is None:
-        return lower, upper
-    return np.minimum(lower, scene.emitter.outlet), np.maximum(upper, scene.emitter.outlet)
-
-
-def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """The box around the container, or around the fluids and the solids, which fluid falls along, if there is none, or
-    around the outlet if there is only the emitter: lower and upper, each (d,) [m]."""
-    ends = scene.container.extent()
-    if ends is not None:
-        return ends
-    half = 0.5 * scene.discretisation.spacing
-    fluids = np.array([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid])
-    boxes = [(lower - half, upper + half) for lower, upper in fluids]
-    boxes += [solid.extent() for solid in solids_of(scene.solid)]
-    if scene.emitter is not None and not boxes:
-        boxes = [(np.array(scene.emitter.outlet), np.array(scene.emitter.outlet))]
-    lower, upper = np.swapaxes(boxes, 0, 1)
-    return lower.min(axis=0), upper.max(axis=0)

@@ -23,8 +23,8 @@ class Pour(Task):
     """Actions: velocity of the jug along x, and rate at which it turns, counterclockwise."""
 
     name = "Pour"
-    horizon, repeats = 75, 7
-    coarse_spacing, coarse_step = 0.0125, 0.0022
+    horizon, repeats = 75, 10
+    coarse_spacing, coarse_step = 0.0125, 0.00154
     lowest = 0.0
 
     @property
