@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projected_flows import C2, PROJECTION, box, simulated, stirred
+from projected_flows import C2, PROJECTION, box, simulated
 
 GRAVITY = 9.81
 DEPTH = 0.5
@@ -48,7 +48,8 @@ def standing_wave(
         flow = np.stack([np.sin(a) * np.cosh(b), -np.cos(a) * np.sinh(b)], axis=-1)
         return flow / np.cosh(k * DEPTH)
 
-    x = stirred(simulation.positions, spacing, 0.05)
+    x = simulation.positions
+    x = x + 0.05 * spacing * np.random.default_rng(1).uniform(-1.0, 1.0, x.shape)
     first = {"initial_positions": x, "initial_velocities": 0.09 * frequency / k / np.tanh(k * DEPTH) * mode(x)}
     run = simulation.run(round(periods * 2.0 * np.pi / frequency / time_step), first, record_every=4)
     flow = mode(run.positions)
