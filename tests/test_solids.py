@@ -344,6 +344,9 @@ THIN = {
     "cup": {"shape": "cup", "base": [0.7, 0.2], "radius": 0.15, "height": 0.3, "thickness": 0.06},
     "capsule": {"shape": "capsule", "start": [0.5, 0.3], "end": [0.9, 0.5], "radius": 0.03},
     "moving": {"shape": "box", "lower": [0.6, 0.2], "upper": [0.66, 0.6], **MOVED},
+    "free": {"shape": "box", "lower": [0.5, 0.3], "upper": [0.9, 0.36], "motion": "free", "density": 500.0},
+    "leaning": {"shape": "box", "lower": [0.6, 0.2], "upper": [0.66, 0.7], "rotation": 0.4},
+    "thin above": {"shape": "polygon", "corners": [[0.5, 0.0], [0.7, 0.0], [0.63, 0.9], [0.6, 0.9]]},
 }
 THICK = {
     "wall": wall(1.5),
@@ -376,3 +379,47 @@ def test_walls_hold_water_from_the_thickness_on_that_is_said():
     assert run.positions[..., 0].max() < 0.4 + 0.2 * 0.05
     with pytest.raises(DivergedError, match="entered the solid 'solid 0'"):
         Simulation(scene([wall(1.0)], solver=auto)).run(80)
+
+
+def sheet(lower, upper):
+    """From floor to lid, between two places, as a polygon, which may be half a spacing thick."""
+    return {"shape": "polygon", "corners": [[lower, -0.1], [upper, -0.1], [upper, 1.1], [lower, 1.1]]}
+
+
+LININGS = {
+    "of the container": ([sheet(0.4, 0.4375)], 0.4375),
+    "of a wall": ([sheet(0.4, 0.4375), {"shape": "box", "lower": [0.4375, -0.1], "upper": [0.6, 1.1]}], 1.0),
+    "of another": ([sheet(0.4, 0.4375), sheet(0.4375, 0.475)], 1.0),
+}
+
+
+@pytest.mark.parametrize("name", LININGS)
+@pytest.mark.filterwarnings("error:the solid:cortado.CortadoWarning")
+def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behind_it(name):
+    """At the same depths as one solid in the place of both, and about as heavy."""
+    solids, upper = LININGS[name]
+    whole = wall(1.5) if name == "of another" else wall(4.0)
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [upper, 1.0]}
+
+    def layers(tables):
+        walls = discretise(scene(tables, container=room)).walls
+        x, y = walls.positions.T
+        beside = np.abs(y - 0.5) < 0.25
+        return np.histogram(x[beside], [0.4, 0.43, 0.445, 0.5], weights=walls.weights[beside])[0]
+
+    np.testing.assert_allclose(layers(solids), layers([whole]), rtol=0.4)
+
+
+HOLDING = {
+    "lining": LININGS["of the container"],
+    "piston": ([{**wall(1.5), "motion": "path", "velocity": [-0.1, 0.0]}], 1.0),
+}
+
+
+@pytest.mark.parametrize("name", HOLDING)
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_linings_and_walls_that_move_hold_water_too(name):
+    solids, upper = HOLDING[name]
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [upper, 1.0]}
+    run = Simulation(scene(solids, container=room, solver={"kind": "projection", "time_step": "auto"})).run(80)
+    assert run.positions[-1, :, 0].max() < 0.4 + 0.25 * 0.05

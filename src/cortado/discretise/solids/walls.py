@@ -30,6 +30,8 @@ MARGIN = 0.01
 """In spacings: a part of a surface that is no further within its room touches a wall or another solid."""
 TOLERANCE = 0.05
 """In spacings: by how much less deep points may be beneath one surface than beneath another."""
+EDGE = 0.4
+"""In spacings: edges are less far from fine points of the surface."""
 HALVINGS, ROUNDS, DIGITS = 12, 30, 4
 
 
@@ -164,6 +166,7 @@ class ExposedSurface:
             for _ in range(ROUNDS):
                 found[pair] = self.solids[first].nearest(self.solids[second].nearest(found[pair]))
         near = np.linalg.norm(found - feet, axis=1) < self.spacing
+        near &= self._tree.query(found)[0] < EDGE * self.spacing  # not where one covers the other
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
