@@ -10,7 +10,9 @@ CODES = (0, 1, 2)
 """Exit codes that the command line promises."""
 LONGEST_SENTENCE = 1500
 """Characters of what a failed command says."""
-_PROGRESS = re.compile(r"\w+ \d+/\d+, [\d:]+ left.*|Compiling (\d+ kernel modules|kernels).*")
+_PROGRESS = re.compile(r"\w+ \d+/\d+, [\d:]+ left.*|(Compiling (\d+ kernel modules|kernels)|Packing the particles).*")
+_AT_WORK = re.compile(r"Packing the particles[^:]*")
+"""The last line of what takes long, says so, and answers an interruption at once."""
 _CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "terminate called")
 
 
@@ -18,6 +20,8 @@ def complaints(
     outcome: Outcome, limits: Limits = LIMITS, codes: Collection[int] = CODES, heard: bool = True
 ) -> list[str]:
     """Sentences about an outcome, by what every command has to keep to; ``heard`` tells whether stderr was open."""
+    if outcome.hung and _AT_WORK.fullmatch(outcome.err.rpartition("\n")[2]):
+        return []
     if outcome.hung:
         return [f"hung for more than {limits.seconds:g} s{_place(outcome.stack)}"]
     found = []

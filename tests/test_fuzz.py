@@ -87,6 +87,16 @@ def test_a_hang_is_found_with_its_place(tmp_path):
     assert len(found) == 1 and found[0].startswith("hung for more than 0.3 s in wait_long")
 
 
+def test_work_that_says_that_it_takes_long_is_no_hang(tmp_path):
+    def pack(said):
+        print(said, end="", file=sys.stderr, flush=True)
+        wait_long()
+
+    assert judged(tmp_path, partial(pack, "Packing the particles of round bodies, 226,031 in all"), Limits(0.3)) == []
+    done = "Packing the particles of round bodies, 226,031 in all: 3.1 s"
+    assert len(judged(tmp_path, partial(pack, done), Limits(0.3))) == 1
+
+
 def test_much_memory_is_found(tmp_path):
     usual = call(lambda: None, ("test",), tmp_path).memory
     assert judged(tmp_path, lambda: None, Limits(memory=usual + 100_000_000)) == []
