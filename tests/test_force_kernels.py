@@ -304,6 +304,7 @@ ELSEWHERE = {
     "velocity_gradient_kernels": "the same",
     "shift_kernels": "the same",
     "following_kernels": "the same",
+    "beginning_kernels": "the same",
     "moving_kernels": "the same",
     "coarse_push_kernels": "the same",
     "coarse_pressure_kernels": "the same",

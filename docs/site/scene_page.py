@@ -95,7 +95,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "## Particles: `[discretisation]`",
         "Fluid is cut into particles that start on a regular lattice. A smaller spacing shows smaller waves and takes "
         "more time: half of it means eight times as many particles in 3-D, and time steps about half as long.",
-        (("DiscretisationTable", "", '[discretisation]\nspacing = 0.05\nsupport = 2.6\nkernel = "wendland_c2"'),),
+        (("DiscretisationTable", "", '[discretisation]\nspacing = 0.05\nsupport = 3.0\nkernel = "wendland_c4"'),),
     ),
     (
         "## Materials: `[[phase]]`",
