@@ -17,7 +17,7 @@ from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTange
 from cortado.solvers.projection.coarse_bodies import CoarseBodies, CoarseBodiesAdjoint, CoarseBodiesTangent
 from cortado.solvers.projection.coarse_grid import SPACING
 from cortado.solvers.projection.coarse_length import length_kernels
-from cortado.solvers.projection.coarse_levels import Levels, half
+from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
 from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels
 from cortado.solvers.projection.coarse_residual import residual_kernels
@@ -63,6 +63,9 @@ class Coarse:
         """Free ones; None without any."""
         rows = 0 if self.bodies is None else self.bodies.rows
         self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
+        pairs = 2**dimension * (2**dimension + 1) // 2
+        self._cells = wp.zeros((pairs, len(self._levels.r)), dtype=real, device=device)
+        """The part of A of each cell, for each two of its corners."""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
@@ -95,7 +98,9 @@ class Coarse:
         for kernel in self.push.forward:
             context.launch(kernel, around, self.pushed)
         self._sort(context.fields["x"])
-        context.launch(self.nodes.fill, self.grid, self.pushed, A=self._levels.A, threads=half(self._levels.A))
+        cells = self._cells
+        context.launch(self.nodes.add_up, self.grid, self.pushed, cells=cells, threads=cells.shape[1])
+        context.launch(self.nodes.fill, self.grid, cells=cells, A=self._levels.A, threads=cells.shape[1])
         self._levels.begin(context)
         if self.bodies is not None:
             self.bodies.begin(context, self.grid, around, self._levels.B)

@@ -19,6 +19,8 @@ from cortado.sph.moment_functions import matrix_type
 class NodeKernels:
     """By what they do."""
 
+    add_up: Any
+    """The part of A that the particles of a cell have, for each two of its corners."""
     fill: Any
     """A, for each node and each of its neighbours, itself among them."""
     spread: Any
@@ -34,9 +36,17 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
     module = kernel_module(f"coarse_nodes_{dimension}d_{precision.name}")
     CORNERS, AROUND = wp.constant(2**dimension), wp.constant(3**dimension)
+    square = wp.types.matrix(shape=(2**dimension, 2**dimension), dtype=real)
+    pushes = wp.types.matrix(shape=(2**dimension, 3), dtype=real)
+
+    @wp.func
+    def pair_of(a: int, b: int) -> int:
+        """The number of two corners of a cell, in any order."""
+        i, j = wp.min(a, b), wp.max(a, b)
+        return i * (2 * CORNERS - 1 - i) // 2 + j
 
     @wp.kernel(module=module, enable_backward=False)
-    def fill(
+    def add_up(
         grid: grid_type,
         order: wp.array(dtype=wp.int32),
         eps: real,
@@ -45,30 +55,47 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         h: wp.array(dtype=vector),
         N: wp.array(dtype=matrix),
         # out
+        cells: wp.array2d(dtype=real),
+    ):
+        """With a thread for each cell."""
+        cell = wp.tid()
+        total, own = square(), pushes()
+        for p in range(grid.starts[cell], grid.starts[cell + 1]):
+            i = order[p]
+            for corner in range(CORNERS):
+                phi = hat(x[i], corner, grid)
+                q = N[i] * phi.slope + phi.value * h[i]
+                for axis in range(3):
+                    own[corner, axis] = q[axis]
+            total += own * wp.transpose(own) / m[i]
+            for corner in range(CORNERS):
+                total[corner, corner] += eps / m[i]
+        for a in range(CORNERS):
+            for b in range(a, CORNERS):
+                cells[pair_of(a, b), cell] = total[a, b]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def fill(
+        grid: grid_type,
+        cells: wp.array2d(dtype=real),
+        # out
         A: wp.array2d(dtype=real),
     ):
-        """With a thread for each of the first half of the offsets of each node, itself among them; A is symmetric."""
-        offset = wp.tid() // A.shape[1]
-        node = wp.tid() - offset * A.shape[1]
+        """With a thread for each node, which has half of the offsets and itself; A is symmetric."""
+        node = wp.tid()
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes
-        here, step = node_of(node - member * nodes, grid.shape), step_of(offset)
-        total = real(0.0)
-        for corner in range(CORNERS):
-            own = corner_step(corner)
-            other = own + step
-            if wp.min(wp.min(other[0], other[1]), other[2]) >= 0 and wp.max(wp.max(other[0], other[1]), other[2]) <= 1:
-                cell = member * nodes + number_of(here - own, grid.shape)
-                far = other[0] + 2 * other[1] + 4 * other[2]
-                for p in range(grid.starts[cell], grid.starts[cell + 1]):
-                    i = order[p]
-                    a, b = hat(x[i], corner, grid), hat(x[i], far, grid)
-                    q_a, q_b = N[i] * a.slope + a.value * h[i], N[i] * b.slope + b.value * h[i]
-                    total += wp.dot(q_a, q_b) / m[i]
-                    if offset == AROUND // 2:
-                        total += eps / m[i]
-        A[offset, node] = total
-        A[AROUND - 1 - offset, member * nodes + number_of(here + step, grid.shape)] = total
+        first, here = member * nodes, node_of(node - member * nodes, grid.shape)
+        for offset in range(AROUND // 2 + 1):
+            step, total = step_of(offset), real(0.0)
+            for corner in range(CORNERS):
+                own = corner_step(corner)
+                to = own + step
+                if wp.min(wp.min(to[0], to[1]), to[2]) >= 0 and wp.max(wp.max(to[0], to[1]), to[2]) <= 1:
+                    cell = first + number_of(here - own, grid.shape)
+                    total += cells[pair_of(corner, to[0] + 2 * to[1] + 4 * to[2]), cell]
+            A[offset, node] = total
+            A[AROUND - 1 - offset, first + number_of(here + step, grid.shape)] = total
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(
@@ -93,4 +120,4 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                 total += e[node] * of.s_own[i]
         r[node] = total
 
-    return NodeKernels(fill, spread)
+    return NodeKernels(add_up, fill, spread)
