@@ -116,11 +116,6 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
     return LevelKernels(coarsen, weigh)
 
 
-def half(A: wp.array) -> int:
-    """Of a matrix (3^d, nodes), the entries with an offset not after the middle one, which a node has to itself."""
-    return (A.shape[0] // 2 + 1) * A.shape[1]
-
-
 class Level(NamedTuple):
     """One grid, with what is its own of the arrays of all levels."""
 
@@ -192,7 +187,8 @@ class Levels:
         for finer, level in zip([None, *self.levels], self.levels, strict=False):
             if finer is not None:
                 both = {"fine": finer.shape, "shape": level.shape, "factor": level.factor, "A_fine": finer.A}
-                context.launch(self._kernels.coarsen, both, A=level.A, threads=half(level.A))
+                entries = (len(level.A) // 2 + 1) * len(level.weight)
+                context.launch(self._kernels.coarsen, both, A=level.A, threads=entries)
             context.launch(self._kernels.weigh, level._asdict(), threads=len(level.weight))
 
     def solve(self, e: wp.array, tolerance: float, most: int) -> None:
