@@ -65,7 +65,7 @@ class Projection:
     iterations: int
     repairs: int
     follow: bool
-    nodes: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     """Of the coarse grid: the place of the first node, 1 / the distance of two, and how many there are, along each
     axis."""
     bodies: tuple[Body, ...] = ()
@@ -85,10 +85,8 @@ class Projection:
         periods = np.array(scene.container.periods(d)[1])
         counts = (getattr(scene.solver, name, 2) for name in ("iterations", "repairs"))
         follow = getattr(scene.solver, "velocities_follow", False)
-        nodes = None
-        if getattr(solver, "coarse", None) is not None:
-            grid = solver.coarse.grid["grid"]
-            nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
+        grid = solver.coarse.grid["grid"]
+        nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
         held, solids = getattr(solver.bodies, "held", ()), search.walls["wall_solids"].numpy()
         bodies = tuple(Body.of(one, solids, scene) for one in held)
         return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes, bodies)
@@ -198,7 +196,7 @@ class Projection:
             return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
 
         share = between(H + 2 * nu, 0.7, 0.95)
-        correct = self.coarse(x, m, force, L, g, share, yielding) if self.nodes else None
+        correct = self.coarse(x, m, force, L, g, share, yielding)
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
         taken = np.where(far & ((before[1] * gamma).sum(1) > 0), 0, full)
@@ -206,14 +204,16 @@ class Projection:
         v = v_star + taken[:, None] * before[1]
         t = 5.0
         for left in reversed(range(self.iterations)):
-            if correct is not None:
+            if left < self.iterations - 1 or not (k > 0).any():
                 r = divergence(v) - falls - yielding @ y - wanted
                 r = np.where((y > 0) | (tension > 0.5) | (r > 0), r, 0)
                 z = y + correct(r)
                 change = np.where(z > 0, z, tension * z) - y
                 thrust = -force(change) / m[:, None]
                 energy = (m[:, None] * thrust**2).sum() + change @ yielding @ change
-                alpha = np.clip((r * change).sum() / energy, 0, 1)
+                least = (m * (1e-6 * self.spacing / dt) ** 2).sum()
+                some = least if left < self.iterations - 1 else 0.0
+                alpha = np.clip(((r * change).sum() + some) / (energy + least), 0, 1)
                 k = y = y + alpha * change
                 v = v + alpha * thrust
             u, D = v, divergence(v) - falls - yielding @ y
@@ -242,21 +242,20 @@ class Projection:
         """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""
         (first, frequency, counts), (n, d) = self.nodes, x.shape
         shape = counts.astype(int)
-        s = (x - first) * frequency
+        s, h, lattice = (x - first) * frequency, force(c), 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
         cell, t = np.floor(s).astype(int), s - np.floor(s)
         phi, slope, touched = np.zeros((n, shape.prod())), np.zeros((n, shape.prod(), d)), np.zeros(shape.prod())
         for corner in np.ndindex(*[2] * d):
             node = np.ravel_multi_index(((cell + corner) % shape).T, shape)
             weight, sign = np.where(corner, t, 1 - t), np.where(corner, 1, -1) * frequency
             phi[np.arange(n), node] += weight.prod(1)
-            np.add.at(touched, node, 1 / m)
+            np.add.at(touched, node, (lattice / 4**d * 1e-5 + 0.01 * (h**2).sum(1)) / m)
             for axis in range(d):
                 others = np.delete(weight, axis, 1).prod(1)
                 slope[np.arange(n), node, axis] += sign[axis] * others
         moment = np.einsum("j,jab,ijb,ijk->iak", c, L, g, -self.pairs(x, x)[0])
-        q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * force(c)[:, None, :]
-        lattice = 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
-        A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(1e-5 * lattice / 4**d * touched)
+        q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * h[:, None, :]
+        A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(touched)
         A += (phi.T * c) @ yielding @ (phi.T * c).T
         live = touched > 0
 

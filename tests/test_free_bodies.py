@@ -61,10 +61,6 @@ def space(*solids, **tables):
     return plane(*solids, **{"dimension": 3, "fluid": [fluid], "container": container, **tables})
 
 
-def multilevel(scene):
-    return scene.replaced("solver.multilevel=true")
-
-
 def begun(scene):
     """What the bodies of a scene begin with, as parameters."""
     found = {}
@@ -242,12 +238,12 @@ def test_a_box_floats_as_deep_as_it_should():
 
 
 @pytest.mark.parametrize("density", [250.0, 500.0, 750.0])
-def test_a_box_that_is_laid_into_water_at_its_draft_stays_where_a_coarse_grid_knows_it(density):
+def test_a_box_that_is_laid_into_water_at_its_draft_stays(density):
     """From the first step on."""
     box = {"name": "raft", "shape": "box", "lower": [0.3, 0.4 - 0.2e-3 * density], "motion": "free", "density": density}
     box["upper"] = [0.7, box["lower"][1] + 0.2]
     water = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}
-    scene = multilevel(plane(box, fluid=[water], discretisation={"spacing": 0.025}))
+    scene = plane(box, fluid=[water], discretisation={"spacing": 0.025})
     run = Simulation(scene, precision="float64").run(8, record_every=1)
     assert np.abs(run.solids["raft"].velocities).max() < 0.001
 
@@ -255,8 +251,7 @@ def test_a_box_that_is_laid_into_water_at_its_draft_stays_where_a_coarse_grid_kn
 @pytest.mark.parametrize("density", [50.0, 200.0, 3000.0])
 def test_a_disc_gets_faster_as_its_added_mass_says(density, tmp_path):
     """From the second step on; a light one is thrown about by a coarse grid that does not know its mass."""
-    solver = {"multilevel": True, "iterations": 10}
-    faster = disc_in_a_round_tank(density, str(tmp_path / "rings.npy"), 0.03, 6, **solver)
+    faster = disc_in_a_round_tank(density, str(tmp_path / "rings.npy"), 0.03, 6, iterations=10)
     assert np.abs(faster[1:] - 1.0).max() < 0.15
 
 
@@ -303,14 +298,8 @@ def test_bodies_touch_across_a_period():
         (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
-        (lambda: multilevel(plane(RAFT)), CentreOfMass([0.5, 0.3])),
-        (lambda: multilevel(touching_across()), SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
-        (lambda: multilevel(space(BRICK)), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
     ],
-    ids=[
-        *("plane", "space", "touching", "touching across a period", "touching in space"),
-        *("multilevel", "multilevel across a period", "multilevel in space"),
-    ],
+    ids=["plane", "space", "touching", "touching across a period", "touching in space"],
 )
 def test_derivatives_of_bodies(made, loss):
     """Reverse and forward mode to round-off, and differences, of all that a body begins with, of its density, and of
@@ -377,9 +366,8 @@ def test_bodies_are_drawn_where_they_are(made):
     assert np.abs(axes).max() > 1e-3
 
 
-@pytest.mark.parametrize("made", [touching, lambda: multilevel(touching())], ids=["touching", "multilevel"])
-def test_a_batch_has_the_bits_of_single_runs(made):
-    scene, loss = made(), SolidPose("raft", [0.3, 0.2], 0.3)
+def test_a_batch_has_the_bits_of_single_runs():
+    scene, loss = touching(), SolidPose("raft", [0.3, 0.2], 0.3)
     densities = [300.0, 700.0]
     single = [Problem(Simulation(scene), 8, loss).value_and_gradient({"raft.density": rho}) for rho in densities]
     several = Problem(Simulation(scene, batch=2), 8, loss).value_and_gradient({"raft.density": np.array(densities)})
@@ -461,17 +449,15 @@ def test_a_file_of_frames_tells_where_bodies_are(tmp_path):
     assert np.array_equal(read.solids["raft"].velocities, run.solids["raft"].velocities)
 
 
-@pytest.mark.parametrize(
-    ("made", "solver"), [(plane, "multilevel"), (plane, "iterations alone"), (space, "multilevel")]
-)
-def test_a_step_beside_bodies_is_that_of_the_twin(made, solver):
+@pytest.mark.parametrize("made", [plane, space])
+def test_a_step_beside_bodies_is_that_of_the_twin(made):
     """Two light bodies at rest in water that is thrown about."""
     flat, still = made is plane, {"velocity": [0.0] * (2 if made is plane else 3), "angular_velocity": None}
     raft = {**(RAFT if flat else BRICK), **still, "density": 100.0}
     ball = {"name": "ball", "shape": "sphere", "motion": "free", "radius": 0.08, "density": 300.0}
     ball |= {"centre": [0.3, 0.12] if flat else [0.32, 0.1, 0.3]}
     scene = made(*({key: v for key, v in one.items() if v is not None} for one in (raft, ball)))
-    scene = (multilevel(scene) if solver == "multilevel" else scene).replaced("phase[0].viscosity=0")
+    scene = scene.replaced("phase[0].viscosity=0")
     simulation = Simulation(scene, precision="float64")
     given, gravity, dt = thrown(simulation), np.array(scene.forces.gravity), 0.001
     x, v = given["initial_positions"], given["initial_velocities"]

@@ -29,7 +29,7 @@ def over_time(point, steps):
     return {k: np.multiply.outer(grows, 1.0 + v) if k.endswith(ends) else v for k, v in point.items()}
 
 
-def evaluate(made, device, precision="float64", steps=60, estimator=EXACT, lanes=None):
+def evaluate(made, device, precision="float64", steps=30, estimator=EXACT, lanes=None):
     """Last positions, iterations, loss and gradient, from a first state with scatter: of a block that falls freely the
     derivative with respect to the viscosity would be round-off."""
     simulation = Simulation(made, device, precision, lanes=lanes)
@@ -150,15 +150,10 @@ SCENES = {
         forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
     ),
 }
-SCENES |= {
-    f"{name}, multilevel": SCENES[name].replaced("solver.multilevel=true")
-    for name in ("projection in the plane", "free bodies in the plane", "a free body in space")
-}
 BATCHED = {
     "tolerance": splash(**TOLERANT),
     **{name: SCENES[name] for name in ("two fluids", "plane", "projection", "projection in the plane")},
     **{name: SCENES[name] for name in ("solids in the plane", "solids in space", "free bodies in the plane")},
-    **{name: one for name, one in SCENES.items() if name.endswith("in the plane, multilevel")},
 }
 
 

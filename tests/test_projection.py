@@ -14,7 +14,6 @@ from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
 FOLLOW = {**SOLVER, "velocities_follow": True}
-COARSE = {**SOLVER, "multilevel": True}
 C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
 CASES = {
     "plane": lambda: plane(solver=SOLVER),
@@ -25,10 +24,6 @@ CASES = {
     "velocities follow in space": lambda: scene(solver=FOLLOW),
     "hurled": lambda: plane(solver=SOLVER),
     "hurled in space": lambda: scene(solver=SOLVER),
-    "multilevel": lambda: plane(solver=COARSE),
-    "multilevel in space": lambda: scene(solver=COARSE),
-    "multilevel, periodic": lambda: plane(solver=COARSE, container=PERIODIC, discretisation=C2),
-    "multilevel, three phases": lambda: plane_of_three(solver=COARSE, mixture={"mobility": 0.0}),
 }
 HURLED = {"hurled": 16.0, "hurled in space": 8.0}
 """How many times as fast as in other cases fluid is thrown: walls throw it back."""
@@ -78,29 +73,28 @@ def test_a_step_is_that_of_the_twin(case):
     assert (k > 0.0).any() and (k < 0.0).any()
 
 
-@pytest.mark.parametrize("multilevel, least, most", [(True, -0.05, 0.05), (False, 0.4, 0.7)])
-def test_water_that_is_shut_in_stays_where_a_coarse_grid_knows_it(multilevel, least, most):
-    """Without it the pressure has come half way in ten steps."""
+def test_water_that_is_shut_in_stays():
+    """Without a coarse grid the pressure has come half way in ten steps."""
     box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
     shut = plane(
         discretisation={"spacing": 0.05, "jitter": 0.05},
         fluid=[{**box, "phase": "water"}],
         container=box,
         forces={"gravity": [9.81, 0.0]},
-        solver={**SOLVER, "multilevel": multilevel},
+        solver=SOLVER,
     )
     run = Simulation(shut, precision="float64").run(10)
-    assert least < run.velocities[-1][:, 0].mean() / (9.81 * 10 * 0.002) < most
+    assert abs(run.velocities[-1][:, 0].mean()) < 0.05 * 9.81 * 10 * 0.002
 
 
-def test_water_that_is_shaken_pushes_the_floor_as_it_should_with_a_coarse_grid():
+def test_water_that_is_shaken_pushes_the_floor_as_it_should():
     """With its mass times g (1 + sin(6 pi t) / 2): the amplitude within 3 %, the phase within 3 degrees."""
     dt = 0.004
     shaken = plane(
         discretisation={"spacing": 0.05, "jitter": 0.05},
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 1.0], "phase": "water"}],
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 1.5]},
-        solver={**COARSE, "time_step": dt},
+        solver={**SOLVER, "time_step": dt},
     )
     t = dt * (np.arange(int(0.7 / dt)) + 0.5)
     g = 9.81 * (1.0 + 0.5 * np.sin(6.0 * np.pi * t))
@@ -126,29 +120,27 @@ def resting(**solver):
 
 @pytest.mark.filterwarnings("ignore:solver.time_step is")
 def test_a_divergence_that_is_left_is_told():
-    """In steps that are too long for a pressure that travels, and not for one that is there at once."""
-    with pytest.warns(CortadoWarning, match=r"a divergence of 0\.02 in step 6, .* and more than 0\.015 in 6 of 12"):
-        run = Simulation(resting(time_step=0.02), precision="float64").run(12)
+    """In steps that are half as long again as they may be."""
+    with pytest.warns(CortadoWarning, match=r"a divergence of 0\.095 in step 12, .* and more than 0\.015 in 8 of 12"):
+        run = Simulation(resting(time_step=0.03), precision="float64").run(12)
     told = divergence_sentence(run.diagnostics, run.scene)
-    assert told is not None and run.diagnostics["divergence"].argmax() == 5
+    assert told is not None and run.diagnostics["divergence"].argmax() == 11
     batch = {"divergence": np.array([[0.0, 0.01], [np.nan, 0.03]])}
     assert "0.03 in step 2 of scene 1, times the step, and more than 0.015 in 1 of 4 steps" in divergence_sentence(
         batch, run.scene
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
-        at_once = Simulation(resting(time_step=0.019, multilevel=True), precision="float64").run(12)
-    assert at_once.diagnostics["divergence"].max() < 0.2 * run.diagnostics["divergence"].max()
+        allowed = Simulation(resting(time_step=0.019), precision="float64").run(12)
+    assert allowed.diagnostics["divergence"].max() < 0.05 * run.diagnostics["divergence"].max()
 
 
 MET = {**SOLVER, "tolerance": 3e-4, "maximum_iterations": 40}
 
 
-@pytest.mark.parametrize("multilevel", [False, True])
-def test_iterations_go_on_to_a_tolerance(multilevel):
+def test_iterations_go_on_to_a_tolerance():
     """In a run that is taken up again too; where there are too few, the run says so."""
-    met = {**MET, "multilevel": multilevel}
-    simulation = Simulation(plane(solver=met), precision="float64")
+    simulation = Simulation(plane(solver=MET), precision="float64")
     given = thrown(simulation)
     run, fixed = simulation.run(8, given), Simulation(plane(solver=SOLVER), precision="float64").run(8, given)
     left, counts = run.diagnostics["divergence"], run.iterations
@@ -158,13 +150,12 @@ def test_iterations_go_on_to_a_tolerance(multilevel):
     np.testing.assert_array_equal(rest.iterations, counts[4:])
     np.testing.assert_array_equal(rest.positions[-1], run.positions[-1])
     with pytest.warns(CortadoWarning, match="the pressure did not converge in"):
-        few = Simulation(plane(solver={**met, "maximum_iterations": 3}), precision="float64").run(8, given)
+        few = Simulation(plane(solver={**MET, "maximum_iterations": 3}), precision="float64").run(8, given)
     assert few.iterations.max() == 3 and not few.converged.all()
 
 
-@pytest.mark.parametrize("multilevel", [False, True])
-def test_derivatives_are_those_of_as_many_iterations_as_a_step_took(multilevel):
-    simulation = Simulation(plane(solver={**MET, "multilevel": multilevel}), precision="float64")
+def test_derivatives_are_those_of_as_many_iterations_as_a_step_took():
+    simulation = Simulation(plane(solver=MET), precision="float64")
     given, rng = thrown(simulation), np.random.default_rng(4)
     problem = Problem(simulation, 6, losses.CentreOfMass([0.3, 0.25]))
     ways = {name: rng.normal(size=value.shape) for name, value in given.items()}
@@ -196,7 +187,7 @@ def test_a_tolerance_is_that_of_one_scene():
 
 
 def test_what_a_lost_run_left_on_the_coarse_grid_is_not_read():
-    simulation = Simulation(plane(solver=COARSE), precision="float64")
+    simulation = Simulation(plane(solver=SOLVER), precision="float64")
     first = simulation.run(3)
     simulation.solver.corrected[0]["e"].fill_(np.nan)
     assert simulation.run(3).positions.tobytes() == first.positions.tobytes()
@@ -270,7 +261,7 @@ def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(case):
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_fluid_that_moves_as_a_whole_resists_a_strain(precision):
-    """All its pressures are 0 at first, where the formula of an iteration has a corner that its values have not."""
+    """All its pressures are 0 at first, where formulas have corners that values have not."""
     jittered = {**plane().discretisation.model_dump(), "jitter": 0.1}
     free = plane(solver=SOLVER, discretisation=jittered, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]})
     problem, double = (problem_of(lambda: free, steps=6, precision=name) for name in (precision, "float64"))
@@ -278,7 +269,7 @@ def test_fluid_that_moves_as_a_whole_resists_a_strain(precision):
     strain = (x - x.mean(axis=0)) * [1.0, -1.0]
     strain[:, 0] += 0.3 * strain[:, 0]  # and a little that the pressure takes out
     still = {"initial_velocities": np.tile([0.5, 0.25], (len(x), 1))}
-    step = 1e-4  # in float32 differences are rounded off where they are not bent
+    step = 1e-7  # what is faster is corrected before the first iteration too
     ends = [double.value({"initial_velocities": still["initial_velocities"] + h * strain}) for h in (step, -step)]
     slope = problem.tangent(still, {"initial_velocities": strain})
     assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.002)
@@ -310,11 +301,10 @@ def test_a_run_goes_on_bit_for_bit_and_has_the_same_bits_twice(precision):
     assert gradients_twice[0][1]["viscosity"].tobytes() == gradients_twice[1][1]["viscosity"].tobytes()
 
 
-@pytest.mark.parametrize("case", ["plane", "multilevel"])
-def test_each_scene_of_a_batch_is_that_run_alone(case):
+def test_each_scene_of_a_batch_is_that_run_alone():
     tilts = np.array([[[0.0, -9.81]], [[3.0, -9.0]], [[-2.0, -9.5]]])
-    batch = problem_of(CASES[case], batch=3)
-    alone = problem_of(CASES[case])
+    batch = problem_of(CASES["plane"], batch=3)
+    alone = problem_of(CASES["plane"])
     values, found = batch.value_and_gradient({"gravity": tilts})
     for value, gradient, tilt in zip(values, found["gravity"], tilts, strict=True):
         one, wanted = alone.value_and_gradient({"gravity": tilt[0]})

@@ -12,7 +12,7 @@ from cortado.scene.discrete_scene import discretise
 from cortado.solvers.projection.coarse_grid import coarse_grid
 from reference_projection import Projection
 from scenes import plane, scene
-from test_projection import C2, CASES, COARSE, HURLED, PERIODIC, SOLVER, begun, thrown
+from test_projection import C2, CASES, HURLED, PERIODIC, SOLVER, begun, thrown
 from test_reference import distance, target_of
 
 CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
@@ -30,9 +30,6 @@ SCENES = {
     "stress, no slip": plane(solver=SOLVER, container=NO_SLIP, discretisation=C2),
     "wendland_c4": plane(solver={**SOLVER, "iterations": 7, "repairs": 1}, discretisation=C4),
     "free space": plane(solver=SOLVER, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
-    "multilevel": plane(solver=COARSE),
-    "multilevel in space": scene(solver=COARSE),
-    "multilevel, periodic": plane(solver=COARSE, container=PERIODIC, discretisation=C2),
 }
 scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
 
@@ -51,20 +48,16 @@ def point_and_direction(simulation, steps, at_rest=False):
 
 
 @pytest.mark.parametrize(
-    "make, smoothing, solver",
+    "make, smoothing",
     [
-        *(
-            pytest.param(make, smoothing, SOLVER, id=f"{make.__name__}-{smoothing['kernel']}")
-            for make in (plane, scene)
-            for smoothing in (CUBIC, C2, C4)
-        ),
-        pytest.param(plane, C4, COARSE, id="plane-multilevel"),
-        pytest.param(scene, CUBIC, COARSE, id="scene-multilevel"),
+        pytest.param(make, smoothing, id=f"{make.__name__}-{smoothing['kernel']}")
+        for make in (plane, scene)
+        for smoothing in (CUBIC, C2, C4)
     ],
 )
-def test_steps_are_those_of_the_twin(make, smoothing, solver):
+def test_steps_are_those_of_the_twin(make, smoothing):
     """Five steps without viscosity, all but the first from pressures of the one before."""
-    made = make(solver=solver, discretisation=smoothing).replaced("phase[0].viscosity=0")
+    made = make(solver=SOLVER, discretisation=smoothing).replaced("phase[0].viscosity=0")
     simulation, discrete = reference.Simulation(made), discretise(made)
     lattice, walls, dt = discrete.lattice, discrete.walls, 0.002
     grid = coarse_grid(made, discrete, len(simulation.positions))
@@ -75,7 +68,7 @@ def test_steps_are_those_of_the_twin(make, smoothing, solver):
         iterations=made.solver.iterations,
         repairs=made.solver.repairs,
         follow=False,
-        nodes=nodes if solver is COARSE else None,
+        nodes=nodes,
     )
     given = thrown(simulation)
     run = simulation.run(5, given)
@@ -130,7 +123,7 @@ def test_fluid_that_is_hurled_at_walls_is_that_of_the_warp_engine(case):
     assert distance(dual.position_tangents[-1], analytic.position_tangents[-1]) < 1e-12
 
 
-@pytest.mark.parametrize("name", ["plane", "free space", "multilevel"])
+@pytest.mark.parametrize("name", ["plane", "free space"])
 def test_on_corners_of_the_clamp_it_takes_the_mean_slope_too(name):
     """The lattice as a scene has it, moving as a whole: there is no divergence, and so the clamp is on its corner."""
     made = SCENES[name]
@@ -165,7 +158,7 @@ def test_methods_agree_and_the_adjoint_is_the_transpose(made):
     assert abs((bar * exact.position_tangents.high[-1]).sum() - reverse) < 1e-12 * size
 
 
-@pytest.mark.parametrize("name", ["plane", "space", "multilevel", "multilevel in space"])
+@pytest.mark.parametrize("name", ["plane", "space"])
 def test_differences_confirm_derivatives_far_below_round_off_of_float64(name):
     """In float64 the best step of central differences leaves an error of about 1e-9."""
     if "float128" not in reference.precisions():
@@ -184,7 +177,7 @@ def test_differences_confirm_derivatives_far_below_round_off_of_float64(name):
     assert distance(found.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-18
 
 
-@pytest.mark.parametrize("name", ["plane", "multilevel", "multilevel in space"])
+@pytest.mark.parametrize("name", ["plane", "space"])
 def test_the_adjoint_is_the_transpose_far_below_round_off_of_float64(name):
     if "float128" not in reference.precisions():
         pytest.skip("the compiler has no float128")
@@ -217,7 +210,7 @@ def product(numbers, digits):
     return sum(Fraction(a) * (Fraction(high) + Fraction(low)) for a, high, low in zip(*columns, strict=True))
 
 
-@pytest.mark.parametrize("name", ["plane", "multilevel"])
+@pytest.mark.parametrize("name", ["plane"])
 def test_same_bits_with_any_number_of_threads(name):
     found = []
     for threads in (1, 3):

@@ -85,5 +85,5 @@ def test_water_at_rest_has_no_lasting_vortex():
 
 def test_a_standing_wave_in_deep_water_lasts_as_it_must():
     """Lamb (1932). It reaches no wall: rows beside walls damp it."""
-    wave = standing_wave(24, solver={"kind": "projection", "multilevel": True})
+    wave = standing_wave(24)
     assert abs(wave.frequency - 1.0) < 0.005 and 0.9 < wave.damping < 1.1

@@ -73,7 +73,7 @@ CASES: dict[str, Case] = {
     **{
         f"standing wave, {n} deep, {long:g} depths long, {'between walls' if walls else 'periodic'}": (
             lambda device, n=n, long=long, walls=walls: standing_wave(
-                n, long, walls, solver={"kind": "projection", "multilevel": True}, time_step=0.072 / n, device=device
+                n, long, walls, time_step=0.072 / n, device=device
             )
         )
         for n in (24, 48)

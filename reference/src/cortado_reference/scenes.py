@@ -101,7 +101,7 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
             "repair_relaxations": constants.repair_relaxations(solver.repairs),
             "least_diagonal": constants.least_diagonal,
             "nearest_weight": constants.nearest_weight,
-            **(_of_nodes(scene, discrete) if solver.multilevel else {}),
+            **_of_nodes(scene, discrete),
         }
     assert isinstance(solver, PcisphSolver)
     greatest = solver.maximum_density_tolerance

@@ -21,7 +21,7 @@ from cortado.scene.tables import Table
 OF_DIFFUSION = ("free_energy", "strength", "mobility_form", "interface_width")
 OF_ITERATIONS = (
     *("minimum_iterations", "maximum_iterations", "density_tolerance", "maximum_density_tolerance"),
-    *("iterations", "tolerance", "repairs", "velocities_follow", "multilevel"),
+    *("iterations", "tolerance", "repairs", "velocities_follow"),
 )
 OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 

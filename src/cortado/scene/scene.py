@@ -108,7 +108,7 @@ class Scene(SceneTables):
         jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
         aside |= {name: {"jitter"} for name, jitter in jittered.items() if not jitter}
         unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
-        off = {name for name in ("velocities_follow", "multilevel") if not getattr(self.solver, name, True)}
+        off = set() if getattr(self.solver, "velocities_follow", True) else {"velocities_follow"}
         endless = {"tolerance", "maximum_iterations"} if getattr(self.solver, "tolerance", 0.0) is None else set()
         aside["solver"] = unused | off | endless
         if self.emitter and self.emitter.duration is None:

@@ -70,7 +70,7 @@ class ProjectionSolver(SolverTable):
 
     kind: Literal["projection"] = "projection"
     """Name of the algorithm."""
-    iterations: Annotated[int, count(1, 1_000)] = 2
+    iterations: Annotated[int, count(2, 1_000)] = 2
     """Iterations of the pressure in every step, each from that of the step before; at least, with a tolerance."""
     tolerance: Annotated[float, quantity(gt=0.0)] | None = None
     """Iterations end once the divergence that one finds is below it: times the step, its root mean square inside of the
@@ -79,9 +79,6 @@ class ProjectionSolver(SolverTable):
     """Iterations of the pressure in a step at most, with a tolerance."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
-    multilevel: Flag = False
-    """Whether the smooth part of the pressure is found at once, on a grid with nodes two spacings apart, before each
-    iteration: water that is shut in or deep then has its pressure in the first step, and steps may be longer."""
     velocities_follow: Flag = False
     """Whether velocities follow where the shift and the repairs take a particle, v + (delta . grad) v: flows in full
     containers lose less of their speed, and those with a surface can gain energy."""

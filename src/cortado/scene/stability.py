@@ -16,6 +16,7 @@ from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.rheology import greatest_viscosity
 from cortado.scene.solids import SolidTable
+from cortado.scene.solvers import ProjectionSolver
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
@@ -239,7 +240,7 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
     upright = np.take_along_axis(along, pulls.argmax(axis=1)[:, None], axis=1)[:, 0]
     roots = np.sqrt(np.linalg.norm(pulls, axis=1))
     depths = 0.5 * (upright + along.sum(axis=1)) / roots  # times sqrt(|g|)
-    if getattr(scene.solver, "multilevel", False):
+    if isinstance(scene.solver, ProjectionSolver):
         factors = np.where(_covers_floor(scene, pulls.argmax(axis=1)), RESTING, RUNNING)
         limits[acts] = factors * cut.spacing / np.sqrt(depths * roots)
     else:

@@ -1,10 +1,11 @@
 // The coarse correction of the projection's pressure: a pressure c_i E(x_i) with E = sum_I e_I phi_I on a grid of nodes,
 // which takes away what a residual r has that is smooth:
 //
-//     A e = sum_i phi_I c_i r_i,   A_IJ = sum_i (q_iI . q_iJ + eps delta_IJ) / m,   q_iI = N_i grad phi_I + phi_I h_i.
+//     A e = sum_i phi_I c_i r_i,   A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m,
+//     q_iI = N_i grad phi_I + phi_I h_i.
 //
 // q_iI is how the pressure phi_I c pushes particle i: h_i is the push of the share c alone, and N_i the moment of that,
-// -sum_j (T_j g_ij) x_ij^T with T = c L. eps is for nodes that few particles touch.
+// -sum_j (T_j g_ij) x_ij^T with T = c L. eps and h^2 are for nodes that few particles touch.
 #pragma once
 
 #include "surroundings.hpp"
@@ -22,34 +23,37 @@ struct Pushes {
 
     // What a function on the grid pushes particle i with.
     Vector<Scalar, D> of(std::size_t i, const Smooth<Scalar, D>& f) const { return N[i] * f.slope + f.value * h[i]; }
+    // h^2 / 100
+    Scalar holds(std::size_t i) const { return hundredths<Scalar>(1) * h[i].dot(h[i]); }
 };
 
 // The y and u that a correction begins with, and what it finds: y + alpha d and u + alpha f, with the alpha from 0 to 1
-// after which the kinetic energy is least.
+// after which the kinetic energy is least, but for a small part of it: where there is next to none, it makes alpha 1, and
+// 0 before the first iteration.
 template <class Scalar, int D>
 struct Correction {
     Values<Scalar> y;
     Vectors<Scalar, D> u;
-    Values<Scalar> counted;  // 1, or 0 where a surface is free: its divergence changes no pressure
+    Values<Scalar> counted;  // 1, or 0 where a surface is free: its divergence changes no pressure; 1/2 between
     Values<Scalar> r;        // D u - b where it counts
     Values<Scalar> e;        // of each node
     Values<Scalar> d;        // z+ + sigma z- - y, where z = y + c E
     Vectors<Scalar, D> f;    // -D^T d / m
-    Scalar energy{0}, alpha{0};  // sum m f^2; sum r d over it
+    Scalar energy{0}, alpha{0};  // sum m (f^2 + small^2); sum r d, and but for the first m small^2, over it
 
     // Whether alpha is between its ends, and follows the sums.
     bool bends() const { return alpha > Scalar(0) && alpha < Scalar(1); }
 
-    void stride(const Scalar& m) {
+    void stride(const Scalar& m, const Scalar& small, bool first) {
         using Real = typename RealOf<Scalar>::type;
-        Scalar work(0);
-        energy = Scalar(0);
+        energy = m * small * small * Scalar(Real(double(d.size())));
+        Scalar work = first ? Scalar(0) : energy;
         for (std::size_t i = 0; i < d.size(); ++i) {
             work += r[i] * d[i];
             energy += m * f[i].dot(f[i]);
         }
         alpha = work / energy;
-        if (real_part(energy) == Real(0) || real_part(alpha) < Real(0)) alpha = Scalar(0);  // NaN must stay
+        if (real_part(alpha) < Real(0)) alpha = Scalar(0);  // NaN must stay
         if (real_part(alpha) > Real(1)) alpha = Scalar(1);
     }
 };
@@ -70,7 +74,7 @@ struct Coarse {
             for (const auto& one : hats[i]) {
                 const Vector<Scalar, D> q = pushes.of(i, one);
                 const int row = rows_[one.node];
-                A_.at(row, row) += model.least_energy / m;
+                A_.at(row, row) += (model.least_energy + pushes.holds(i)) / m;
                 for (const auto& other : hats[i])
                     if (rows_[other.node] <= row) A_.at(row, rows_[other.node]) += q.dot(pushes.of(i, other)) / m;
             }

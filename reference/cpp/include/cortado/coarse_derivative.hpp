@@ -43,8 +43,10 @@ Values<Real> correction_tangent(const Model<Real, D>& model, const Projection<Re
     const Values<Real> de = coarse.solve([&](std::size_t i, const Hat<Real, D>& hat) {
         const Real c = at.effects[i].shared, wanted = c * before.r[i];
         const Real wanted_dot = change[i].shared * before.r[i] + c * change[i].r;
+        const Real held_dot = Real(2) / Real(100) * coarse.pushes.h[i].dot(dpushes.h[i]) / model.rest_density;
         return Real(hat.value * wanted_dot + hat.slope.dot(dx[i]) * wanted - coarse.pushes.of(i, hat).dot(dw[i]) -
-                    push_tangent<Real, D>(coarse.pushes, dpushes, i, hat, dx[i]).dot(w[i]));
+                    push_tangent<Real, D>(coarse.pushes, dpushes, i, hat, dx[i]).dot(w[i]) -
+                    held_dot * before.e[hat.node]);
     });
     Values<Real> dd(count);
     each_particle(count, model.threads, [&](std::size_t i) {
@@ -90,6 +92,9 @@ std::vector<CorrectionChange<Real>> correction_adjoint(const Model<Real, D>& mod
         const Vector<Real, D> by_f = -coarse.pushes.of(i, g) / m, by_g = -coarse.pushes.of(i, f) / m;
         push_adjoint<Real, D>(coarse.pushes, pushes_bar, i, f, by_f, x_bar[i]);
         push_adjoint<Real, D>(coarse.pushes, pushes_bar, i, g, by_g, x_bar[i]);
+        Real both = 0;
+        for (const auto& hat : coarse.hats[i]) both += before.e[hat.node] * multiplier[hat.node];
+        pushes_bar.h[i] -= Real(2) / Real(100) * both / m * coarse.pushes.h[i];
     });
     return bar;
 }

@@ -3,6 +3,8 @@
 // the same in the same order.
 #pragma once
 
+#include <algorithm>
+
 #include "coarse.hpp"
 
 namespace cortado {
@@ -30,7 +32,7 @@ struct Projection {
     std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity before iteration i; the last is the result
-    std::vector<Correction<Scalar, D>> corrections;  // [i]: of k, y and u before iteration i; none without a grid
+    std::vector<Correction<Scalar, D>> corrections;  // [i]: of k, y and u before iteration i, where one is due
     Coarse<Scalar, D> coarse;
     Vectors<Scalar, D> kick;                  // what the last k adds to velocities
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of the last but one
@@ -40,10 +42,13 @@ struct Projection {
     std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
     std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
     std::vector<Values<Scalar>> held;         // [i]: the part of its way that a particle goes in repair i
+    bool cold = true;                         // whether no particle begins with a pressure
     double error = 0;                         // average compression as the last repair found it
 
     State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back(), kick}; }
 
+    // Whether there is a correction before iteration i: not before the first where a particle begins with a pressure.
+    bool corrects(std::size_t i) const { return i > 0 || cold; }
     // y as iteration i - 1 leaves it, before it is corrected.
     const Values<Scalar>& uncorrected(std::size_t i) const { return i < corrections.size() ? corrections[i].y : y[i]; }
 
@@ -100,10 +105,11 @@ struct Projection {
             k[0][i] = y[0][i] = full * state.k[i];
             u[0][i] = v_star[i] + full * state.kick[i];
         }
-        corrections.resize(model.nodes.count() > 0 ? iterations : 0);
-        if (!corrections.empty()) spread(model, fluid, state.x);
+        cold = std::none_of(k[0].begin(), k[0].end(), [](const Scalar& one) { return one > Scalar(0); });
+        corrections.resize(iterations);
+        spread(model, fluid, state.x);
         for (std::size_t at = 0; at < iterations; ++at) {
-            if (!corrections.empty()) correct(model, fluid, n, corrections[at], at);
+            if (corrects(at)) correct(model, fluid, n, corrections[at], at);
             iterate(model, fluid, n, at);
             pull(model, fluid, y[at + 1], v_star, u[at + 1]);
         }
@@ -194,7 +200,8 @@ private:
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             const Scalar left = divergence_of(model, fluid, before.u, i) - wanted(model, i, n[i]);
             const bool inside = before.y[i] > Scalar(0) || effects[i].tension > hundredths<Scalar>(50);
-            before.counted[i] = Scalar(inside || !(real_part(left) <= Real(0)) ? 1 : 0);  // NaN must stay
+            const bool all = inside || !(real_part(left) <= Real(0));  // NaN must stay
+            before.counted[i] = Scalar(all ? Real(1) : real_part(left) == Real(0) ? Real(1) / Real(2) : Real(0));
             before.r[i] = before.counted[i] * left;
         });
         before.e = coarse.solve(
@@ -207,7 +214,7 @@ private:
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             before.f[i] = -push(model, fluid, before.d, i) / model.rest_density;
         });
-        before.stride(model.rest_density);
+        before.stride(model.rest_density, model.spacing / (Scalar(1'000'000) * model.time_step), at == 0);
         for (std::size_t i = 0; i < n.size(); ++i) {
             k[at][i] = y[at][i] = before.y[i] + before.alpha * before.d[i];
             u[at][i] = before.u[i] + before.alpha * before.f[i];

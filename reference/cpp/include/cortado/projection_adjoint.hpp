@@ -247,9 +247,9 @@ private:
             });
             u_bar = k == last ? flow_bar_ : zero_vectors<Real, D>(count_);
             diverge(d_bar, at_.u[k], u_bar);
-            if (!at_.corrections.empty()) correct(k, bar, y_bar, n_bar);
+            if (at_.corrects(k)) correct(k, bar, y_bar, n_bar);
         }
-        if (!at_.corrections.empty()) pushes();
+        pushes();
     }
 
     // From the adjoints of effects and moments to that of positions.

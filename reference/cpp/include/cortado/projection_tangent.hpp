@@ -128,8 +128,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             dv[i] = dv_star[i] + dkick[i];
         }
     };
-    Pushes<Real, D> pushes_dot;
-    if (!at.corrections.empty()) pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
+    const Pushes<Real, D> pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
     const auto correct = [&](std::size_t k) {
         const Correction<Real, D>& before = at.corrections[k];
         std::vector<CorrectionChange<Real>> change(count);
@@ -151,7 +150,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         }
     };
     for (std::size_t k = 0; k < at.divergences.size(); ++k) {
-        if (!at.corrections.empty()) correct(k);
+        if (at.corrects(k)) correct(k);
         du = dv;
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];

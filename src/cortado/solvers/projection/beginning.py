@@ -5,6 +5,9 @@ Not so for a particle that its kick would take towards a wall, gamma . w > 0, by
 step. Between walls that are nearer to one another than a spacing it has come from one to the other, and what held it
 off the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure;
 of that choice there is no derivative.
+
+A scene is warm in which a particle begins with a pressure. In a cold one, as in the first step of a run, the coarse
+correction comes before the first iteration too (`cortado.solvers.projection.steps`).
 """
 
 from functools import cache
@@ -52,13 +55,17 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         k: wp.array(dtype=real),
         y: wp.array(dtype=real),
         u: wp.array(dtype=vector),
+        warm: wp.array(dtype=int),
     ):
+        """``warm`` is 0 for each scene before."""
         i = wp.tid()
         full = weights[i][1] * taken(kick_before[i], gamma[i], time_step[i // particles], spacing)
         first = full * k_before[i]
         k[i] = first
         y[i] = first
         u[i] = v_star[i] + full * kick_before[i]
+        if not (first <= real(0.0)) and warm[i // particles] == 0:
+            warm[i // particles] = 1
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def begin_tangent(

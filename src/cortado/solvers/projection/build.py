@@ -32,7 +32,7 @@ class ProjectionMaker:
             raise InputError(
                 f"batch is {setting.batch}, but must be left out, as solver.tolerance is that of one scene."
             )
-        grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles) if table.multilevel else None
+        grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
         constants = lattice_constants(setting.scene, setting.discrete)
         return Projection(system, constants, pressure_limits(table), table.repairs, table.velocities_follow, grid)
 

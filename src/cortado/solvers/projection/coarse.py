@@ -1,9 +1,13 @@
 """A coarse correction of the pressure, so that water that is shut in knows of its walls within one step.
 
-An iteration of `cortado.solvers.projection.pressure` hands a pressure on by a spacing or two. Before each of them the
-smooth part of what is missing is found at once, on a grid with nodes two spacings apart (Takahashi and Lin 2016 have a
-multilevel particle solver; `cortado.solvers.projection.coarse_pressure` has the equations of this one).
+An iteration of `cortado.solvers.projection.pressure` hands a pressure on by a spacing or two. Before each of them but
+the first, which has the pressure of the step before, the smooth part of what is missing is found at once, on a grid
+with nodes two spacings apart (Takahashi and Lin 2016 have a multilevel particle solver;
+`cortado.solvers.projection.coarse_pressure` has the equations of this one). Before the first as well it would cost
+twice as much and gain a tenth at most, but in a cold scene, which has no pressure of the step before.
 """
+
+from collections.abc import Callable
 
 import warp as wp
 
@@ -30,7 +34,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 LEAST = 1e-5
 """eps of all particles around a node over what A_II is on the lattice. It takes 0.7 % off the correction of the longest
 wave in water that is 100 spacings deep, and 3 % where it is 200 deep."""
-CLOSE = 1e-4
+CLOSE = 1e-3
 """Of the first residual of a solve in float32, in the norm of A^-1, where it ends. From 3e-7 to 1e-3 the gradient of a
 dam's place after 80 steps with respect to gravity differs by less than 4e-7, beside float64 too."""
 MOST = 1_000
@@ -68,12 +72,17 @@ class Coarse:
         """The part of A of each cell, for each two of its corners."""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
+        self.spaced = {"spacing": spacing}
+        """As kernels call it."""
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
         """As kernels call them."""
         self.pushed = layout.arrays(h=vector, N=matrix_type(precision), T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
         """Of alpha."""
+        self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
+        """Whether scenes are (`cortado.solvers.projection.beginning`)."""
+        self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
         """Nothing: what a correction left may not be finite, if its run was lost."""
         self.still = layout.arrays(still=vector)["still"]
@@ -94,7 +103,9 @@ class Coarse:
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, around: Named) -> None:
-        """The matrix of a step."""
+        """The matrix of a step, and whether it is to be solved before the first iteration."""
+        scenes = {"scenes": len(self.warm), "warm": self.warm}
+        context.launch(self.length.every, scenes, all_warm=self._all_warm, threads=1)
         for kernel in self.push.forward:
             context.launch(kernel, around, self.pushed)
         self._sort(context.fields["x"])
@@ -105,22 +116,31 @@ class Coarse:
         if self.bodies is not None:
             self.bodies.begin(context, self.grid, around, self._levels.B)
 
+    def where_due(self, k: int, correct: Callable[[], None]) -> None:
+        """``correct`` before iteration k, before the first one only if a scene is cold."""
+        if k > 0:
+            correct()
+        else:
+            wp.capture_if(self._all_warm, on_false=correct)
+
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
         """Write to ``e`` (nodes,) what solves A e = the `source`, spread with the e ``before``."""
         r = self._levels.r
         context.launch(self.nodes.spread, self.grid, self.source, r=r, e=before, threads=len(r))
         self._levels.solve(e, self._tolerance, MOST)
 
-    def correct(self, context: StepContext, around: Named, at: Named, new: Named, T: wp.array) -> None:
-        """From an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new`` one, which has `room`
-        for the rest; ``around`` has the drift of walls, and ``T`` is overwritten."""
+    def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
+        """Before iteration k, from an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new``
+        one, which has `room` for the rest; ``around`` has the drift of walls, and ``T`` is overwritten."""
         context.launch(self.residual.residual, around, at, self.source, r=new["r"])
         self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
         thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
         context.launch(self.velocity.velocity.forward, around, thrown, v_star=self.still)
-        context.launch(self.length.share, own, self.carried(context, new["change"]), self.parts)
+        stays = self.warm if k == 0 else self._none_stays
+        carried = self.carried(context, new["change"])
+        context.launch(self.length.share, own, carried, self.spaced, self.parts, first=int(k == 0), stays=stays)
         wp.copy(new["sums"], self.sums(self.parts["parts"]))
         out = {"k_out": new["k"], "y_out": new["y"], "u_out": new["u"]}
         context.launch(self.length.apply, out, own, at)
@@ -150,8 +170,9 @@ class CoarseTangent:
         for kernel in self._coarse.push.tangent:
             context.launch(kernel, *known, self._coarse.pushed, self._change)
 
-    def correct(self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named) -> None:
-        """``at``: the iterate before, and k_dot, y_dot and u_dot, which are replaced by those of the ``new`` one."""
+    def correct(self, context: StepContext, k: int, known: tuple[Named, ...], at: Named, new: Named) -> None:
+        """Before iteration k. ``at``: the iterate before, and k_dot, y_dot and u_dot, which become those of the ``new``
+        one."""
         own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
         found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -170,7 +191,8 @@ class CoarseTangent:
         carried = self._unmoved
         if self._bodies is not None:
             carried = self._bodies.carried(context, new["change"], change["change"])
-        context.launch(own.length.share_tangent, found, left, carried, own.parts, *known)
+        given = {**own.spaced, "first": int(k == 0)}
+        context.launch(own.length.share_tangent, given, found, left, carried, own.parts, *known)
         steps = {name: at[name] for name in ("k_dot", "y_dot", "u_dot")}
         context.launch(own.length.apply_tangent, steps, found, left, sums_dot=own.sums(own.parts["parts"]))
 
@@ -195,16 +217,25 @@ class CoarseAdjoint:
             array.zero_()
 
     def correct(
-        self, context: StepContext, known: tuple[Named, ...], at: Named, new: Named, steps: Named, u_bar: wp.array
+        self,
+        context: StepContext,
+        k: int,
+        known: tuple[Named, ...],
+        at: Named,
+        new: Named,
+        steps: Named,
+        u_bar: wp.array,
     ) -> None:
-        """From the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, and ``u_bar``, to those of k and y of
-        the one before, ``at``, and to d_bar and S there, from which u before has what it has not from u_bar."""
+        """Before iteration k, from the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, and ``u_bar``, to
+        those of k and y of the one before, ``at``, and to d_bar and S there, from which u before has what it has not
+        from u_bar."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])
         total = self._sum(found["alpha_bar"])
         left |= own.carried(context, new["change"])
-        context.launch(own.length.apply_adjoint, {"alpha_bar": total}, left, steps, found, *known, u_bar=u_bar)
+        given = {"alpha_bar": total, **own.spaced, "first": int(k == 0)}
+        context.launch(own.length.apply_adjoint, given, left, steps, found, *known, u_bar=u_bar)
         if self._bodies is not None:
             self._bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
         thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}

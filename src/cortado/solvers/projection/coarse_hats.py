@@ -14,6 +14,9 @@ from cortado.device.bundles import bundle
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.precision import Precision
 
+ALONE = 0.01
+"""Of h^2, in what holds the nodes around a particle."""
+
 
 def source_type(precision: Precision) -> Any:
     """The bundle of what is spread."""
@@ -78,6 +81,8 @@ class HatFunctions:
     """H v"""
     corner_step: Any
     """To one of the corners of a cell."""
+    held: Any
+    """eps + h^2 / 100, by which a particle holds the nodes around it."""
 
 
 @cache
@@ -88,6 +93,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     number_of = node_functions(dimension).number_of
     CORNERS = wp.constant(2**dimension)
     flat = wp.constant(dimension == 2)
+    alone = wp.constant(real(ALONE))
 
     @wp.struct
     class Hat:
@@ -162,4 +168,8 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         """H v"""
         return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
 
-    return HatFunctions(hat, at, products, bend, corner_step)
+    @wp.func
+    def held(eps: real, h: vector) -> real:
+        return eps + alone * wp.dot(h, h)
+
+    return HatFunctions(hat, at, products, bend, corner_step, held)

@@ -10,6 +10,9 @@ from cortado.device.bundles import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
+SMALL = 1e-6
+"""Speed, in spacings a step, of the kinetic energy that is added to the sums of alpha."""
+
 
 @dataclass(frozen=True)
 class LengthKernels:
@@ -25,19 +28,20 @@ class LengthKernels:
     """Of y' and u', given both sums."""
     along_adjoint: Any
     """What the adjoint of y' and u' gives to alpha."""
+    every: Any
+    """Whether all scenes of a batch are warm."""
 
 
 @cache
 def length_kernels(precision: Precision) -> LengthKernels:
     """The same in 2 and in 3 dimensions."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
+    small = wp.constant(real(SMALL))
     module = kernel_module(f"coarse_length_{precision.name}")
 
     @wp.func
     def length(sums: pair_of) -> real:
         """alpha; NaN stays NaN, which must not be hidden."""
-        if sums[1] == real(0.0):
-            return real(0.0)
         found = sums[0] / sums[1]
         return wp.where(found < real(0.0), real(0.0), wp.where(found > real(1.0), real(1.0), found))
 
@@ -47,7 +51,25 @@ def length_kernels(precision: Precision) -> LengthKernels:
         return sums[0] > real(0.0) and sums[0] < sums[1]
 
     @wp.kernel(module=module, enable_backward=False)
+    def every(scenes: int, warm: wp.array(dtype=int), all_warm: wp.array(dtype=int)):
+        found = int(1)
+        for scene in range(scenes):
+            found = wp.min(found, warm[scene])
+        all_warm[0] = found
+
+    @wp.func
+    def least(m: real, spacing: real, dt: real) -> real:
+        """What a particle adds to the sums in any case."""
+        v = small * spacing / dt
+        return m * v * v
+
+    @wp.kernel(module=module, enable_backward=False)
     def share(
+        particles: int,
+        first: int,
+        spacing: real,
+        stays: wp.array(dtype=int),
+        time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         r: wp.array(dtype=real),
         change: wp.array(dtype=real),
@@ -56,9 +78,13 @@ def length_kernels(precision: Precision) -> LengthKernels:
         # out
         parts: wp.array(dtype=pair_of),
     ):
+        """In a scene that ``stays`` as it is alpha is 0."""
         i = wp.tid()
-        d = change[i]
-        parts[i] = pair_of(r[i] * d, m[i] * wp.dot(thrust[i], thrust[i]) + d * carried[i])
+        if stays[i // particles] != 0:
+            parts[i] = pair_of(real(0.0), m[i])
+            return
+        d, own = change[i], least(m[i], spacing, time_step[i // particles])
+        parts[i] = pair_of(r[i] * d + real(1 - first) * own, m[i] * wp.dot(thrust[i], thrust[i]) + d * carried[i] + own)
 
     @wp.kernel(module=module, enable_backward=False)
     def apply(
@@ -82,6 +108,11 @@ def length_kernels(precision: Precision) -> LengthKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def share_tangent(
+        particles: int,
+        first: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
         of: bundle(r=real, change=real, carried=real, thrust=vector),
@@ -90,10 +121,13 @@ def length_kernels(precision: Precision) -> LengthKernels:
         parts: wp.array(dtype=pair_of),
     ):
         i = wp.tid()
-        first = dot.r[i] * of.change[i] + of.r[i] * dot.change[i]
+        along = dot.r[i] * of.change[i] + of.r[i] * dot.change[i]
         f, f_dot = of.thrust[i], dot.thrust[i]
-        second = m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot)
-        parts[i] = pair_of(first, second + dot.change[i] * of.carried[i] + of.change[i] * dot.carried[i])
+        energy = m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot)
+        energy += dot.change[i] * of.carried[i] + of.change[i] * dot.carried[i]
+        dt, dt_dot = time_step[i // particles], time_step_dot[i // particles]
+        own_dot = least(m_dot[i], spacing, dt) - real(2.0) * least(m[i], spacing, dt) * dt_dot / dt
+        parts[i] = pair_of(along + real(1 - first) * own_dot, energy + own_dot)
 
     @wp.kernel(module=module, enable_backward=False)
     def apply_tangent(
@@ -132,6 +166,9 @@ def length_kernels(precision: Precision) -> LengthKernels:
     @wp.kernel(module=module, enable_backward=False)
     def apply_adjoint(
         particles: int,
+        first: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
         sums: wp.array(dtype=pair_of),
         alpha_bar: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -140,7 +177,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
         # in and out: at first those of k' and y', at last those of k and y
         k_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
+        bar: bundle(m=real, time_step=real),
         # out
         change_bar: wp.array(dtype=real),
         carried_bar: wp.array(dtype=real),
@@ -150,17 +187,19 @@ def length_kernels(precision: Precision) -> LengthKernels:
         """``alpha_bar`` is that of each scene. The adjoint of u' is that of u, too."""
         i = wp.tid()
         both, no = sums[i // particles], real(0.0)
-        alpha, first_bar, second_bar = length(both), real(0.0), real(0.0)
+        alpha, along_bar, energy_bar = length(both), real(0.0), real(0.0)
         if bends(both):
-            first_bar = alpha_bar[i // particles] / both[1]
-            second_bar = -alpha * first_bar
+            along_bar = alpha_bar[i // particles] / both[1]
+            energy_bar = -alpha * along_bar
         new_bar, f = k_bar[i] + y_bar[i], of.thrust[i]
         k_bar[i] = no
         y_bar[i] = new_bar
-        m_bar[i] = m_bar[i] + second_bar * wp.dot(f, f)
-        change_bar[i] = alpha * new_bar + first_bar * of.r[i] + second_bar * of.carried[i]
-        carried_bar[i] = second_bar * of.change[i]
-        thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * second_bar) * f
-        r_bar[i] = first_bar * of.change[i]
+        dt, own_bar = time_step[i // particles], real(1 - first) * along_bar + energy_bar
+        bar.m[i] = bar.m[i] + energy_bar * wp.dot(f, f) + own_bar * least(real(1.0), spacing, dt)
+        bar.time_step[i] = bar.time_step[i] - real(2.0) * own_bar * least(m[i], spacing, dt) / dt
+        change_bar[i] = alpha * new_bar + along_bar * of.r[i] + energy_bar * of.carried[i]
+        carried_bar[i] = energy_bar * of.change[i]
+        thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * energy_bar) * f
+        r_bar[i] = along_bar * of.change[i]
 
-    return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint)
+    return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint, every)

@@ -32,7 +32,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     """In 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, source, own = cell_grid_type(precision), source_type(precision), hat_functions(precision, dimension)
-    hat, corner_step, among = own.hat, own.corner_step, node_functions(dimension)
+    hat, corner_step, held, among = own.hat, own.corner_step, own.held, node_functions(dimension)
     number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
     module = kernel_module(f"coarse_nodes_{dimension}d_{precision.name}")
     CORNERS, AROUND = wp.constant(2**dimension), wp.constant(3**dimension)
@@ -69,7 +69,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                     own[corner, axis] = q[axis]
             total += own * wp.transpose(own) / m[i]
             for corner in range(CORNERS):
-                total[corner, corner] += eps / m[i]
+                total[corner, corner] += held(eps, h[i]) / m[i]
         for a in range(CORNERS):
             for b in range(a, CORNERS):
                 cells[pair_of(a, b), cell] = total[a, b]

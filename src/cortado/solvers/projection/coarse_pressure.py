@@ -3,18 +3,24 @@
 With the share c of each particle, and N and h of `cortado.solvers.projection.coarse_sums`,
 
     q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
-    A_IJ = sum_i (q_iI . q_iJ + eps delta_IJ) / m_i        over the particles of the cells around I and J,
+    A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,
     A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma > 1/2 or D u > b, else 0,
     d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > 0, else sigma z - y,
-    y' = y + alpha d,   u' = u - alpha D^T d / m,   alpha = sum_i r_i d_i / sum_i |D^T d|^2 / m, from 0 to 1.
+    y' = y + alpha d,   u' = u - alpha D^T d / m,
+    alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
-alpha is the step along d after which the kinetic energy is least, so that a correction never adds any, whatever the
-clamp leaves of it. Free bodies add to A and to what alpha divides by: `cortado.solvers.projection.coarse_bodies`.
+But for l, alpha is the step along d after which the kinetic energy is least, so that a correction adds none, whatever
+the clamp leaves of it. Where it is next to nothing, as in fluid that falls freely, alpha is 1 by l, and y' follows a
+small change of u linearly. Before the first iteration, l is in the second sum alone, and alpha is 0 there: a small
+change of u makes a pressure in a step, so that the next one is not cold. Free bodies add to A and to what alpha divides
+by: `cortado.solvers.projection.coarse_bodies`.
 
-eps makes e small at nodes that few particles touch. Everything goes between nodes and particles in two ways: `spread`
-sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the cells around a node, in their
-order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second derivatives at a particle. With
-w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = eps / m.
+eps makes e small at nodes that few particles touch. So does h^2 / 100, which is next to nothing in fluid and beside
+walls that close it: a particle that has a wall beside it and no fluid tells the nodes around it one thing, and what it
+leaves open would take solves hundreds of iterations, in dams that have run out. Everything goes between nodes and
+particles in two ways: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the
+cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second derivatives
+at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
 """
 
 from dataclasses import dataclass
@@ -28,7 +34,7 @@ from cortado.device.cells import cell_grid_type
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.solvers.projection.clamp import clamp_functions
-from cortado.solvers.projection.coarse_hats import hat_functions, source_type
+from cortado.solvers.projection.coarse_hats import ALONE, hat_functions, source_type
 from cortado.solvers.projection.effects import weights_type
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
@@ -53,7 +59,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
     """In 2 or 3 dimensions."""
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
-    at, products, bend = hats.at, hats.products, hats.bend
+    at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
     six, pack, parts = packed.kind, packed.pack, clamp_functions(precision).parts
     module = kernel_module(f"coarse_pressure_{dimension}d_{precision.name}")
@@ -103,7 +109,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         w_dot = (N_dot * f.slope + N * bend(f.bent, v) + along * h + f.value * h_dot - m_dot[i] * w) / m[i]
         p, cr = wp.transpose(N) * w, of.coarse[i] * of.r[i]
         out.s_value[i] = of.coarse_dot[i] * of.r[i] + of.coarse[i] * of.r_dot[i] - wp.dot(h_dot, w) - wp.dot(h, w_dot)
-        out.s_own[i] = eps * m_dot[i] / (m[i] * m[i])
+        out.s_own[i] = (held(eps, h) * m_dot[i] / m[i] - alone * wp.dot(h, h_dot)) / m[i]
         out.s_slope[i] = (cr - wp.dot(h, w)) * v - wp.transpose(N_dot) * w - wp.transpose(N) * w_dot
         out.s_bent[i] = -(cross_terms(p, v) + cross_terms(v, p))
 
@@ -184,9 +190,10 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         w, u = (N * f.slope + f.value * h) / m[i], (N * g.slope + g.value * h) / m[i]
         r_bar[i] = r_bar[i] + c * g.value
         bar.coarse[i] = bar.coarse[i] + g.value * r
-        bar.h[i] = bar.h[i] - g.value * w - f.value * u
+        both = products(i, particles, x[i], e, multiplier, grid)
+        bar.h[i] = bar.h[i] - g.value * w - f.value * u - (alone * both / m[i]) * h
         bar.N[i] = bar.N[i] - wp.outer(w, g.slope) - wp.outer(u, f.slope)
-        bar.m[i] = bar.m[i] + wp.dot(u, w) + eps * products(i, particles, x[i], e, multiplier, grid) / (m[i] * m[i])
+        bar.m[i] = bar.m[i] + wp.dot(u, w) + held(eps, h) * both / (m[i] * m[i])
         x_part = (c * r - wp.dot(h, w)) * g.slope - wp.dot(h, u) * f.slope
         x_part -= bend(g.bent, wp.transpose(N) * w) + bend(f.bent, wp.transpose(N) * u)
         bar.x[i] = bar.x[i] + x_part

@@ -43,9 +43,12 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
     lane = lane_functions(precision, LANES).lane
 
     @wp.func
-    def counts(y: real, tension: real, left: real) -> bool:
-        """Not where a surface is free: its divergence changes no pressure. NaN counts, which must not be hidden."""
-        return y > real(0.0) or tension > real(0.5) or not (left <= real(0.0))
+    def counts(y: real, tension: real, left: real) -> real:
+        """Which part of a divergence does. Where a surface is free it changes no pressure; at the corner between it is
+        the mean of both sides. NaN counts, which must not be hidden."""
+        if y > real(0.0) or tension > real(0.5) or not (left <= real(0.0)):
+            return real(1.0)
+        return wp.where(left == real(0.0), real(0.5), real(0.0))
 
     @wp.kernel(module=discretisation.module(True, topic))
     def residual(
@@ -67,8 +70,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
         left = D - wanted(n[i], of.weights[i][1], time_step[i // s.particles])
-        if not counts(at.y[i], of.weights[i][0], left):
-            left = real(0.0)
+        left *= counts(at.y[i], of.weights[i][0], left)
         at.A[i] = A
         at.d[i] = D
         r[i] = left
@@ -104,7 +106,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         b_dot = -b * time_step_dot[member] / dt
         if n[i] < real(1.0):
             b_dot -= ((real(1.0) - full) * n_dot[i] + dot.weights[i][1] * (real(1.0) - n[i])) / dt
-        r_dot[i] = wp.where(counts(at.y[i], of.weights[i][0], at.d[i] - b), D_dot - b_dot, real(0.0))
+        r_dot[i] = counts(at.y[i], of.weights[i][0], at.d[i] - b) * (D_dot - b_dot)
 
     @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)
     def residual_adjoint(
@@ -124,7 +126,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         i = wp.tid()
         no, dt, full = real(0.0), time_step[i // particles], of.weights[i][1]
         b = wanted(n[i], full, dt)
-        found = wp.where(counts(y[i], of.weights[i][0], d[i] - b), r_bar[i], no)
+        found = counts(y[i], of.weights[i][0], d[i] - b) * r_bar[i]
         if n[i] < real(1.0):
             bar.n[i] = bar.n[i] + (real(1.0) - full) / dt * found
             bar.weights[i] = bar.weights[i] + weights4(no, (real(1.0) - n[i]) / dt * found, no, no)

@@ -39,7 +39,7 @@ class ProjectionTangent(ParticleTangent):
         free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
         self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
         own = solver.layout, self._bodies, self.dot
-        self._coarse = None if solver.coarse is None else CoarseTangent(solver.coarse, *own)
+        self._coarse = CoarseTangent(solver.coarse, *own)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Replace the tangent of the replayed step's state by that of its result."""
@@ -98,14 +98,10 @@ class ProjectionTangent(ParticleTangent):
         before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
         change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
         context.launch(beginning.tangent, *known, solver.spaced, before, change, v_star_dot=self._v_star_dot)
-        if self._coarse is not None:
-            self._coarse.begin(context, known)
+        self._coarse.begin(context, known)
         for k in range(iterations):
             at = solver.corrected[k]
-            if self._coarse is not None:
-                before = {**solver.iterates[k], **change}
-                drift = self._drift(context, before)
-                self._coarse.correct(context, (drift, *known), before, at)
+            solver.coarse.where_due(k, partial(self._correct, context, known, k, change))
             drift = self._drift(context, at)
             new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
             beta = solver.momentum(k)
@@ -113,6 +109,12 @@ class ProjectionTangent(ParticleTangent):
             self._press(context, known, solver.iterates[k + 1])
         if self._bodies is not None:
             self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
+
+    def _correct(self, context: StepContext, known: tuple[Named, ...], k: int, change: dict[str, wp.array]) -> None:
+        """The coarse correction before iteration k."""
+        before = {**self._solver.iterates[k], **change}
+        drift = self._drift(context, before)
+        self._coarse.correct(context, k, (drift, *known), before, self._solver.corrected[k])
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> dict[str, wp.array]:
         """The tangent of the drift of walls where bodies move; what surrounds particles has that of others."""
@@ -151,7 +153,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
         self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
         own = solver.layout, self._bodies, self.bar
-        self._coarse = None if solver.coarse is None else CoarseAdjoint(solver.coarse, *own)
+        self._coarse = CoarseAdjoint(solver.coarse, *own)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""
@@ -250,23 +252,19 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver = self._solver
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
-        if self._coarse is not None:
-            self._coarse.begin()
+        self._coarse.begin()
         for k in reversed(range(iterations)):
             self._press(context, known, solver.iterates[k + 1], self._y_bar)
             self._back(context, known, solver.corrected[k], solver.momentum(k), moves=k == iterations - 1)
-            if self._coarse is not None:
-                self._correct(context, known, k)
-        if self._coarse is not None:
-            self._coarse.finish(context, known)
+            solver.coarse.where_due(k, partial(self._correct, context, known, k))
+        self._coarse.finish(context, known)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
         """Of the coarse correction before iteration k, from the adjoints of its k, y and u to those before."""
-        assert self._coarse is not None
         solver, at = self._solver, self._solver.iterates[k]
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
-        self._coarse.correct(context, (drift, *known), at, solver.corrected[k], steps, self._u_bar)
+        self._coarse.correct(context, k, (drift, *known), at, solver.corrected[k], steps, self._u_bar)
         wp.copy(self._f, self._u_bar)
         self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, steps)
         add(self._f, self._u_bar)

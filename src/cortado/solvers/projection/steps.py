@@ -87,11 +87,11 @@ class ProjectionSteps(ParticleSolver):
         limits: LoopLimits,
         repairs: int,
         follow: bool,
-        grid: Grid | None,
+        grid: Grid,
     ):
         """Of iterations of the pressure within ``limits`` and so many repairs of density in every step; velocities
-        ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure before each
-        iteration."""
+        ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure between
+        iterations, and in a cold scene before the first one."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -112,10 +112,9 @@ class ProjectionSteps(ParticleSolver):
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
         own = self.discretisation, self.layout, system.walled.dimension
-        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies) if grid is not None else None
-        """What corrects the pressure before each iteration; None where nothing does."""
-        self.corrected = [self._new_corrected()] if grid is not None else self.iterates
-        """The iterates that an iteration of the pressure begins with: the corrected ones, or those themselves."""
+        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies)
+        self.corrected = [self._new_corrected()]
+        """The iterates as iterations of the pressure begin with them."""
         self._momenta = momenta(limits.minimum_iterations)
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
@@ -160,13 +159,11 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         while len(self.iterates) <= iterations:
             self.iterates.append(self.layout.arrays(**self._iterate_kinds))
-            if self.coarse is not None:
-                self.corrected.append(self._new_corrected())
+            self.corrected.append(self._new_corrected())
         while len(self.repaired) <= repairs:
             self.repaired.append(self.layout.arrays(**self._repair_kinds))
 
     def _new_corrected(self) -> dict[str, wp.array]:
-        assert self.coarse is not None
         return {**self.layout.arrays(**self._iterate_kinds), **self.coarse.room()}
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
@@ -214,18 +211,22 @@ class ProjectionSteps(ParticleSolver):
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
-        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first)
-        if self.coarse is not None:
-            self.coarse.begin(context, self.around)
+        self.coarse.warm.zero_()
+        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first, warm=self.coarse.warm)
+        self.coarse.begin(context, self.around)
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Iteration k, from the iterates of one slot to those of another."""
-        if self.coarse is not None:
-            at, new = self.iterates[before], self.corrected[before]
-            around = {**self.around, "drift": self._drift(context, at)}
-            self.coarse.correct(context, around, at, new, self.pull)
-        at, new = self.corrected[before], self.iterates[after]
+        old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
+
+        def correct() -> None:
+            around = {**self.around, "drift": self._drift(context, old)}
+            self.coarse.correct(context, k, around, old, at, self.pull)
+
+        for name in ("k", "y", "u") if k == 0 else ():  # where nothing corrects them
+            wp.copy(at[name], old[name])
+        self.coarse.where_due(k, correct)
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
         out["drift"] = self._drift(context, at)
         update = self.kernels.pressure.update.forward
