@@ -279,5 +279,7 @@ class Projection:
         out = total + gamma
         along = slope - out * ((out * slope).sum(1) / ((out**2).sum(1) + (0.03 / s) ** 2))[:, None]
         strength = rate / np.sqrt(1 + (rate / 0.5) ** 2)
-        wish = -(strength * s**2 * between(H, 0.5, 0.8))[:, None] * along
+        apart = self.pairs(x, x)[0]
+        away = (np.maximum(1 - (apart**2).sum(-1) / (0.65 * s) ** 2, 0)[..., None] ** 2 * apart).sum(1)
+        wish = strength[:, None] * (4 * away - (s**2 * between(H, 0.5, 0.8))[:, None] * along)
         return wish / np.sqrt(1 + (wish**2).sum(1) / (0.1 * s) ** 2)[:, None]

@@ -36,7 +36,7 @@ struct Projection {
     Coarse<Scalar, D> coarse;
     Vectors<Scalar, D> kick;                  // what the last k adds to velocities
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of the last but one
-    Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
+    Vectors<Scalar, D> crowd, apart;          // sum (1 + q_ij / (4 + q_ij)) g_ij, sum p_ij
     Vectors<Scalar, D> x_moved;               // x'
     std::vector<Vectors<Scalar, D>> x_now;    // [i]: before repair i; the last is the result
     std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
@@ -238,18 +238,19 @@ private:
     // The shift, and the positions that it and velocities lead to.
     void move(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
               const Vectors<Scalar, D>& v) {
-        for (Vectors<Scalar, D>* each : {&crowd, &x_moved}) each->resize(x.size());
+        for (Vectors<Scalar, D>* each : {&crowd, &apart, &x_moved}) each->resize(x.size());
         A.resize(x.size());
         each_particle(x.size(), model.threads, [&](std::size_t i) {
             const Vectors<Scalar, D>& w = flow();
             A[i] = Matrix<Scalar, D>::Constant(Scalar(0));
-            crowd[i] = Vector<Scalar, D>::Constant(Scalar(0));
+            crowd[i] = apart[i] = Vector<Scalar, D>::Constant(Scalar(0));
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
                 const Vector<Scalar, D> g = model.volume * pair->gradient();
                 A[i] += (w[i] - w[pair->other]) * g.transpose();
                 crowd[i] += Closeness<Scalar>(model.volume * pair->w, model.nearest_weight).value * g;
+                apart[i] += Apart<Scalar, D>(model, pair->x).value();
             }
-            const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i], pulled(i));
+            const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i], pulled(i), apart[i]);
             x_moved[i] = x[i] + model.time_step * v[i] + shift.delta;
             x_now[0][i] = x_moved[i];
             c[0][i] = Scalar(0);

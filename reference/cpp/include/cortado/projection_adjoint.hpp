@@ -97,7 +97,8 @@ private:
     void shift(const Vectors<Real, D>& moved_bar, Vectors<Real, D>& v_bar, Values<Real>& k_bar) {
         std::vector<Crowding<Real, D>> bar(count_);
         each([&](std::size_t i) {
-            const Crowding<Real, D> crowding{at_.A[i], at_.crowd[i], at_.effects[i].shifted, at_.pulled(i)};
+            const Real shifted = at_.effects[i].shifted;
+            const Crowding<Real, D> crowding{at_.A[i], at_.crowd[i], shifted, at_.pulled(i), at_.apart[i]};
             const ShiftSlope<Real, D> shift(model_, at_.moments[i], crowding);
             bar[i] = shift.adjoint(moved_bar[i], moments_bar_[i]);
             effects_bar_[i].shifted += bar[i].shifted;
@@ -114,6 +115,7 @@ private:
                 const Closeness<Real> near(Real(model_.volume * pair.w), model_.nearest_weight);
                 flow_bar_[i] += A_bar * g;
                 x_bar_[i] += near.slope * g.dot(crowd_bar) * g;
+                x_bar_[i] += Apart<Real, D>(model_, pair.x).along(bar[i].apart - bar[j].apart);
                 bent = A_bar.transpose() * u_ij + near.value * crowd_bar;
             });
         });

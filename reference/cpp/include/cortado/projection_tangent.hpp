@@ -170,7 +170,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     Vectors<Real, D> dx_moved(count);
     each_particle(count, model.threads, [&](std::size_t i) {
         const Real pull_dot = effects_dot[i].repaired * at.k.back()[i] + at.effects[i].repaired * dk[i];
-        Crowding<Real, D> change{Matrix<Real, D>::Zero(), Vector<Real, D>::Zero(), effects_dot[i].shifted, pull_dot};
+        const Vector<Real, D> zero = Vector<Real, D>::Zero();
+        Crowding<Real, D> change{Matrix<Real, D>::Zero(), zero, effects_dot[i].shifted, pull_dot, zero};
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Vector<Real, D> dx_ij = dot.x[i] - dot.x[j], g = model.volume * pair->gradient();
@@ -178,8 +179,9 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             const Closeness<Real> near(Real(model.volume * pair->w), model.nearest_weight);
             change.A += (du[i] - du[j]) * g.transpose() + (u[i] - u[j]) * dg.transpose();
             change.crowd += near.value * dg + near.slope * g.dot(dx_ij) * g;
+            change.apart += Apart<Real, D>(model, pair->x).along(dx_ij);
         }
-        const Crowding<Real, D> crowding{at.A[i], at.crowd[i], at.effects[i].shifted, at.pulled(i)};
+        const Crowding<Real, D> crowding{at.A[i], at.crowd[i], at.effects[i].shifted, at.pulled(i), at.apart[i]};
         const ShiftSlope<Real, D> shift(model, at.moments[i], crowding);
         dx_moved[i] = dot.x[i] + dt * dv[i] + shift.tangent(moments_dot[i], change);
     });

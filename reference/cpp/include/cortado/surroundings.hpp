@@ -173,8 +173,30 @@ struct Pulled {
     }
 };
 
+// p_ij = w^2 x_ij with w = max(1 - |x_ij|^2 / (0.65 s)^2, 0), which moves pairs apart that are near.
+template <class Scalar, int D>
+class Apart {
+public:
+    Apart(const Model<Scalar, D>& model, const Vector<Scalar, D>& x) : x_(x) {
+        const Scalar nearest = hundredths<Scalar>(65) * model.spacing;
+        per_ = Scalar(1) / (nearest * nearest);
+        const Scalar left = Scalar(1) - per_ * x.dot(x);
+        if (left > Scalar(0)) w_ = left;
+    }
+
+    Vector<Scalar, D> value() const { return (w_ * w_) * x_; }
+    // Its derivative along a change of x_ij, a symmetric matrix times it.
+    Vector<Scalar, D> along(const Vector<Scalar, D>& change) const {
+        return w_ * (w_ * change - (Scalar(4) * per_ * x_.dot(change)) * x_);
+    }
+
+private:
+    Vector<Scalar, D> x_;
+    Scalar per_, w_{0};
+};
+
 // How far a particle is shifted, from A = sum v_ij g_ij^T, the crowd of its neighbours, sum (1 + ...) g_ij,
-// and how much it is pulled.
+// how much it is pulled, and sum p_ij, by which it is moved away from others.
 template <class Scalar, int D>
 struct Shift {
     Matrix<Scalar, D> K, G;
@@ -185,7 +207,8 @@ struct Shift {
     Scalar farthest, bound;         // [m]; sqrt(1 + |wish|^2 / farthest^2)
 
     Shift(const Model<Scalar, D>& model, const Moments<Scalar, D>& of, const Scalar& shifted,
-          const Matrix<Scalar, D>& A, const Vector<Scalar, D>& crowd, const Scalar& pull) {
+          const Matrix<Scalar, D>& A, const Vector<Scalar, D>& crowd, const Scalar& pull,
+          const Vector<Scalar, D>& apart) {
         using Real = typename RealOf<Scalar>::type;
         const Scalar one(1), dt = model.time_step, s = model.spacing, least(Real(1) / Real(1e5));
         K = regular_inverse<Scalar, D>(of.M);
@@ -199,7 +222,7 @@ struct Shift {
         square = out.dot(out) + hundredths<Scalar>(3) * hundredths<Scalar>(3) / (s * s);
         part = out.dot(slope) / square;
         along = slope - part * out;
-        wish = (-rate / bend * s * s * shifted) * along;
+        wish = rate / bend * (Scalar(4) * apart - s * s * shifted * along);
         farthest = s / Scalar(10);
         bound = square_root(Scalar(one + wish.dot(wish) / (farthest * farthest)));
         delta = wish / bound;

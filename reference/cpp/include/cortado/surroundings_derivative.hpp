@@ -104,13 +104,17 @@ struct Crowding {
     Matrix<Real, D> A;
     Vector<Real, D> crowd;
     Real shifted, pull;
+    Vector<Real, D> apart;
 };
 
 template <class Real, int D>
 class ShiftSlope {
 public:
     ShiftSlope(const Model<Real, D>& model, const Moments<Real, D>& of, const Crowding<Real, D>& at)
-        : A_(at.A), shifted_(at.shifted), at_(model, of, at.shifted, at.A, at.crowd, at.pull) {
+        : A_(at.A),
+          away_(4 * at.apart),
+          shifted_(at.shifted),
+          at_(model, of, at.shifted, at.A, at.crowd, at.pull, at.apart) {
         const Real dt = model.time_step;
         rate_slope_ = 20 * dt * dt / at_.root;
         pulled_slope_ = Pulled<Real, D>(model, at.pull).slope;
@@ -128,13 +132,14 @@ public:
         const Vector<Real, D> along_dot = slope_dot - part_dot * at_.out - at_.part * out_dot;
         const Real grown = strength_dot * shifted_ + strength() * change.shifted;
         const Vector<Real, D> wish_dot = scale_ * (grown * at_.along + strength() * shifted_ * along_dot);
-        return bounded(wish_dot);
+        return bounded(wish_dot + strength_dot * away_ + 4 * strength() * change.apart);
     }
 
     // From the adjoint of the shift to that of its crowding; adds to that of moments.
     Crowding<Real, D> adjoint(const Vector<Real, D>& delta_bar, Moments<Real, D>& bar) const {
-        const Vector<Real, D> wish_bar = scale_ * bounded(delta_bar);
-        const Real along_wish = at_.along.dot(wish_bar), strength_bar = shifted_ * along_wish;
+        const Vector<Real, D> both_bar = bounded(delta_bar), wish_bar = scale_ * both_bar;
+        const Real along_wish = at_.along.dot(wish_bar);
+        const Real strength_bar = shifted_ * along_wish + away_.dot(both_bar);
         const Vector<Real, D> along_bar = strength() * shifted_ * wish_bar;
         const Real part_bar = -at_.out.dot(along_bar) / at_.square;
         const Vector<Real, D> slope_bar = along_bar + part_bar * at_.out;
@@ -144,7 +149,7 @@ public:
         bar.g += out_bar;
         bar.gamma += out_bar + slope_bar;
         bar.M += inverse_change<Real, D>(at_.K, even<Real, D>(A_.transpose() * G_bar));
-        return {G_bar * at_.K, slope_bar, strength() * along_wish, pulled_slope_ * rate_bar};
+        return {G_bar * at_.K, slope_bar, strength() * along_wish, pulled_slope_ * rate_bar, 4 * strength() * both_bar};
     }
 
 private:
@@ -156,6 +161,7 @@ private:
     }
 
     Matrix<Real, D> A_;
+    Vector<Real, D> away_;  // 4 sum p_ij
     Real shifted_;
     Shift<Real, D> at_;
     // Of r by G : dG and by the pull; of the bounded r by r; -s^2.

@@ -8,6 +8,7 @@ from cortado.particles.state import Layout
 from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.sums import APART
 from cortado.solvers.projection.surroundings import adjoint_entries, entries, surrounding_kernels
 from cortado.sph.moment_functions import symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -22,7 +23,8 @@ class Surroundings(Density):
         super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
         self.layout = layout
         self.around = layout.arrays(**entries(layout.precision))
-        self.constants = {"least": constants.least_diagonal, "per_nearest": 1.0 / constants.nearest_weight}
+        per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
+        self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
         """As kernels call them."""
 
     def measure(self, context: StepContext) -> None:

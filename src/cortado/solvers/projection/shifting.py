@@ -1,14 +1,17 @@
 """Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
-2013), at a rate that follows the velocity gradient and the tension, so that a fluid at rest is not stirred:
+2013), and pairs that are nearer than 0.65 s are moved apart, wherever they are, at a rate that follows the velocity
+gradient and the tension, so that a fluid at rest is not stirred:
 
-    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
+    delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
+    grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
     r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
 with r softly at most 0.5, and |delta| softly at most 0.1 s. Where the pressure pulls, particles clump at the rate of
 sqrt(-p / rho) / s (the tensile instability, Monaghan 2000), and the shift is faster. P takes out the direction
 of the surface, g + gamma. Of the weights of `cortado.solvers.projection.effects`, u is 0 at surfaces, and w, that
 of low densities in repairs, near them and beside walls. Velocities stay as they are: with a correction by
-(delta . grad) v the fluid gains energy.
+(delta . grad) v the fluid gains energy. In spray and in thin sheets pairs come together, to 0.00 s without p, which no
+repair of the density parts, as theirs is too low.
 """
 
 from dataclasses import dataclass
@@ -33,6 +36,8 @@ FARTHEST = 0.1
 """In spacings: how far a particle is shifted in a step, at most."""
 SURFACE = 0.03
 """|g| s below which the direction of a surface is not known."""
+AWAY = 4.0
+"""How much faster pairs that are near are moved apart."""
 LEAST = 1e-5
 """e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
 PULLED = 60.0
@@ -46,7 +51,7 @@ class ShiftFunctions:
     """Warp functions of one particle."""
 
     shift: Any
-    """delta of A, the crowding, which is the sum in grad C, M, g, gamma, the weights, k = dt p, m, dt and s."""
+    """delta of A, the sums over j in grad C and of p, M, g, gamma, the weights, k = dt p, m, dt and s."""
     back: Any
     """For an adjoint of delta, those of all but s."""
 
@@ -57,13 +62,14 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     inverse = effect_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
-    farthest = wp.constant(real(FARTHEST))
+    farthest, away = wp.constant(real(FARTHEST)), wp.constant(real(AWAY))
     surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
 
     @wp.func
     def shift(
         A: matrix,
         crowd: vector,
+        apart: vector,
         M: matrix,
         g: vector,
         gamma: vector,
@@ -82,7 +88,7 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
         strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))
-        wish = (-strength * spacing * spacing * weights[2]) * along
+        wish = strength * (away * apart - (spacing * spacing * weights[2]) * along)
         most = farthest * spacing
         return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
 
@@ -90,6 +96,7 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
     def work(
         A: matrix,
         crowd: vector,
+        apart: vector,
         M: matrix,
         g: vector,
         gamma: vector,
@@ -100,12 +107,13 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         spacing: real,
         bar: vector,
     ) -> real:
-        return wp.dot(shift(A, crowd, M, g, gamma, weights, k, m, dt, spacing), bar)
+        return wp.dot(shift(A, crowd, apart, M, g, gamma, weights, k, m, dt, spacing), bar)
 
     @wp.func(module=module)
     def back(
         A: matrix,
         crowd: vector,
+        apart: vector,
         M: matrix,
         g: vector,
         gamma: vector,
@@ -116,10 +124,11 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         spacing: real,
         bar: vector,
     ):
-        by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt, _s, _bar = wp.grad(work)(
-            A, crowd, M, g, gamma, weights, k, m, dt, spacing, bar
+        by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt, _s, _bar = wp.grad(work)(
+            A, crowd, apart, M, g, gamma, weights, k, m, dt, spacing, bar
         )
-        return by_A, by_crowd, real(0.5) * (by_M + wp.transpose(by_M)), by_g, by_gamma, by_weights, by_k, by_m, by_dt
+        even = real(0.5) * (by_M + wp.transpose(by_M))
+        return by_A, by_crowd, by_apart, even, by_g, by_gamma, by_weights, by_k, by_m, by_dt
 
     return ShiftFunctions(shift, back)
 
@@ -135,7 +144,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     shift_of = shift_functions(precision, dimension, module).shift
     along = shift_functions(precision, dimension, tangent_module).back
     back = shift_functions(precision, dimension, adjoint_module).back
-    own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "crowd", "gamma", "weights")}
+    names = ("M", "g", "crowd", "apart", "gamma", "weights")
+    own = {name: kind for name, kind in entries(precision).items() if name in names}
     seen = bundle(**own)
 
     @wp.kernel(module=module)
@@ -152,7 +162,19 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     ):
         i = wp.tid()
         dt = time_step[i // particles]
-        delta[i] = shift_of(A[i], of.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i], k[i], m[i], dt, spacing)
+        delta[i] = shift_of(
+            A[i],
+            of.crowd[i],
+            of.apart[i],
+            of.M[i],
+            of.g[i],
+            of.gamma[i],
+            of.weights[i],
+            k[i],
+            m[i],
+            dt,
+            spacing,
+        )
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def shift_tangent(
@@ -175,9 +197,10 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         for axis in range(count):
             unit = vector()
             unit[axis] = real(1.0)
-            by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
+            by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
                 A[i],
                 of.crowd[i],
+                of.apart[i],
                 of.M[i],
                 of.g[i],
                 of.gamma[i],
@@ -189,7 +212,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
                 unit,
             )
             entry = wp.ddot(by_A, dot.A[i]) + wp.dot(by_crowd, dot.crowd[i]) + wp.ddot(by_M, dot.M[i])
-            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + wp.dot(by_weights, dot.weights[i])
+            entry += wp.dot(by_apart, dot.apart[i]) + wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i])
+            entry += wp.dot(by_weights, dot.weights[i])
             total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
         delta_dot[i] = total
 
@@ -207,9 +231,10 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         bar: bundle(time_step=real, k=real, m=real, A=matrix, **own),
     ):
         i = wp.tid()
-        by_A, by_crowd, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = back(
+        by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = back(
             A[i],
             of.crowd[i],
+            of.apart[i],
             of.M[i],
             of.g[i],
             of.gamma[i],
@@ -222,6 +247,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         )
         bar.A[i] = bar.A[i] + by_A
         bar.crowd[i] = bar.crowd[i] + by_crowd
+        bar.apart[i] = bar.apart[i] + by_apart
         bar.M[i] = bar.M[i] + by_M
         bar.g[i] = bar.g[i] + by_g
         bar.gamma[i] = bar.gamma[i] + by_gamma

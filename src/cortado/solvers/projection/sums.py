@@ -19,6 +19,9 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, symm
 CROWDED = 0.25
 """R: how much more pairs count in a shift that are close (Monaghan 2000), boundedly: unbounded, the derivative of the
 shift is so steep among clumped particles that gradients of a splash grow by ten orders more."""
+APART = 0.65
+"""In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come as
+seldom to half a spacing; energy rises more with 0.7, 0.03 in place of 0.02 % in a dam 12 deep, and with 0.8."""
 UNEQUAL = 2.0
 """By how much more a lighter neighbour counts in the diagonal of the projection's matrix: an iteration goes too far
 where one light particle takes the pressures of many that are heavy (on the lattice 1.2 and 1.5 times as far at ratios
@@ -31,8 +34,9 @@ class ProjectionSums:
 
     moments: Any
     """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
-    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``, and
-    sum V W_ij, to which what fills lists up adds."""
+    g_ij, with h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2 and q = (W_ij / W(s))^4, for 1 / (V W(s)) ``per_nearest``;
+    sum p_ij with p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij, which moves pairs apart, for 1 / (0.65 s)^2
+    ``per_apart``; and sum V W_ij, to which what fills lists up adds."""
     moments_tangent: Any
     moments_back: Any
     """What adjoints of the moments, and ``n_bar`` of the last one, give to x and m."""
@@ -96,15 +100,27 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         part = real(1.0) + real(0.25) * q
         return real(4.0) * crowded * near * near * near * reciprocal(part * part)
 
+    @wp.func
+    def nearness(x_ij: vector, per_apart: real) -> real:
+        """1 - |x_ij|^2 / (0.65 s)^2, at least 0."""
+        return wp.max(real(1.0) - per_apart * wp.dot(x_ij, x_ij), real(0.0))
+
+    @wp.func
+    def parted(x_ij: vector, change: vector, per_apart: real) -> vector:
+        """The derivative of p_ij along a change of x_ij, a symmetric matrix times it."""
+        w = nearness(x_ij, per_apart)
+        return w * (w * change - (real(4.0) * per_apart * wp.dot(x_ij, change)) * x_ij)
+
     @fluid_sum(discretisation)
     def moments(
-        x_ij: vector, m_i: real, m_j: real, per_nearest: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+        x_ij: vector, m_i: real, m_j: real, per_nearest: real, per_apart: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, vector, vector, real]:
         g = s.volume * gradient(x_ij, s)
         q = mobility(m_i, m_j) * g
         near = s.volume * weight(x_ij, s)
-        crowd = closeness(near * per_nearest) * g
-        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd, near
+        crowd, w = closeness(near * per_nearest) * g, nearness(x_ij, per_apart)
+        push = (w * w) * x_ij
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd, push, near
 
     @tangent_of(moments)
     @fluid_sum(discretisation, ahead=False)
@@ -116,8 +132,9 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         m_dot_i: real,
         m_dot_j: real,
         per_nearest: real,
+        per_apart: real,
         s: neighbourhood,
-    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+    ) -> tuple[vector, vector, vector, vector, vector, vector, vector, real]:
         g = s.volume * gradient(x_ij, s)
         g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
         per = mobility(m_i, m_j)
@@ -133,6 +150,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             cross_terms(q_dot, g) + cross_terms(q, g_dot),
             g_dot,
             closeness(near) * g_dot + more * g,
+            parted(x_ij, x_dot_ij, per_apart),
             near_dot,
         )
 
@@ -147,9 +165,11 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         Q_bar_j: six,
         g_bar_ij: vector,
         crowd_bar_ij: vector,
+        apart_bar_ij: vector,
         n_bar_i: real,
         n_bar_j: real,
         per_nearest: real,
+        per_apart: real,
         s: neighbourhood,
     ) -> tuple[vector, real]:
         g = s.volume * gradient(x_ij, s)
@@ -160,6 +180,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) * per_nearest + n_bar_i + n_bar_j
         bent = real(2.0) * both + g_bar_ij + closeness(near) * crowd_bar_ij - stretch
         x_part = s.volume * (hessian_product(x_ij, bent, s) - slope(x_ij, s) * stretch) + more * g
+        x_part += parted(x_ij, apart_bar_ij, per_apart)
         h = slope_of_h(m_i, m_j)
         return x_part, wp.dot(g, from_i) * h * reciprocal(m_j) + wp.dot(g, from_j) * (h - per) * reciprocal(m_i)
 

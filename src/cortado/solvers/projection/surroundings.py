@@ -23,7 +23,8 @@ def entries(precision: Precision) -> dict[str, Any]:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
-    return {**own, "L": matrix, "a": real, "crowd": vector, "weights": weights_type(precision), "coarse": real}
+    own |= {"crowd": vector, "apart": vector, "L": matrix, "a": real}
+    return {**own, "weights": weights_type(precision), "coarse": real}
 
 
 def adjoint_entries(precision: Precision) -> dict[str, Any]:
@@ -62,6 +63,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         s: neighbourhood,
         least: real,
         per_nearest: real,
+        per_apart: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -70,7 +72,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of: around,
     ):
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g, crowd, near = moments(i, x, m, per_nearest, s)
+        diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
         if lane() > 0:
             return
@@ -92,6 +94,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.edge[i] = e
         of.L[i] = L
         of.crowd[i] = crowd
+        of.apart[i] = apart
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu)
         of.coarse[i] = share_of(M, nu)
@@ -101,6 +104,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         s: neighbourhood,
         least: real,
         per_nearest: real,
+        per_apart: real,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -114,8 +118,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g_i_dot, crowd_dot, near_dot = moments_tangent(
-            i, x, x_dot, m, m_dot, per_nearest, s
+        diagonal, others, square, mixed, g_i_dot, crowd_dot, apart_dot, near_dot = moments_tangent(
+            i, x, x_dot, m, m_dot, per_nearest, per_apart, s
         )
         normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         if lane() > 0:
@@ -163,6 +167,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.edge[i] = e_dot
         dot.L[i] = L_dot
         dot.crowd[i] = crowd_dot
+        dot.apart[i] = apart_dot
         dot.a[i] = a_dot
         dot.weights[i] = weights_dot
         dot.coarse[i] = coarse_dot
@@ -204,6 +209,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def sums_adjoint(
         s: neighbourhood,
         per_nearest: real,
+        per_apart: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -216,7 +222,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_part, m_part = moments_back(i, x, m, M_pull, Q_pull, bar.g, bar.crowd, n_bar, per_nearest, s)
+        x_part, m_part = moments_back(
+            i, x, m, M_pull, Q_pull, bar.g, bar.crowd, bar.apart, n_bar, per_nearest, per_apart, s
+        )
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
         if lane() > 0:
             return
