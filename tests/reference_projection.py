@@ -202,13 +202,14 @@ class Projection:
         taken = np.where(far & ((before[1] * gamma).sum(1) > 0), 0, full)
         k = y = taken * before[0]
         v = v_star + taken[:, None] * before[1]
-        t = 5.0
+        momentum = 4 / ((1 + np.sqrt(101)) / 2)
         for left in reversed(range(self.iterations)):
             if left < self.iterations - 1 or not (k > 0).any():
                 r = divergence(v) - falls - yielding @ y - wanted
-                r = np.where((y > 0) | (tension > 0.5) | (r > 0), r, 0)
+                r = np.where((y > 0) | (tension == 1) | (r > 0), r, 0)
                 z = y + correct(r)
-                change = np.where(z > 0, z, tension * z) - y
+                least = np.minimum(y, 0)
+                change = np.where(z > least, z, least + tension * (z - least)) - y
                 thrust = -force(change) / m[:, None]
                 energy = (m[:, None] * thrust**2).sum() + change @ yielding @ change
                 least = (m * (1e-6 * self.spacing / dt) ** 2).sum()
@@ -220,8 +221,7 @@ class Projection:
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
             missed = dt * np.where(up > 0, D - wanted, np.where(down < 0, tension * D, 0))
-            later = (1 + np.sqrt(1 + 4 * t * t)) / 2
-            y, k, t = new + (t - 1) / later * (new - k) * (left > 0), new, later
+            y, k, momentum = new + momentum * (new - k), new, 0
             kick = -force(y) / m[:, None]
             v = v_star + kick
         moved = x + dt * v + self.shift(x, u, dt, dt * k / m)

@@ -34,10 +34,10 @@ template <class Scalar, int D>
 struct Correction {
     Values<Scalar> y;
     Vectors<Scalar, D> u;
-    Values<Scalar> counted;  // 1, or 0 where a surface is free: its divergence changes no pressure; 1/2 between
+    Values<Scalar> counted;  // 1, or 0 where iterations leave a tension a part of its divergence; 1/2 between
     Values<Scalar> r;        // D u - b where it counts
     Values<Scalar> e;        // of each node
-    Values<Scalar> d;        // z+ + sigma z- - y, where z = y + c E
+    Values<Scalar> d;        // z - y where z = y + c E is above y- = min(y, 0), else y- + sigma (z - y-) - y
     Vectors<Scalar, D> f;    // -D^T d / m
     Scalar energy{0}, alpha{0};  // sum m (f^2 + small^2); sum r d, and but for the first m small^2, over it
 

@@ -54,8 +54,11 @@ Values<Real> correction_tangent(const Model<Real, D>& model, const Projection<Re
         const Smooth<Real, D> f = coarse.at(i, before.e);
         const Real moved = f.slope.dot(dx[i]) + coarse.at(i, de).value, z = before.y[i] + c * f.value;
         const Real dz = change[i].y + change[i].shared * f.value + c * moved;
-        const Clamp<Real> clamp(z, z);
-        dd[i] = clamp.rise * dz + clamp.fall * (change[i].tension * z + sigma * dz) - change[i].y;
+        const bool pulls = before.y[i] < 0;
+        const Real below = z - (pulls ? before.y[i] : Real(0)), dleast = pulls ? change[i].y : Real(0);
+        const Clamp<Real> clamp(below, below);
+        const Real dbelow = dz - dleast;
+        dd[i] = clamp.rise * dz + clamp.fall * (dleast + change[i].tension * below + sigma * dbelow) - change[i].y;
     });
     return dd;
 }
@@ -73,10 +76,13 @@ std::vector<CorrectionChange<Real>> correction_adjoint(const Model<Real, D>& mod
         const Real c = at.effects[i].shared, sigma = at.effects[i].tension;
         const Smooth<Real, D> f = coarse.at(i, before.e);
         const Real z = before.y[i] + c * f.value;
-        const Clamp<Real> clamp(z, z);
+        const bool pulls = before.y[i] < 0;
+        const Real below = z - (pulls ? before.y[i] : Real(0));
+        const Clamp<Real> clamp(below, below);
         z_bar[i] = (clamp.rise + clamp.fall * sigma) * d_bar[i];
-        bar[i].tension = clamp.fall * z * d_bar[i];
+        bar[i].tension = clamp.fall * below * d_bar[i];
         bar[i].y = z_bar[i] - d_bar[i];
+        if (pulls) bar[i].y += clamp.fall * (1 - sigma) * d_bar[i];
         bar[i].shared = f.value * z_bar[i];
         x_bar[i] += c * z_bar[i] * f.slope;
     });

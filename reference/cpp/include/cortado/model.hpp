@@ -28,7 +28,7 @@ struct Model {
     Scalar spacing, relaxation, least_diagonal, nearest_weight;
     Nodes<Scalar, D> nodes;  // of the coarse correction
     Scalar least_energy;     // eps: 1e-5 of that of a hat's gradient on the lattice, for each particle around a node
-    Values<Scalar> momenta;  // beta of the projection's iterations (Nesterov 1983), and 0 of the last
+    Values<Scalar> momenta;  // beta of the projection's iterations: of the first as Nesterov's (1983), else 0
     Values<Scalar> repair_relaxations;
     Vectors<Real, D> wall_positions, wall_normals;
     Values<Real> wall_depths;  // behind the surface
@@ -79,12 +79,9 @@ struct Model {
             wall_depths[b] = square_root(Real(wall_normals[b].dot(wall_normals[b])));
             wall_normals[b] /= wall_depths[b];
         }
-        Real t(5);  // as the first pressure is that of the step before
-        for (std::size_t k = 0; k + 1 < momenta.size(); ++k) {
-            const Real later = (Real(1) + square_root(Real(Real(1) + Real(4) * t * t))) / Real(2);
-            momenta[k] = Scalar((t - Real(1)) / later);
-            t = later;
-        }
+        const Real t(5);  // not 1, as the first pressure is that of the step before
+        const Real later = (Real(1) + square_root(Real(Real(1) + Real(4) * t * t))) / Real(2);
+        if (momenta.size() > 1) momenta[0] = Scalar((t - Real(1)) / later);
     }
 
     // phi of the pairwise viscosity, of a pair at rest and its gradient: see docs/discretisation.md.

@@ -199,7 +199,7 @@ private:
         before.f.resize(n.size());
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             const Scalar left = divergence_of(model, fluid, before.u, i) - wanted(model, i, n[i]);
-            const bool inside = before.y[i] > Scalar(0) || effects[i].tension > hundredths<Scalar>(50);
+            const bool inside = before.y[i] > Scalar(0) || real_part(effects[i].tension) >= Real(1);
             const bool all = inside || !(real_part(left) <= Real(0));  // NaN must stay
             before.counted[i] = Scalar(all ? Real(1) : real_part(left) == Real(0) ? Real(1) / Real(2) : Real(0));
             before.r[i] = before.counted[i] * left;
@@ -208,8 +208,9 @@ private:
             [&](std::size_t i, const Hat<Scalar, D>& hat) { return hat.value * effects[i].shared * before.r[i]; });
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             const Scalar z = before.y[i] + effects[i].shared * coarse.at(i, before.e).value;
-            const Clamp<Scalar> clamp(z, z);
-            before.d[i] = (clamp.rise + clamp.fall * effects[i].tension) * z - before.y[i];
+            const Scalar least = before.y[i] < Scalar(0) ? before.y[i] : Scalar(0), below = z - least;
+            const Clamp<Scalar> clamp(below, below);
+            before.d[i] = least + (clamp.rise + clamp.fall * effects[i].tension) * below - before.y[i];
         });
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             before.f[i] = -push(model, fluid, before.d, i) / model.rest_density;

@@ -4,8 +4,8 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
 
     q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
     A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,
-    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma > 1/2 or D u > b, else 0,
-    d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > 0, else sigma z - y,
+    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma = 1 or D u > b, else 0,
+    d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > y-, else y- + sigma (z - y-) - y,   y- = min(y, 0),
     y' = y + alpha d,   u' = u - alpha D^T d / m,
     alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
@@ -80,10 +80,10 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
     ):
         """T is d L."""
         i = wp.tid()
-        z = y[i] + coarse[i] * at(i, particles, x[i], e, grid).value
+        z, least = y[i] + coarse[i] * at(i, particles, x[i], e, grid).value, wp.min(y[i], real(0.0))
         new = z
-        if z < real(0.0):
-            new = weights[i][0] * z
+        if z < least:
+            new = least + weights[i][0] * (z - least)
         change[i] = new - y[i]
         T[i] = (new - y[i]) * pack(L[i])
 
@@ -130,8 +130,11 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         z = of.y[i] + of.coarse[i] * f.value
         z_dot = of.y_dot[i] + of.coarse_dot[i] * f.value
         z_dot += of.coarse[i] * (wp.dot(f.slope, x_dot[i]) + f_dot.value)
-        rise, fall = parts(z, z)
-        new_dot = rise * z_dot + fall * (of.weights_dot[i][0] * z + of.weights[i][0] * z_dot)
+        below, below_dot, sigma = z - wp.min(of.y[i], real(0.0)), z_dot, of.weights[i][0]
+        if of.y[i] < real(0.0):
+            below_dot -= of.y_dot[i]
+        rise, fall = parts(below, below)
+        new_dot = rise * z_dot + fall * (z_dot - below_dot + of.weights_dot[i][0] * below + sigma * below_dot)
         change_dot[i] = new_dot - of.y_dot[i]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -157,13 +160,15 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         no, c = real(0.0), of.coarse[i]
         f = at(i, particles, x[i], e, grid)
         z = of.y[i] + c * f.value
-        rise, fall = parts(z, z)
-        new_bar = change_bar[i]
-        z_bar = (rise + fall * of.weights[i][0]) * new_bar
-        weights_bar[i] = weights_bar[i] + weights4(fall * z * new_bar, no, no, no)
+        below, sigma, new_bar, least_bar = z - wp.min(of.y[i], no), of.weights[i][0], change_bar[i], no
+        rise, fall = parts(below, below)
+        z_bar = (rise + fall * sigma) * new_bar
+        if of.y[i] < no:
+            least_bar = fall * (real(1.0) - sigma) * new_bar
+        weights_bar[i] = weights_bar[i] + weights4(fall * below * new_bar, no, no, no)
         coarse_bar[i] = coarse_bar[i] + z_bar * f.value
         x_bar[i] = x_bar[i] + (z_bar * c) * f.slope
-        y_bar[i] = y_bar[i] + z_bar - new_bar
+        y_bar[i] = y_bar[i] + z_bar + least_bar - new_bar
         s_value[i] = c * z_bar
         s_slope[i] = vector()
         s_bent[i] = vector()

@@ -193,6 +193,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         wp.copy(at["k"], self._end[IMPULSE])
         solver.press(context, at)
         context.launch(self._gradient.forward, v_flow=at["u"], A=at["A"])
+        wp.copy(solver.last_gradient(0), at["A"])
         solver.move(context, 0)
         for k in range(repairs):
             solver.mend(context, k, k, k + 1)

@@ -40,11 +40,11 @@ IMPULSE = "pressure_impulse"
 """The name of k = dt p in a state."""
 KICK = "pressure_kick"
 """The name of -D^T k / m, which a step's pressures added to velocities, in a state."""
-WARM = 5.0
-"""t of the first momentum. Nesterov's method begins with 1; here the first k is that of the step before, as if there
-had been iterations, and two with the momentum of later ones do as much as four from 1. From step to step errors shrink
-where iterations leave between -1/3 and 1 of them: here they leave -0.19 at least, whatever their number, up to 1.33
-times the stiffest wave of the lattice, and two of them up to 1.6 times."""
+MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
+"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983) from t = 5 and not from 1,
+as the first k is that of the step before. Later ones, which begin with a coarse correction, have none: with it, many of
+them would not come to rest. From step to step errors shrink where iterations leave between -1/3 and 1 of them: two of
+them do up to 1.6 times the stiffest wave of the lattice."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,6 @@ class ProjectionSteps(ParticleSolver):
         self.coarse = Coarse(*own, grid, constants.spacing, self.bodies)
         self.corrected = [self._new_corrected()]
         """The iterates as iterations of the pressure begin with them."""
-        self._momenta = momenta(limits.minimum_iterations)
         self.repair_relaxations = constants.repair_relaxations(repairs)
         """omega of each repair."""
         self.loops = (
@@ -234,8 +233,8 @@ class ProjectionSteps(ParticleSolver):
         self.press(context, new)
 
     def momentum(self, k: int) -> float:
-        """beta of iteration k; beyond the least number of them 0, as each may be the last."""
-        return self._momenta[k] if k < len(self._momenta) else 0.0
+        """beta of iteration k."""
+        return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
         """That of walls, where bodies move as the y of an iterate pushes them."""
@@ -282,14 +281,3 @@ class ProjectionSteps(ParticleSolver):
             context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
         self.unsort(context, x_now, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
         return v_end
-
-
-def momenta(iterations: int) -> list[float]:
-    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 5; 0 in the
-    last, so that y is k at the end."""
-    found, t = [], WARM
-    for _ in range(iterations):
-        later = 0.5 * (1.0 + (1.0 + 4.0 * t * t) ** 0.5)
-        found.append((t - 1.0) / later)
-        t = later
-    return [*found[:-1], 0.0]
