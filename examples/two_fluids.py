@@ -23,7 +23,7 @@ scene = cortado.Scene(
     ],
     container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.035, "height": 0.04},
     mixture={"free_energy": "miscible", "mobility": 2e-5, "mobility_form": "constant"},  # m2/s
-    solver={"time_step": 0.002},
+    solver={"time_step": 0.0018},
 )
 simulation = cortado.Simulation(scene)
 trajectory = simulation.run(steps=40, controls={"tilt": [20.0, 10.0]}, record_every=10)  # degrees, towards x and z

@@ -9,7 +9,7 @@ from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.sums import APART
-from cortado.solvers.projection.surroundings import adjoint_entries, entries, surrounding_kernels
+from cortado.solvers.projection.surroundings import bar_entries, entries, surrounding_kernels
 from cortado.sph.moment_functions import symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
@@ -59,7 +59,7 @@ class SurroundingsAdjoint(DensityAdjoint):
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
         precision = surroundings.layout.precision
-        self.around = surroundings.layout.arrays("_bar", **adjoint_entries(precision))
+        self.around = surroundings.layout.arrays("_bar", **bar_entries(precision))
         six = symmetric(precision).kind
         self._moments = surroundings.layout.arrays("_pull", M=six, Q=six)
 

@@ -27,7 +27,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     return {**own, "weights": weights_type(precision), "coarse": real}
 
 
-def adjoint_entries(precision: Precision) -> dict[str, Any]:
+def bar_entries(precision: Precision) -> dict[str, Any]:
     """The same for adjoints, which add up for all but Q: nothing but a depends on it."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
@@ -54,7 +54,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     edge = edge_functions(precision, dimension, module).edge
     edge_along = edge_functions(precision, dimension, tangent_module).back
     edge_back = edge_functions(precision, dimension, adjoint_module).back
-    around, bars = bundle(**entries(precision)), bundle(**adjoint_entries(precision))
+    around, bars = bundle(**entries(precision)), bundle(**bar_entries(precision))
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
