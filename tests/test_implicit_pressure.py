@@ -44,8 +44,8 @@ def distances(case, iterations, estimator):
 
 @pytest.mark.parametrize(("case", "bound"), [(case, 5e-3 if case == "periodic" else 1e-5) for case in MADE])
 def test_at_the_fixed_point_it_is_the_exact_gradient(case, bound):
-    """Without walls beside it fluid is slow to get there: 4e-3 after 1,000 iterations. Velocities are nearer by then, but
-    the shift depends on the pressure itself, whose weakest waves take longest, and no iteration but the first has a
+    """Without walls beside it fluid is slow to get there: 4e-3 after 1,000 iterations. Velocities are nearer by then,
+    but the shift depends on the pressure itself, whose weakest waves take longest, and no iteration but the first has a
     momentum."""
     near, nearer = (max(distances(case, iterations, SOLVED).values()) for iterations in (60, 1000))
     assert nearer < bound and nearer < 0.1 * near

@@ -44,9 +44,9 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
 
     @wp.func
     def counts(y: real, tension: real, left: real) -> real:
-        """Which part of a divergence does. Where iterations let through but a part of a tension, they leave one that the
-        coarse grid must not take away; at the corner between it is the mean of both sides. NaN counts, which must not
-        be hidden."""
+        """Which part of a divergence does. Where iterations let through but a part of a tension, they leave one that
+        the coarse grid must not take away; at the corner between it is the mean of both sides. NaN counts, which must
+        not be hidden."""
         if y > real(0.0) or tension >= real(1.0) or not (left <= real(0.0)):
             return real(1.0)
         return wp.where(left == real(0.0), real(0.5), real(0.0))
