@@ -89,6 +89,7 @@ class Projection:
         nodes = tuple(np.array([*map(float, part)])[:d] for part in (grid.origin, grid.frequency, grid.shape))
         held, solids = getattr(solver.bodies, "held", ()), search.walls["wall_solids"].numpy()
         bodies = tuple(Body.of(one, solids, scene) for one in held)
+        nodes = None if solver.coarse.endless else nodes
         return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes, bodies)
 
     def pairs(self, x, y):
@@ -196,7 +197,7 @@ class Projection:
             return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
 
         share = between(H + 2 * nu, 0.7, 0.95)
-        correct = self.coarse(x, m, force, L, g, share, yielding)
+        correct = self.coarse(x, m, force, L, g, share, yielding) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
         taken = np.where(far & ((before[1] * gamma).sum(1) > 0), 0, full)
@@ -204,7 +205,7 @@ class Projection:
         v = v_star + taken[:, None] * before[1]
         momentum = 4 / ((1 + np.sqrt(101)) / 2)
         for left in reversed(range(self.iterations)):
-            if left < self.iterations - 1 or not (k > 0).any():
+            if correct is not None and (left < self.iterations - 1 or not (k > 0).any()):
                 r = divergence(v) - falls - yielding @ y - wanted
                 r = np.where((y > 0) | (tension == 1) | (r > 0), r, 0)
                 z = y + correct(r)

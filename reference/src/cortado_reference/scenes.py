@@ -9,7 +9,7 @@ from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
-from cortado.solvers.projection.coarse_grid import coarse_grid
+from cortado.solvers.projection.coarse_grid import coarse_grid, endless
 from cortado.solvers.projection.constants import lattice_constants
 from cortado_reference.engine import extension
 
@@ -101,7 +101,7 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
             "repair_relaxations": constants.repair_relaxations(solver.repairs),
             "least_diagonal": constants.least_diagonal,
             "nearest_weight": constants.nearest_weight,
-            **_of_nodes(scene, discrete),
+            **({} if endless(discrete) else _of_nodes(scene, discrete)),
         }
     assert isinstance(solver, PcisphSolver)
     greatest = solver.maximum_density_tolerance

@@ -48,7 +48,7 @@ struct Projection {
     State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back(), kick}; }
 
     // Whether there is a correction before iteration i: not before the first where a particle begins with a pressure.
-    bool corrects(std::size_t i) const { return i > 0 || cold; }
+    bool corrects(std::size_t i) const { return !corrections.empty() && (i > 0 || cold); }
     // y as iteration i - 1 leaves it, before it is corrected.
     const Values<Scalar>& uncorrected(std::size_t i) const { return i < corrections.size() ? corrections[i].y : y[i]; }
 
@@ -106,8 +106,8 @@ struct Projection {
             u[0][i] = v_star[i] + full * state.kick[i];
         }
         cold = std::none_of(k[0].begin(), k[0].end(), [](const Scalar& one) { return one > Scalar(0); });
-        corrections.resize(iterations);
-        spread(model, fluid, state.x);
+        corrections.resize(model.nodes.count() > 0 ? iterations : 0);
+        if (!corrections.empty()) spread(model, fluid, state.x);
         for (std::size_t at = 0; at < iterations; ++at) {
             if (corrects(at)) correct(model, fluid, n, corrections[at], at);
             iterate(model, fluid, n, at);

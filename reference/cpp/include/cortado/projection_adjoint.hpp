@@ -251,7 +251,7 @@ private:
             diverge(d_bar, at_.u[k], u_bar);
             if (at_.corrects(k)) correct(k, bar, y_bar, n_bar);
         }
-        pushes();
+        if (!at_.corrections.empty()) pushes();
     }
 
     // From the adjoints of effects and moments to that of positions.

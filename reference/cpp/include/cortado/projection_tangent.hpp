@@ -128,7 +128,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             dv[i] = dv_star[i] + dkick[i];
         }
     };
-    const Pushes<Real, D> pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
+    Pushes<Real, D> pushes_dot;
+    if (!at.corrections.empty()) pushes_dot = pushes_tangent(model, step, dot.x, moments_dot, effects_dot);
     const auto correct = [&](std::size_t k) {
         const Correction<Real, D>& before = at.corrections[k];
         std::vector<CorrectionChange<Real>> change(count);

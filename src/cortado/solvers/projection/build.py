@@ -8,7 +8,7 @@ from cortado.solvers.build import particle_system
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
-from cortado.solvers.projection.coarse_grid import coarse_grid
+from cortado.solvers.projection.coarse_grid import coarse_grid, endless
 from cortado.solvers.projection.constants import lattice_constants
 from cortado.solvers.projection.solver import Projection
 from cortado.solvers.solver import Solver
@@ -34,7 +34,8 @@ class ProjectionMaker:
             )
         grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
         constants = lattice_constants(setting.scene, setting.discrete)
-        return Projection(system, constants, pressure_limits(table), table.repairs, table.velocities_follow, grid)
+        own = table.repairs, table.velocities_follow, grid, endless(setting.discrete)
+        return Projection(system, constants, pressure_limits(table), *own)
 
 
 maker = ProjectionMaker

@@ -52,8 +52,10 @@ class Coarse:
         grid: Grid,
         spacing: float,
         bodies: Bodies | None,
+        endless: bool,
     ):
-        """Of particles with a ``spacing`` [m], and of free ``bodies``."""
+        """Of particles with a ``spacing`` [m], and of free ``bodies``; without a correction in an ``endless`` scene."""
+        self.endless = endless
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector
         self.push = coarse_push_kernels(discretisation, dimension)
@@ -117,7 +119,10 @@ class Coarse:
             self.bodies.begin(context, self.grid, around, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
-        """``correct`` before iteration k, before the first one only if a scene is cold."""
+        """``correct`` before iteration k, before the first one only if a scene is cold; never in an endless scene,
+        where the level that it would give to pressures moves particles that are not on a lattice."""
+        if self.endless:
+            return
         if k > 0:
             correct()
         else:

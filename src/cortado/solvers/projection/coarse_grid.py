@@ -10,6 +10,11 @@ SPACING = 2.0
 """Distance of nodes, in spacings of particles."""
 
 
+def endless(discrete: DiscreteScene) -> bool:
+    """Whether all axes are periodic: such a scene has no coarse correction, as nothing sets its level of pressure."""
+    return bool((np.asarray(discrete.periods) > 0.0).all())
+
+
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
     """The nodes of the coarse correction: about everything that can be reached; what goes further wraps around. Along
     each axis there are 4 to 7 times a power of two, so that coarser grids have half as many.

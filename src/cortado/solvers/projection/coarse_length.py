@@ -179,10 +179,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
         y_bar: wp.array(dtype=real),
         bar: bundle(m=real, time_step=real),
         # out
-        change_bar: wp.array(dtype=real),
-        carried_bar: wp.array(dtype=real),
-        thrust_bar: wp.array(dtype=vector),
-        r_bar: wp.array(dtype=real),
+        out: bundle(change_bar=real, carried_bar=real, thrust_bar=vector, r_bar=real),
     ):
         """``alpha_bar`` is that of each scene. The adjoint of u' is that of u, too."""
         i = wp.tid()
@@ -197,9 +194,9 @@ def length_kernels(precision: Precision) -> LengthKernels:
         dt, own_bar = time_step[i // particles], real(1 - first) * along_bar + energy_bar
         bar.m[i] = bar.m[i] + energy_bar * wp.dot(f, f) + own_bar * least(real(1.0), spacing, dt)
         bar.time_step[i] = bar.time_step[i] - real(2.0) * own_bar * least(m[i], spacing, dt) / dt
-        change_bar[i] = alpha * new_bar + along_bar * of.r[i] + energy_bar * of.carried[i]
-        carried_bar[i] = energy_bar * of.change[i]
-        thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * energy_bar) * f
-        r_bar[i] = along_bar * of.change[i]
+        out.change_bar[i] = alpha * new_bar + along_bar * of.r[i] + energy_bar * of.carried[i]
+        out.carried_bar[i] = energy_bar * of.change[i]
+        out.thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * energy_bar) * f
+        out.r_bar[i] = along_bar * of.change[i]
 
     return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint, every)

@@ -88,10 +88,11 @@ class ProjectionSteps(ParticleSolver):
         repairs: int,
         follow: bool,
         grid: Grid,
+        endless: bool,
     ):
         """Of iterations of the pressure within ``limits`` and so many repairs of density in every step; velocities
         ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure between
-        iterations, and in a cold scene before the first one."""
+        iterations, and in a cold scene before the first one; none in an ``endless`` scene."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -112,7 +113,7 @@ class ProjectionSteps(ParticleSolver):
         self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
         """Those that fluid moves; None without any."""
         own = self.discretisation, self.layout, system.walled.dimension
-        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies)
+        self.coarse = Coarse(*own, grid, constants.spacing, self.bodies, endless)
         self.corrected = [self._new_corrected()]
         """The iterates as iterations of the pressure begin with them."""
         self.repair_relaxations = constants.repair_relaxations(repairs)
@@ -223,7 +224,7 @@ class ProjectionSteps(ParticleSolver):
             around = {**self.around, "drift": self._drift(context, old)}
             self.coarse.correct(context, k, around, old, at, self.pull)
 
-        for name in ("k", "y", "u") if k == 0 else ():  # where nothing corrects them
+        for name in ("k", "y", "u"):  # where nothing corrects them
             wp.copy(at[name], old[name])
         self.coarse.where_due(k, correct)
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
