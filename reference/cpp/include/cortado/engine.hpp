@@ -46,7 +46,7 @@ struct Scene {
     std::vector<double> repair_relaxations;  // that of each repair of the density
     double least_diagonal;               // 0.05 a_0 [1 / m2]
     double nearest_weight;               // V W(s)
-    std::array<int, 3> nodes;            // of its coarse grid along each axis; 0 for another solver
+    std::array<int, 3> nodes;            // of its coarse grid along each axis; 0 where nothing is corrected
     std::array<double, 3> first_node;    // [m]
     std::array<double, 3> node_frequency;  // nodes to the metre
 };

@@ -106,6 +106,8 @@ class Coarse:
 
     def begin(self, context: StepContext, around: Named) -> None:
         """The matrix of a step, and whether it is to be solved before the first iteration."""
+        if self.endless:
+            return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
         context.launch(self.length.every, scenes, all_warm=self._all_warm, threads=1)
         for kernel in self.push.forward:

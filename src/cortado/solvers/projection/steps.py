@@ -224,7 +224,7 @@ class ProjectionSteps(ParticleSolver):
             around = {**self.around, "drift": self._drift(context, old)}
             self.coarse.correct(context, k, around, old, at, self.pull)
 
-        for name in ("k", "y", "u"):  # where nothing corrects them
+        for name in ("k", "y", "u") if k == 0 or self.coarse.endless else ():  # where nothing corrects them
             wp.copy(at[name], old[name])
         self.coarse.where_due(k, correct)
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
