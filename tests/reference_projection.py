@@ -1,5 +1,6 @@
 """Slow twin of a step of the projection: all pairs, NumPy, straight from the equations of `docs/projection.md`."""
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -61,6 +62,10 @@ class Projection:
     wall_weights: np.ndarray
     feet: np.ndarray
     """From wall particles to the surface."""
+    mirrors: tuple[np.ndarray, np.ndarray]
+    """Coordinates of flat walls that mirror the fluid; infinite where none does."""
+    container: np.ndarray
+    """Which wall particles are theirs."""
     periods: np.ndarray
     iterations: int
     repairs: int
@@ -90,6 +95,8 @@ class Projection:
         held, solids = getattr(solver.bodies, "held", ()), search.walls["wall_solids"].numpy()
         bodies = tuple(Body.of(one, solids, scene) for one in held)
         nodes = None if solver.coarse.endless else nodes
+        mirrors = tuple(end[:d] for end in solver.system.mirrors)
+        walls = (*walls, mirrors, (solids == -1) & np.isfinite(mirrors).any())
         return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods, *counts, follow, nodes, bodies)
 
     def pairs(self, x, y):
@@ -104,14 +111,35 @@ class Projection:
         a = self.volume * sigma / self.support**2 * reference.slope(self.kernel.name, q)
         return apart, W, a[..., None] * apart
 
-    def density(self, x, before=None):
-        """Over the neighbours that particles have at positions before a step."""
+    def images(self, x):
+        """Of each reflection what it does to vectors, the separations from images, and V W and V grad W of them."""
+        ways = [
+            ((1, 0), *((-1, 2 * end[axis]) for end in self.mirrors if np.isfinite(end[axis])))
+            for axis in range(x.shape[1])
+        ]
+        for way in itertools.product(*ways):
+            flip, offset = np.array(way, dtype=float).T
+            if (flip < 0).any():
+                yield flip, *self.pairs(x, flip * x + offset)
+
+    def share(self, x):
+        """h, and of walls that mirror the push and nu."""
+        _, wall_W, wall_g = self.pairs(x, self.walls)
+        mirror, behind = self.pushes(wall_g, self.container)[0], wall_W @ (self.wall_weights * self.container)
+        images = sum((W.sum(1) for _, _, W, _ in self.images(x)), np.zeros(len(x)))
+        return between(images / (behind + 1e-6), 0.7, 0.9), mirror, behind
+
+    def density(self, x, h, before=None):
+        """Over the neighbours that particles have at positions before a step, with images h times."""
         W, wall = self.pairs(x, x)[1], self.pairs(x, self.walls)[1]
         if before is not None:
             near, beside = (np.linalg.norm(self.pairs(before, y)[0], axis=-1) for y in (before, self.walls))
             reach = (1 + SKIN) * self.support
             W, wall = W * (near < reach), wall * (beside < reach)
-        return W.sum(1) + wall @ self.wall_weights
+        found = W.sum(1) + wall @ (self.wall_weights * ~self.container)
+        found += (1 - h) * (wall @ (self.wall_weights * self.container))
+        kept = True if before is None else near < reach
+        return found + h * sum(((image * kept).sum(1) for _, _, image, _ in self.images(x)), np.zeros(len(x)))
 
     @cached_property
     def constants(self):
@@ -160,9 +188,11 @@ class Projection:
         """Positions, velocities, and k with what it adds to velocities, after the step, from predicted velocities and
         those two of the step before; and the divergence that the last iteration found, times the step. Bodies begin at
         rest and fall with the ``gravity``."""
-        (n, d), density = x.shape, self.density(x)
-        _, g, total, gamma, nu, M, H, inverse = self.around(x)
-        B = 1 / (1 + (nu / 0.05) ** 4)
+        (n, d), (h, mirror, behind) = x.shape, self.share(x)
+        density = self.density(x, h)
+        _, g, total, walled, nu, M, H, inverse = self.around(x)
+        B, Bo = (1 / (1 + (each / 0.05) ** 4) for each in (nu + 9 * behind, nu - behind))
+        gamma = walled - mirror
         tension = between(H, 0.1, 0.5) * B
         omega, square = self.constants
         N = gamma[:, :, None] * gamma[:, None, :]
@@ -173,10 +203,11 @@ class Projection:
         K = inverse + 0.033 * between(H, 0.8, 0.95)[:, None, None] * (inverse @ (inverse - np.eye(d)))
         t = 0.2 * (1.05 / ((M * P).sum((1, 2)) / (d - 1) + 0.05) - 1)[:, None, None]
         beside = t * P - (1 + t) * C
-        B, full = B[:, None, None], between(H + nu, 0.1, 0.5)
-        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (K - np.eye(d)) + (1 - B) * beside)
-        B = B[:, 0, 0]
-        own = np.einsum("iab,ib->ia", L, total) + gamma
+        inside, Bo, full = B[:, None, None], Bo[:, None, None], between(H + nu, 0.1, 0.5)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (inside * (K - np.eye(d)) + (1 - Bo) * beside)
+        own = np.einsum("iab,ib->ia", L, total) + walled
+        gamma = walled - h[:, None] * mirror
+        images = [(flip, g_image) for flip, _, _, g_image in self.images(x)]
         a = ((own**2).sum(1) + 0.05 * square) / m
         unequal = 1 + 2 * ((m[:, None] - m) / (m[:, None] + m)) ** 2
         a += (unequal * (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1)) @ (1 / m)
@@ -188,19 +219,29 @@ class Projection:
             yielding += row.T @ body.mobility @ row
         falls = sum((row[:d].T @ np.broadcast_to(gravity, d) * dt for row in rows), np.zeros(n))
 
-        def force(k):
+        def lift(k):
+            both = (h * k)[:, None] + (h * k)[None, :]
+            return sum((np.einsum("ij,ija->ia", both, image) for _, image in images), np.zeros((n, d)))
+
+        def from_fluid(k):
             pull = k[:, None, None] * L
-            return np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g) + k[:, None] * gamma
+            return np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g)
+
+        def force(k):
+            return from_fluid(k) + k[:, None] * gamma + lift(k)
 
         def divergence(v):
             apart = v[:, None] - v[None, :]
-            return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
+            found = np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
+            for flip, image in images:
+                found = found + h * np.einsum("ija,ija->i", v[:, None] - flip * v[None, :], image)
+            return found
 
         share = between(H + 2 * nu, 0.7, 0.95)
-        correct = self.coarse(x, m, force, L, g, share, yielding) if self.nodes else None
+        correct = self.coarse(x, m, from_fluid(share) + share[:, None] * walled, L, g, share, yielding) if self.nodes else None
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
-        taken = np.where(far & ((before[1] * gamma).sum(1) > 0), 0, full)
+        taken = np.where(far & ((before[1] * walled).sum(1) > 0), 0, full)
         k = y = taken * before[0]
         v = v_star + taken[:, None] * before[1]
         momentum = 4 / ((1 + np.sqrt(101)) / 2)
@@ -229,9 +270,9 @@ class Projection:
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
-            z = c + omega * 3 / (2 - root) * (self.density(now, x) - 1) / a
+            z = c + min(dt / 0.02, 1) * omega * 3 / (2 - root) * (self.density(now, h, x) - 1) / a
             c = np.where(z > 0, z, low * z)
-            back = (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+            back = (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma + lift(c)) / m[:, None]
             now = moved - back / np.maximum(np.linalg.norm(back, axis=1) / (self.spacing / 6), 1)[:, None]
         if self.follow:
             slopes = -np.einsum("ija,ijb,ibc->iac", u[:, None] - u[None, :], g, inverse)
@@ -239,23 +280,23 @@ class Projection:
         share = between(H + 2 * nu, 0.7, 0.95)
         return now, v, (k, kick), np.sqrt((share * missed**2).sum() / share.sum())
 
-    def coarse(self, x, m, force, L, g, c, yielding):
+    def coarse(self, x, m, push, L, g, c, yielding):
         """The function that gives the coarse pressure of a residual, from hat functions written out node by node."""
         (first, frequency, counts), (n, d) = self.nodes, x.shape
         shape = counts.astype(int)
-        s, h, lattice = (x - first) * frequency, force(c), 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
+        s, lattice = (x - first) * frequency, 8 / 3 * {2: 1.0, 3: 2.0}[d] / self.spacing**2
         cell, t = np.floor(s).astype(int), s - np.floor(s)
         phi, slope, touched = np.zeros((n, shape.prod())), np.zeros((n, shape.prod(), d)), np.zeros(shape.prod())
         for corner in np.ndindex(*[2] * d):
             node = np.ravel_multi_index(((cell + corner) % shape).T, shape)
             weight, sign = np.where(corner, t, 1 - t), np.where(corner, 1, -1) * frequency
             phi[np.arange(n), node] += weight.prod(1)
-            np.add.at(touched, node, (lattice / 4**d * 1e-5 + 0.01 * (h**2).sum(1)) / m)
+            np.add.at(touched, node, (lattice / 4**d * 1e-5 + 0.01 * (push**2).sum(1)) / m)
             for axis in range(d):
                 others = np.delete(weight, axis, 1).prod(1)
                 slope[np.arange(n), node, axis] += sign[axis] * others
         moment = np.einsum("j,jab,ijb,ijk->iak", c, L, g, -self.pairs(x, x)[0])
-        q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * h[:, None, :]
+        q = np.einsum("iab,iIb->iIa", moment, slope) + phi[:, :, None] * push[:, None, :]
         A = np.einsum("iIa,iJa,i->IJ", q, q, 1 / m) + np.diag(touched)
         A += (phi.T * c) @ yielding @ (phi.T * c).T
         live = touched > 0
@@ -270,9 +311,10 @@ class Projection:
     def shift(self, x, v, dt, pull=0.0):
         """By velocities, and dt^2 p / rho of every particle."""
         (W, g, total, gamma, nu, _, H, inverse), s, d = self.around(x), self.spacing, x.shape[1]
+        behind = self.share(x)[2]
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
-        c = between(H, 0.8, 0.95) / (1 + (nu / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
+        c = between(H, 0.8, 0.95) / (1 + ((nu + 9 * behind) / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
         rate = rate + 60 * c**2 / (c + 0.004) ** 1.5
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4

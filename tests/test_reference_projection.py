@@ -9,6 +9,7 @@ import pytest
 from cortado import InputError, Problem, Simulation, losses, reference
 from cortado.reference import Terms
 from cortado.scene.discrete_scene import discretise
+from cortado.scene.walls import mirrors_of
 from cortado.solvers.projection.coarse_grid import coarse_grid
 from reference_projection import Projection
 from scenes import plane, scene
@@ -64,7 +65,10 @@ def test_steps_are_those_of_the_twin(make, smoothing):
     nodes = tuple(np.array(part)[: made.dimension] for part in (grid.origin, 1.0 / grid.cell, grid.shape))
     twin = Projection(
         *(discrete.kernel, lattice.support, lattice.volume, made.discretisation.spacing),
-        *(walls.positions, walls.weights, walls.feet, np.zeros(made.dimension)),
+        *(walls.positions, walls.weights, walls.feet),
+        mirrors=tuple(end[: made.dimension] for end in mirrors_of(made)),
+        container=walls.solid == -1,
+        periods=np.zeros(made.dimension),
         iterations=made.solver.iterations,
         repairs=made.solver.repairs,
         follow=False,

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <limits>
 
 #include "cortado/engine.hpp"
 
@@ -37,6 +38,10 @@ Scene box(int d, const std::string& kernel, const std::string& viscosity, bool p
             s.wall_feet.insert(s.wall_feet.end(), {0, 0.02});
             if (d == 3) s.wall_feet.push_back(0);
         }
+    s.wall_mirrors.assign(s.wall_weights.size(), 1);
+    s.mirror_lower.fill(-std::numeric_limits<double>::infinity());
+    s.mirror_upper.fill(std::numeric_limits<double>::infinity());
+    s.mirror_lower[1] = 0;
     if (periodic) s.periods = {0.3, 0, 0};
     s.rest_density = 1000;
     s.time_step = 0.002;

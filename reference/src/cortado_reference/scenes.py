@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from cortado.discretise.calibration import SKIN, stress_control
 from cortado.errors import InputError, shown
 from cortado.scene.discrete_scene import DiscreteScene
@@ -9,6 +11,7 @@ from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
+from cortado.scene.walls import mirrors_of
 from cortado.solvers.projection.coarse_grid import coarse_grid, endless
 from cortado.solvers.projection.constants import lattice_constants
 from cortado_reference.engine import extension
@@ -72,6 +75,7 @@ def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "wall_positions": discrete.walls.positions.ravel().tolist(),
         "wall_weights": discrete.walls.weights.tolist(),
         "wall_feet": discrete.walls.feet.ravel().tolist(),
+        **_of_mirrors(scene, discrete),
         "periods": [*map(float, discrete.periods), *[0.0] * (3 - scene.dimension)],
         "rest_density": scene.phase[0].rest_density,
         "time_step": solver.time_step,
@@ -87,6 +91,17 @@ def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
     for name, value in values.items():
         setattr(made, name, value)
     return made
+
+
+def _of_mirrors(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
+    """The flat walls that mirror the fluid, and which wall particles are theirs."""
+    lower, upper = mirrors_of(scene)
+    mirrors = (discrete.walls.solid == -1) & np.isfinite([lower, upper]).any()
+    return {
+        "mirror_lower": lower.tolist(),
+        "mirror_upper": upper.tolist(),
+        "wall_mirrors": mirrors.astype(int).tolist(),
+    }
 
 
 def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.loads import loads
+from cortado.particles.mirrors import mirror_functions
 from cortado.particles.wall_functions import wall_functions
 
 UNROLL = 4
@@ -120,6 +121,10 @@ def neighbourhood_type(precision: Precision) -> Any:
         """[m], 0 along an axis that is not periodic; read where the `Discretisation` is periodic."""
         frequency: vector
         """1 / period [1 / m], or 0."""
+        mirror_lower: vector
+        """Coordinates of the flat walls that mirror the fluid [m], -inf along an axis where none does."""
+        mirror_upper: vector
+        """The same of those at the upper ends, inf where none does."""
 
     Neighbourhood.__qualname__ = f"Surroundings_{precision.name}"
     Neighbourhood.__name__ = Neighbourhood.__qualname__
@@ -152,6 +157,11 @@ class PairFunctions:
     wall_velocity_dot: Any
     wall_turn_dot: Any
     wall_growth_dot: Any
+    near_mirrors: Any
+    reflects: Any
+    flip_of: Any
+    flip_of_six: Any
+    mirrored: Any
     several: Any
     vectors: Any
     numbers: Any
@@ -271,6 +281,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         factor_gradient=factor_gradient,
         neighbour=neighbour,
         **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
+        **mirror_functions(discretisation.precision, neighbourhood),
         several=several,
         vectors=vectors,
         numbers=numbers,

@@ -28,6 +28,21 @@ OVER_FLUID = """\
             {separation}
             {body}
 """
+OVER_IMAGES = """\
+    _near = _near_mirrors(_x_i, s)
+    _others = s.fluid_count[i] - s.filling[i]
+    for _code in range(1, _near + 1):
+        if _reflects(_code, _near):
+            _flip = _flip_of(_code)
+            {more}
+            for _place in range(_lane(), _others + 1, _LANES):
+                _j = i
+                if _place < _others:
+                    _j = _neighbour(_place, i, s)
+                _x_ij = _separation(_x_i, _mirrored(x[_j], _code, s), s)
+                {apart}
+                {body}
+"""
 OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
         _b = _neighbour(_place, i, s)
@@ -62,6 +77,21 @@ def over_fluid(
         index="_j = _several_j[_more]" if numbered or len(loaded) < len(arrays) else "",
         separation=f"_x_ij = _separation(_x_i, {of_j['x']}, s)" if separated else "",
         body=_lines(12, body(of_j)),
+    )
+
+
+def over_images(d: Discretisation, arrays: Types, body: Body, known: Iterable[str]) -> str:
+    """A loop over the images of the fluid and of the particle itself, which have what their particles have, mirrored:
+    vectors and matrices with it. Terms know what is ``known`` of `cortado.particles.terms.OF_IMAGES`."""
+    six = d.precision.six in arrays.values()
+    flips = {d.precision.real: "{0}[_j]", d.precision.vector: "_times(_flip, {0}[_j])"}
+    flips[d.precision.six] = "_times(_flip_six, {0}[_j])"
+    matrix = "_times({0}[_j], _outer(_flip, _flip))"
+    of_j = {array: flips.get(kind, matrix).format(array) for array, kind in arrays.items()}
+    return OVER_IMAGES.format(
+        more="_flip_six = _flip_of_six(_flip)" if six else "",
+        apart="_apart = _separation(_x_i, x[_j], s)" if "apart" in known else "",
+        body=_lines(16, body(of_j)),
     )
 
 
@@ -127,6 +157,11 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 def _known(d: Discretisation) -> dict[str, Any]:
     pair = pair_functions(d)
     used = (
+        "near_mirrors",
+        "reflects",
+        "flip_of",
+        "flip_of_six",
+        "mirrored",
         "separation",
         "neighbour",
         "several",
@@ -146,6 +181,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
     )
     return {
         **{f"_{name}": getattr(pair, name) for name in used},
+        **{"_times": wp.cw_mul, "_outer": wp.outer},
         **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},
         **{"_lane": lane_functions(d.precision, d.lanes).lane, "_LANES": d.lanes, "_UNROLL": UNROLL},
     }

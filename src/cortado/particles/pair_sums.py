@@ -19,7 +19,7 @@ from typing import Any
 import warp as wp
 
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.pair_loops import over_fluid, over_walls, summed
+from cortado.particles.pair_loops import Body, over_fluid, over_images, over_walls, summed
 from cortado.particles.terms import Term
 
 Function = Callable[..., Any]
@@ -48,6 +48,16 @@ def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Deco
     def make(function: Function) -> Any:
         term = Term.of(function)
         return _made(term, d, _over_fluid(term, d, ahead), term, module)
+
+    return make
+
+
+def image_sum(d: Discretisation) -> Decorator:
+    """As `fluid_sum`, over the images of the fluid in flat walls that mirror it (`cortado.particles.mirrors`)."""
+
+    def make(function: Function) -> Any:
+        term = Term.of(function)
+        return _made(term, d, over_images(d, term.of_neighbours, _adding_up(term), term.parameters), term)
 
     return make
 
@@ -90,13 +100,17 @@ def _check_walls(wall: Term, term: Term) -> None:
         raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
 
 
-def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
+def _adding_up(term: Term) -> Body:
     def body(of_j: Mapping[str, str]) -> list[str]:
         called = f"{_terms(term)} = _term({term.seen_from_i(of_j)})"
         return [called, *(f"_total_{n} += _term_{n}" for n in _numbers(term))]
 
+    return body
+
+
+def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     knows = ("j" in term.parameters, "x_ij" in term.parameters)
-    return over_fluid(d, term.of_neighbours, body, ahead, *knows)
+    return over_fluid(d, term.of_neighbours, _adding_up(term), ahead, *knows)
 
 
 def _over_walls(wall: Term, d: Discretisation, rubs: bool, grows: Any = None, of_one: bool = False) -> str:

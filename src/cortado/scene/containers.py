@@ -81,6 +81,11 @@ class Container(Table):
         """Where the period begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
         return np.zeros(dimension), np.zeros(dimension)
 
+    def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
+        """Coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and at the upper end of each
+        axis, each (d,) [m], and -inf or inf where none does."""
+        return np.full(dimension, -np.inf), np.full(dimension, np.inf)
+
     def domain(self, dimension: int) -> Domain:
         """The same as one object."""
         return Domain.of(*self.periods(dimension))
@@ -152,6 +157,14 @@ class BoxContainer(Container):
 
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
         return box_places(*self.extent(), self.periodic, spacing, reach)
+
+    def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
+        """Walls without slip do not: a mirror would bend the shear beside them. Nor do those of a box so narrow that
+        images had images."""
+        (lower, upper), periodic = self.extent(), np.array(self.periodic)
+        if self.sticks or (upper - lower < support)[~periodic].any():
+            return super().mirrors(dimension, support)
+        return np.where(periodic, -np.inf, lower), np.where(periodic, np.inf, upper)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
         lower, upper = self.extent()

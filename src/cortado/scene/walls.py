@@ -158,3 +158,11 @@ def _weighed(
     known = len(kept.weights)
     all_walls = WallSurface(walls, flat, lattice, room, surface.lower, room.periods, uneven_changes, known)
     return points, all_walls.weights(places)[: len(points)]
+
+
+def mirrors_of(scene: Scene) -> tuple[Points, Points]:
+    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
+    does."""
+    lower, upper = scene.container.mirrors(scene.dimension, scene.discretisation.support_radius)
+    flat = (0, 3 - scene.dimension)
+    return np.pad(lower, flat, constant_values=-np.inf), np.pad(upper, flat, constant_values=np.inf)

@@ -25,6 +25,7 @@ from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.sampling import reserve_offset
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
+from cortado.scene.walls import mirrors_of
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting
@@ -72,6 +73,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
+            mirrors_of(scene),
             _named_solids(scene),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )

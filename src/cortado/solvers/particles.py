@@ -17,6 +17,7 @@ from cortado.device.memory import gradient_parts
 from cortado.device.staying import Staying
 from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
+from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
 from cortado.particles.arrays import Fields
 from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
@@ -56,6 +57,9 @@ class ParticleSystem:
     waiting: int
     """Number of the first particle of a scene that may wait in a nozzle."""
     walled: Walled
+    mirrors: tuple[Points, Points]
+    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
+    does."""
     solids: Mapping[str, NamedSolid]
     """By their names."""
     of_one_lane: Callable[[], "ParticleSystem"]
@@ -309,6 +313,7 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.normalisation = lattice.normalisation
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
     s.laplacian_correction = lattice.laplacian_correction
+    s.mirror_lower, s.mirror_upper = (precision.vector(*ends) for ends in system.mirrors)
     s.period = precision.vector(*periods)
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
     return s

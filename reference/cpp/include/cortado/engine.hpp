@@ -30,6 +30,8 @@ struct Scene {
     std::vector<double> wall_positions;  // (b, d) [m]
     std::vector<double> wall_weights;    // (b,) w_b, a fluid particle being 1
     std::vector<double> wall_feet;       // (b, d) from wall particles to the surface [m]
+    std::array<double, 3> mirror_lower, mirror_upper;  // of flat walls that mirror the fluid [m]; infinite: none
+    std::vector<int> wall_mirrors;       // (b,) 1 of particles of these walls, else 0
     std::array<double, 3> periods;       // [m], 0 along an axis that is not periodic
     double rest_density;                 // [kg / m3]
     double time_step;                    // [s]

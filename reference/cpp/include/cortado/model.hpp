@@ -33,6 +33,8 @@ struct Model {
     Vectors<Real, D> wall_positions, wall_normals;
     Values<Real> wall_depths;  // behind the surface
     Values<Scalar> wall_weights;
+    std::array<double, 3> mirror_lower, mirror_upper;  // flat walls that mirror the fluid
+    std::vector<int> wall_mirrors;                     // whether a wall particle is one of theirs
     Cells<D> wall_cells;
     int threads;
 
@@ -73,6 +75,9 @@ struct Model {
           wall_normals(joined_vectors<Real, D>(high_only(s.wall_feet))),
           wall_depths(wall_normals.size()),
           wall_weights(s.wall_weights.begin(), s.wall_weights.end()),
+          mirror_lower(s.mirror_lower),
+          mirror_upper(s.mirror_upper),
+          wall_mirrors(s.wall_mirrors),
           wall_cells(cells_of<Real, D>(wall_positions, s.reach, s.periods)),
           threads(threads) {
         for (std::size_t b = 0; b < wall_normals.size(); ++b) {

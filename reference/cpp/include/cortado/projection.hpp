@@ -29,6 +29,7 @@ struct Projection {
 
     std::vector<Moments<Scalar, D>> moments;
     std::vector<Effects<Scalar, D>> effects;
+    Values<Scalar> n;                         // the number density, with images
     std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity before iteration i; the last is the result
@@ -56,7 +57,9 @@ struct Projection {
     Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
     // The same of a repair.
     Scalar repair_step_of(const Model<Scalar, D>& model, std::size_t repair, std::size_t i) const {
-        return model.repair_relaxations[repair] / effects[i].a;
+        const Real lasts = Real(1) / Real(50), dt = real_part(model.time_step);
+        const Scalar part(dt < lasts ? Real(dt / lasts) : Real(1));
+        return part * model.repair_relaxations[repair] / effects[i].a;
     }
     // How much a particle is pulled after all iterations, by which it is shifted.
     Scalar pulled(std::size_t i) const { return effects[i].repaired * k.back()[i]; }
@@ -82,9 +85,9 @@ struct Projection {
         return n < one ? (one - effects[i].full) * (one - n) / model.time_step : Scalar(0);
     }
 
-    // From lists over a state, its densities n and predicted velocities.
+    // From lists over a state, its densities `without` images and predicted velocities.
     void take(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
-              const State<Scalar, D>& state, const Values<Scalar>& n, const Vectors<Scalar, D>& v_star) {
+              const State<Scalar, D>& state, const Values<Scalar>& without, const Vectors<Scalar, D>& v_star) {
         const std::size_t count = state.x.size(), iterations = model.maximum_iterations;
         const std::size_t repairs = model.repair_relaxations.size();
         const auto sized = [count](auto& all, std::size_t length) {
@@ -98,7 +101,7 @@ struct Projection {
         sized(c, repairs + 1);
         sized(excess, repairs);
         sized(held, repairs);
-        find(model, fluid, walls, count);
+        find(model, fluid, walls, state.x, without);
         kick.resize(count);
         for (std::size_t i = 0; i < count; ++i) {
             const Scalar full = taken(model, state, i);
@@ -109,17 +112,19 @@ struct Projection {
         corrections.resize(model.nodes.count() > 0 ? iterations : 0);
         if (!corrections.empty()) spread(model, fluid, state.x);
         for (std::size_t at = 0; at < iterations; ++at) {
-            if (corrects(at)) correct(model, fluid, n, corrections[at], at);
-            iterate(model, fluid, n, at);
-            pull(model, fluid, y[at + 1], v_star, u[at + 1]);
+            if (corrects(at)) correct(model, fluid, state.x, corrections[at], at);
+            iterate(model, fluid, state.x, at);
+            pull(model, fluid, state.x, y[at + 1], v_star, u[at + 1]);
         }
         move(model, fluid, state.x, u[iterations]);
-        for (std::size_t at = 0; at < repairs; ++at) repair(model, fluid, walls, at);
+        for (std::size_t at = 0; at < repairs; ++at) repair(model, fluid, walls, state.x, at);
     }
 
 private:
     void find(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
-              std::size_t count) {
+              const Vectors<Scalar, D>& x, const Values<Scalar>& without) {
+        const std::size_t count = x.size();
+        n.resize(count);
         moments.resize(count);
         effects.resize(count);
         each_particle(count, model.threads, [&](std::size_t i) {
@@ -133,20 +138,37 @@ private:
             for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
                 const Vector<Scalar, D> normal = model.wall_normals[pair->other].template cast<Scalar>();
                 const Scalar volume = model.volume * model.wall_weights[pair->other];
-                of.normal += (volume * normal.dot(pair->gradient())) * normal;
+                const Vector<Scalar, D> along = (volume * normal.dot(pair->gradient())) * normal;
+                of.normal += along;
                 of.whole += volume * pair->gradient();
                 of.nu += volume * pair->w;
+                if (!model.wall_mirrors[pair->other]) continue;
+                of.mirror += along;
+                of.behind += volume * pair->w;
             }
+            each_image(model, fluid, x, i, [&](const Image<Scalar, D>& image) { of.images += model.volume * image.w; });
             of.gamma = Edge<Scalar, D>(model, of).gamma();
             moments[i] = of;
             effects[i] = Surroundings<Scalar, D>(model, of).found;
+            n[i] = without[i] + effects[i].image * (of.images - of.behind);
         });
     }
 
-    // D^T y
+    // What pressures y of walls and images add to D^T y.
+    Vector<Scalar, D> walled(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
+                             const Values<Scalar>& y, std::size_t i) const {
+        Vector<Scalar, D> total = Vector<Scalar, D>::Constant(Scalar(0));
+        each_image(model, fluid, x, i, [&](const Image<Scalar, D>& image) {
+            const int j = image.other;
+            total += (effects[i].image * y[i] + effects[j].image * y[j]) * image.gradient();
+        });
+        return y[i] * effects[i].push + model.volume * total;
+    }
+
+    // D^T y, but for that.
     Vector<Scalar, D> push(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
                            std::size_t i) const {
-        Vector<Scalar, D> total = y[i] * moments[i].gamma;
+        Vector<Scalar, D> total = Vector<Scalar, D>::Constant(Scalar(0));
         const Matrix<Scalar, D> T = y[i] * effects[i].L;
         for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
             const int j = pair->other;
@@ -156,18 +178,18 @@ private:
     }
 
     // The velocity v* - D^T y / m that pressures leave.
-    void pull(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
-              const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) {
+    void pull(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
+              const Values<Scalar>& y, const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) {
         each_particle(y.size(), model.threads, [&](std::size_t i) {
-            kick[i] = -push(model, fluid, y, i) / model.rest_density;
+            kick[i] = -(push(model, fluid, y, i) + walled(model, fluid, x, y, i)) / model.rest_density;
             left[i] = v_star[i] + kick[i];
         });
     }
 
     // D v
-    Scalar divergence_of(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& v,
-                         std::size_t i) const {
-        Scalar divergence = moments[i].gamma.dot(v[i]);
+    Scalar divergence_of(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
+                         const Vectors<Scalar, D>& v, std::size_t i) const {
+        Scalar divergence = effects[i].push.dot(v[i]) + effects[i].image * widening(model, fluid, x, v, i);
         for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
             const Vector<Scalar, D> v_ij = v[i] - v[pair->other], corrected = effects[i].L * pair->gradient();
             divergence += model.volume * v_ij.dot(corrected);
@@ -181,7 +203,7 @@ private:
         for (std::size_t i = 0; i < x.size(); ++i) c[i] = effects[i].shared;
         coarse.pushes = Pushes<Scalar, D>(x.size());
         each_particle(x.size(), model.threads, [&](std::size_t i) {
-            coarse.pushes.h[i] = push(model, fluid, c, i);
+            coarse.pushes.h[i] = push(model, fluid, c, i) + c[i] * moments[i].gamma;
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
                 const Matrix<Scalar, D> T = c[pair->other] * effects[pair->other].L;
                 coarse.pushes.N[i] -= T * (model.volume * pair->gradient()) * pair->x.transpose();
@@ -191,14 +213,14 @@ private:
     }
 
     // The coarse correction of k, y and u, which `before` keeps.
-    void correct(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
+    void correct(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
                  Correction<Scalar, D>& before, std::size_t at) {
         before.y = y[at];
         before.u = u[at];
         for (auto* each : {&before.counted, &before.r, &before.d}) each->resize(n.size());
         before.f.resize(n.size());
         each_particle(n.size(), model.threads, [&](std::size_t i) {
-            const Scalar left = divergence_of(model, fluid, before.u, i) - wanted(model, i, n[i]);
+            const Scalar left = divergence_of(model, fluid, x, before.u, i) - wanted(model, i, n[i]);
             const bool inside = before.y[i] > Scalar(0) || real_part(effects[i].tension) >= Real(1);
             const bool all = inside || !(real_part(left) <= Real(0));  // NaN must stay
             before.counted[i] = Scalar(all ? Real(1) : real_part(left) == Real(0) ? Real(1) / Real(2) : Real(0));
@@ -213,7 +235,8 @@ private:
             before.d[i] = least + (clamp.rise + clamp.fall * effects[i].tension) * below - before.y[i];
         });
         each_particle(n.size(), model.threads, [&](std::size_t i) {
-            before.f[i] = -push(model, fluid, before.d, i) / model.rest_density;
+            before.f[i] =
+                -(push(model, fluid, before.d, i) + walled(model, fluid, x, before.d, i)) / model.rest_density;
         });
         before.stride(model.rest_density, model.spacing / (Scalar(1'000'000) * model.time_step), at == 0);
         for (std::size_t i = 0; i < n.size(); ++i) {
@@ -222,10 +245,10 @@ private:
         }
     }
 
-    void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
+    void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
                  std::size_t at) {
         each_particle(n.size(), model.threads, [&](std::size_t i) {
-            const Scalar divergence = divergence_of(model, fluid, u[at], i);
+            const Scalar divergence = divergence_of(model, fluid, x, u[at], i);
             const Scalar per = step_of(model, i), down = y[at][i] + per * divergence;
             const Scalar up = y[at][i] + per * (divergence - wanted(model, i, n[i]));
             const Clamp<Scalar> clamp(up, down);
@@ -259,11 +282,12 @@ private:
     }
 
     void repair(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
-                std::size_t at) {
+                const Vectors<Scalar, D>& x, std::size_t at) {
         const std::size_t count = x_moved.size();
         each_particle(count, model.threads, [&](std::size_t i) {
             const Scalar weights = model.self_weight + model.weights(i, fluid, walls, x_now[at]);
             excess[at][i] = model.volume * weights - Scalar(1);
+            excess[at][i] += effects[i].image * surplus(model, fluid, walls, x_now[at], i);
             const Scalar z = c[at][i] + repair_step_of(model, at, i) * excess[at][i];
             c[at + 1][i] = z < Scalar(0) ? Scalar(effects[i].repaired * z) : z;
         });
@@ -272,7 +296,7 @@ private:
             if (real_part(one) > Real(0)) sum += real_part(one);
         error = double(sum / Real(double(count)));
         each_particle(count, model.threads, [&](std::size_t i) {
-            Vector<Scalar, D> total = c[at + 1][i] * moments[i].gamma;
+            Vector<Scalar, D> total = walled(model, fluid, x, c[at + 1], i);
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
                 total += (model.volume * (c[at + 1][i] + c[at + 1][pair->other])) * pair->gradient();
             const Vector<Scalar, D> back = total / model.rest_density;

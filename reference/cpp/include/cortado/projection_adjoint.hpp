@@ -38,7 +38,7 @@ public:
             if (full > 0) effects_bar_[i].full += state_.k[i] * first_bar + state_.kick[i].dot(bar.v[i]);
             v_star_bar_[i] += bar.v[i];
         });
-        surroundings();
+        surroundings(n_bar);
         bar.x = x_bar_;
         return v_star_bar_;
     }
@@ -58,6 +58,21 @@ private:
         }
     }
 
+    // Of what walls and images add to D^T y, from its adjoint f to that of y, which is returned.
+    Real walled(std::size_t i, const Values<Real>& y) {
+        const Effects<Real, D>& of = at_.effects[i];
+        Real wide = 0;
+        each_image(model_, step_.fluid, state_.x, i, [&](const Image<Real, D>& image) {
+            const int j = image.other;
+            const Vector<Real, D> f_ij = f_[i] - image.of(f_[j]);
+            wide += model_.volume * image.gradient().dot(f_ij);
+            x_bar_[i] += model_.volume * (of.image * y[i] + at_.effects[j].image * y[j]) * image.hessian_product(f_ij);
+        });
+        effects_bar_[i].push += y[i] * f_[i];
+        effects_bar_[i].image += y[i] * wide;
+        return of.push.dot(f_[i]) + of.image * wide;
+    }
+
     // From the adjoint of the last positions to that of those before all repairs.
     Vectors<Real, D> repairs(const Vectors<Real, D>& last_bar) {
         Vectors<Real, D> now_bar = last_bar, moved_bar = zero_vectors<Real, D>(count_);
@@ -70,7 +85,7 @@ private:
             });
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];
-                Real z_bar = c_bar[i] + at_.moments[i].gamma.dot(f_[i]);
+                Real z_bar = c_bar[i] + walled(i, c);
                 each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
                     const Vector<Real, D> f_ij = f_[i] - f_[j];
                     z_bar += g.dot(f_ij);
@@ -82,12 +97,21 @@ private:
                     effects_bar_[i].repaired += z * z_bar;
                     z_bar *= of.repaired;
                 }
-                moments_bar_[i].gamma += c[i] * f_[i];
                 effects_bar_[i].a -= per * excess / of.a * z_bar;
                 r[i] = model_.volume * per * z_bar;
                 c_bar[i] = z_bar;
             });
-            each([&](std::size_t i) { now_bar[i] = weights_adjoint(model_, i, step_, at_.x_now[k], r); });
+            Values<Real> imaged(count_);
+            for (std::size_t i = 0; i < count_; ++i) imaged[i] = at_.effects[i].image * r[i] / model_.volume;
+            each([&](std::size_t i) {
+                const Vectors<Real, D>& x = at_.x_now[k];
+                now_bar[i] = weights_adjoint(model_, i, step_, x, r) + lift(model_, step_.fluid, x, imaged, i);
+                each_mirror(model_, step_.walls, x, i, [&](const Pair<Real, D>& wall) {
+                    now_bar[i] -= model_.volume * imaged[i] * model_.wall_weights[wall.other] * wall.gradient();
+                });
+                effects_bar_[i].image +=
+                    r[i] / model_.volume * surplus(model_, step_.fluid, step_.walls, x, i);
+            });
         }
         for (std::size_t i = 0; i < count_; ++i) moved_bar[i] += now_bar[i];
         return moved_bar;
@@ -129,9 +153,10 @@ private:
             kick_bar[i] = Vector<Real, D>::Zero();
         });
         pulled(y, y_bar);
+        each([&](std::size_t i) { y_bar[i] += walled(i, y); });
     }
 
-    // Of D^T y, from its adjoint f to that of y.
+    // Of D^T y, but for that, from its adjoint f to that of y.
     void pulled(const Values<Real>& y, Values<Real>& y_bar) {
         each([&](std::size_t i) {
             const Matrix<Real, D>& L = at_.effects[i].L;
@@ -142,9 +167,8 @@ private:
                 bent = (y[i] * L + y[j] * at_.effects[j].L) * f_ij;
             });
             T_bar = even<Real, D>(T_bar);
-            y_bar[i] += L.cwiseProduct(T_bar).sum() + at_.moments[i].gamma.dot(f_[i]);
+            y_bar[i] += L.cwiseProduct(T_bar).sum();
             effects_bar_[i].L += y[i] * T_bar;
-            moments_bar_[i].gamma += y[i] * f_[i];
         });
     }
 
@@ -153,7 +177,17 @@ private:
         each([&](std::size_t i) {
             const Matrix<Real, D>& L = at_.effects[i].L;
             Matrix<Real, D> L_bar = Matrix<Real, D>::Zero();
-            u_bar[i] += d_bar[i] * at_.moments[i].gamma;
+            u_bar[i] += d_bar[i] * at_.effects[i].push;
+            Real wide = 0;
+            each_image(model_, step_.fluid, state_.x, i, [&](const Image<Real, D>& image) {
+                const int j = image.other;
+                const Real both = at_.effects[i].image * d_bar[i] + at_.effects[j].image * d_bar[j];
+                const Vector<Real, D> u_ij = u[i] - image.of(u[j]);
+                u_bar[i] += model_.volume * both * image.gradient();
+                x_bar_[i] += model_.volume * both * image.hessian_product(u_ij);
+                wide += model_.volume * image.gradient().dot(u_ij);
+            });
+            effects_bar_[i].image += d_bar[i] * wide;
             each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
                 const Vector<Real, D> u_ij = u[i] - u[j];
                 const Matrix<Real, D> S = d_bar[i] * L + d_bar[j] * at_.effects[j].L;
@@ -162,13 +196,13 @@ private:
                 bent = S * u_ij;
             });
             effects_bar_[i].L += d_bar[i] * even<Real, D>(L_bar);
-            moments_bar_[i].gamma += d_bar[i] * u[i];
+            effects_bar_[i].push += d_bar[i] * u[i];
         });
     }
 
     // Of b, from its adjoint.
     void want(std::size_t i, const Real& b_bar, Values<Real>& n_bar) {
-        const Real n = step_.n[i], dt = model_.time_step;
+        const Real n = at_.n[i], dt = model_.time_step;
         if (!(n < 1)) return;
         n_bar[i] -= (1 - at_.effects[i].full) / dt * b_bar;
         effects_bar_[i].full -= (1 - n) / dt * b_bar;
@@ -191,6 +225,7 @@ private:
             f_[i] = 2 * alpha * work_bar * before.f[i] - alpha / m * bar.v[i];
         }
         pulled(before.d, d_bar);
+        each([&](std::size_t i) { d_bar[i] += walled(i, before.d); });
         const auto change = correction_adjoint(model_, at_, before, d_bar, pushes_bar_, x_bar_);
         each([&](std::size_t i) {
             effects_bar_[i].shared += change[i].shared;
@@ -209,6 +244,8 @@ private:
         f_ = pushes_bar_.h;
         pulled(c, c_bar);
         each([&](std::size_t i) {
+            c_bar[i] += at_.moments[i].gamma.dot(f_[i]);
+            moments_bar_[i].gamma += c[i] * f_[i];
             const Matrix<Real, D> &N_bar = pushes_bar_.N[i], T = c[i] * at_.effects[i].L;
             Matrix<Real, D> T_bar = Matrix<Real, D>::Zero();
             each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
@@ -235,7 +272,7 @@ private:
             each([&](std::size_t i) {
                 const Effects<Real, D>& of = at_.effects[i];
                 Effects<Real, D>& of_bar = effects_bar_[i];
-                const Real n = step_.n[i], b = at_.wanted(model_, i, n), D_i = at_.divergences[k][i];
+                const Real n = at_.n[i], b = at_.wanted(model_, i, n), D_i = at_.divergences[k][i];
                 const Real per = at_.step_of(model_, i), down = at_.y[k][i] + per * D_i;
                 const Clamp<Real> clamp(Real(at_.y[k][i] + per * (D_i - b)), down);
                 const Real new_bar = k_bar[i] + (1 + beta) * y_bar[i], up_bar = clamp.rise * new_bar;
@@ -255,8 +292,11 @@ private:
     }
 
     // From the adjoints of effects and moments to that of positions.
-    void surroundings() {
+    void surroundings(const Values<Real>& n_bar) {
+        Values<Real> images_bar(count_);
         each([&](std::size_t i) {
+            const Real with = at_.effects[i].image * n_bar[i];
+            effects_bar_[i].image += n_bar[i] * (at_.moments[i].images - at_.moments[i].behind);
             const Moments<Real, D> more =
                 SurroundingsSlope<Real, D>(model_, at_.moments[i]).adjoint(effects_bar_[i]);
             Moments<Real, D>& bar = moments_bar_[i];
@@ -265,6 +305,9 @@ private:
             bar.g += more.g;
             bar.gamma += more.gamma;
             bar.nu += more.nu;
+            bar.mirror += more.mirror;
+            bar.behind += more.behind - with;
+            images_bar[i] = more.images + with;
             Edge<Real, D>(model_, at_.moments[i]).adjoint(bar);
         });
         each([&](std::size_t i) {
@@ -279,9 +322,13 @@ private:
             for (auto pair = step_.walls.begin_of(i); pair != step_.walls.end_of(i); ++pair) {
                 const Vector<Real, D>& normal = model_.wall_normals[pair->other];
                 const Real volume = model_.volume * model_.wall_weights[pair->other];
-                const Vector<Real, D> along = normal.dot(own.normal) * normal + own.whole;
-                x_bar_[i] += volume * (pair->hessian_product(along) + own.nu * pair->gradient());
+                const bool mirrors = model_.wall_mirrors[pair->other];
+                const Vector<Real, D> of_normal = own.normal + Real(mirrors ? 1 : 0) * own.mirror;
+                const Vector<Real, D> along = normal.dot(of_normal) * normal + own.whole;
+                const Real nu = own.nu + (mirrors ? own.behind : Real(0));
+                x_bar_[i] += volume * (pair->hessian_product(along) + nu * pair->gradient());
             }
+            x_bar_[i] += lift(model_, step_.fluid, state_.x, images_bar, i);
         });
     }
 

@@ -13,7 +13,7 @@ template <class Real, int D>
 using ManyEffects = std::vector<Effects<Real, D>>;
 
 template <class Real, int D>
-ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Real, D>& step,
+ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& x,
                                      const Vectors<Real, D>& dx) {
     const Real m = model.rest_density;
     ManyMoments<Real, D> change(dx.size());
@@ -30,21 +30,44 @@ ManyMoments<Real, D> moments_tangent(const Model<Real, D>& model, const Step<Rea
             const Vector<Real, D>& normal = model.wall_normals[pair->other];
             const Real volume = model.volume * model.wall_weights[pair->other];
             const Vector<Real, D> dg = volume * pair->hessian_product(dx[i]);
+            const Real dw = volume * pair->gradient().dot(dx[i]);
             dot.normal += normal.dot(dg) * normal;
             dot.whole += dg;
-            dot.nu += volume * pair->gradient().dot(dx[i]);
+            dot.nu += dw;
+            if (!model.wall_mirrors[pair->other]) continue;
+            dot.mirror += normal.dot(dg) * normal;
+            dot.behind += dw;
         }
+        each_image(model, step.fluid, x, i, [&](const Image<Real, D>& image) {
+            dot.images += model.volume * image.gradient().dot(dx[i] - image.of(dx[image.other]));
+        });
         dot.gamma = Edge<Real, D>(model, step.projection.moments[i]).tangent(dot.normal, dot.whole);
         dot.M = even<Real, D>(dot.M);  // which it is over all pairs, but for round-off
     });
     return change;
 }
 
-// Of D^T y.
+// Of what walls and images add to D^T y.
+template <class Real, int D>
+Vector<Real, D> walled_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& x,
+                               const Vectors<Real, D>& dx, const ManyEffects<Real, D>& effects_dot,
+                               const Values<Real>& y, const Values<Real>& dy, std::size_t i) {
+    const ManyEffects<Real, D>& effects = step.projection.effects;
+    const auto pushed_dot = [&](std::size_t j) { return effects_dot[j].image * y[j] + effects[j].image * dy[j]; };
+    Vector<Real, D> total = Vector<Real, D>::Zero();
+    each_image(model, step.fluid, x, i, [&](const Image<Real, D>& image) {
+        const int j = image.other;
+        const Vector<Real, D> dg = image.hessian_product(Vector<Real, D>(dx[i] - image.of(dx[j])));
+        total += (pushed_dot(i) + pushed_dot(j)) * image.gradient();
+        total += (effects[i].image * y[i] + effects[j].image * y[j]) * dg;
+    });
+    return dy[i] * effects[i].push + y[i] * effects_dot[i].push + model.volume * total;
+}
+
+// Of D^T y, but for that.
 template <class Real, int D>
 Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& dx,
-                              const ManyMoments<Real, D>& moments_dot, const ManyEffects<Real, D>& effects_dot,
-                              const Values<Real>& y, const Values<Real>& dy) {
+                              const ManyEffects<Real, D>& effects_dot, const Values<Real>& y, const Values<Real>& dy) {
     const Projection<Real, D>& at = step.projection;
     Vectors<Real, D> dpull(y.size());
     each_particle(y.size(), model.threads, [&](std::size_t i) {
@@ -52,7 +75,7 @@ Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& 
         const auto change = [&](std::size_t j) {
             return Matrix<Real, D>(dy[j] * at.effects[j].L + y[j] * effects_dot[j].L);
         };
-        Vector<Real, D> total = dy[i] * at.moments[i].gamma + y[i] * moments_dot[i].gamma;
+        Vector<Real, D> total = Vector<Real, D>::Zero();
         const Matrix<Real, D> T = pull(i), dT = change(i);
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
@@ -76,8 +99,9 @@ Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>&
         dc[i] = effects_dot[i].shared;
     }
     Pushes<Real, D> dot(dx.size());
-    dot.h = pull_tangent(model, step, dx, moments_dot, effects_dot, c, dc);
+    dot.h = pull_tangent(model, step, dx, effects_dot, c, dc);
     each_particle(dx.size(), model.threads, [&](std::size_t i) {
+        dot.h[i] += dc[i] * at.moments[i].gamma + c[i] * moments_dot[i].gamma;
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Matrix<Real, D> T = c[j] * at.effects[j].L, dT = dc[j] * at.effects[j].L + c[j] * effects_dot[j].L;
@@ -89,26 +113,38 @@ Pushes<Real, D> pushes_tangent(const Model<Real, D>& model, const Step<Real, D>&
     return dot;
 }
 
-// From the tangents of a state, of its densities and of predicted velocities to that of the step's result.
+// From the tangents of a state, of its densities without images and of predicted velocities to that of the step's result.
 template <class Real, int D>
 State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const State<Real, D>& state,
-                                  const State<Real, D>& dot, const Values<Real>& dn, const Vectors<Real, D>& dv_star) {
+                                  const State<Real, D>& dot, const Values<Real>& without_dot,
+                                  const Vectors<Real, D>& dv_star) {
     const Projection<Real, D>& at = step.projection;
     const std::size_t count = state.x.size();
     const Real dt = model.time_step, m = model.rest_density;
-    const ManyMoments<Real, D> moments_dot = moments_tangent(model, step, dot.x);
+    const ManyMoments<Real, D> moments_dot = moments_tangent(model, step, state.x, dot.x);
     ManyEffects<Real, D> effects_dot(count);
-    Values<Real> dk(count), dy(count);
+    Values<Real> dk(count), dy(count), dn(count);
     Vectors<Real, D> dv(count), du(count), dkick;  // du: before the last iteration
     each_particle(count, model.threads, [&](std::size_t i) {
         effects_dot[i] = SurroundingsSlope<Real, D>(model, at.moments[i]).tangent(moments_dot[i]);
+        const Moments<Real, D>&of = at.moments[i], &change = moments_dot[i];
+        dn[i] = without_dot[i] + effects_dot[i].image * (of.images - of.behind) +
+                at.effects[i].image * (change.images - change.behind);
         const Real full = at.taken(model, state, i), dfull = full > 0 ? effects_dot[i].full : Real(0);
         dk[i] = dy[i] = dfull * state.k[i] + full * dot.k[i];
         dv[i] = dv_star[i] + dfull * state.kick[i] + full * dot.kick[i];
     });
     const auto divergence = [&](std::size_t i, const Vectors<Real, D>& u, const Vectors<Real, D>& change) {
         const Matrix<Real, D>&L = at.effects[i].L, &dL = effects_dot[i].L;
-        Real found = at.moments[i].gamma.dot(change[i]) + moments_dot[i].gamma.dot(u[i]);
+        Real found = at.effects[i].push.dot(change[i]) + effects_dot[i].push.dot(u[i]);
+        Real wide = 0, wide_dot = 0;
+        each_image(model, step.fluid, state.x, i, [&](const Image<Real, D>& image) {
+            const int j = image.other;
+            const Vector<Real, D> u_ij = u[i] - image.of(u[j]), dx_ij = dot.x[i] - image.of(dot.x[j]);
+            wide += image.gradient().dot(u_ij);
+            wide_dot += image.gradient().dot(change[i] - image.of(change[j])) + image.hessian_product(dx_ij).dot(u_ij);
+        });
+        found += model.volume * (at.effects[i].image * wide_dot + effects_dot[i].image * wide);
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Vector<Real, D> g = pair->gradient(), dg = pair->hessian_product(dot.x[i] - dot.x[j]);
@@ -118,13 +154,13 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         return found;
     };
     const auto wanted = [&](std::size_t i) {
-        const Real less = (at.effects[i].full - 1) * dn[i] - effects_dot[i].full * (1 - step.n[i]);
-        return step.n[i] < 1 ? Real(less / dt) : Real(0);
+        const Real less = (at.effects[i].full - 1) * dn[i] - effects_dot[i].full * (1 - at.n[i]);
+        return at.n[i] < 1 ? Real(less / dt) : Real(0);
     };
     const auto press = [&](const Values<Real>& y) {
-        dkick = pull_tangent(model, step, dot.x, moments_dot, effects_dot, y, dy);
+        dkick = pull_tangent(model, step, dot.x, effects_dot, y, dy);
         for (std::size_t i = 0; i < count; ++i) {
-            dkick[i] /= -m;
+            dkick[i] = -(dkick[i] + walled_tangent(model, step, state.x, dot.x, effects_dot, y, dy, i)) / m;
             dv[i] = dv_star[i] + dkick[i];
         }
     };
@@ -138,10 +174,10 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             change[i] = {dy[i], dr, effects_dot[i].shared, effects_dot[i].tension};
         });
         const Values<Real> dd = correction_tangent(model, at, before, dot.x, pushes_dot, change);
-        Vectors<Real, D> df = pull_tangent(model, step, dot.x, moments_dot, effects_dot, before.d, dd);
+        Vectors<Real, D> df = pull_tangent(model, step, dot.x, effects_dot, before.d, dd);
         Real climb = 0;
         for (std::size_t i = 0; i < count; ++i) {
-            df[i] /= -m;
+            df[i] = -(df[i] + walled_tangent(model, step, state.x, dot.x, effects_dot, before.d, dd, i)) / m;
             climb += change[i].r * before.d[i] + before.r[i] * dd[i] - 2 * before.alpha * m * before.f[i].dot(df[i]);
         }
         const Real dalpha = before.bends() ? Real(climb / before.energy) : Real(0);
@@ -155,7 +191,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         du = dv;
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
-            const Real b = at.wanted(model, i, step.n[i]), D_i = at.divergences[k][i], per = at.step_of(model, i);
+            const Real b = at.wanted(model, i, at.n[i]), D_i = at.divergences[k][i], per = at.step_of(model, i);
             const Real dD = divergence(i, at.u[k], du), db = wanted(i);
             const Real down = at.y[k][i] + per * D_i, dper = -per * change.a / of.a;
             const Clamp<Real> clamp(Real(at.y[k][i] + per * (D_i - b)), down);
@@ -192,13 +228,15 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
         each_particle(count, model.threads, [&](std::size_t i) {
             const Effects<Real, D>&of = at.effects[i], &change = effects_dot[i];
             const Real per = at.repair_step_of(model, k, i), excess = at.excess[k][i];
-            const Real dn_now = model.volume * weights_tangent(model, i, step, at.x_now[k], dx_now);
+            Real dn_now = model.volume * weights_tangent(model, i, step, at.x_now[k], dx_now);
+            dn_now += of.image * surplus_tangent(model, step.fluid, step.walls, at.x_now[k], dx_now, i);
+            dn_now += change.image * surplus(model, step.fluid, step.walls, at.x_now[k], i);
             const Real z = at.c[k][i] + per * excess, dz = dc[i] + per * (dn_now - change.a / of.a * excess);
             dc[i] = z < 0 ? Real(of.repaired * dz + change.repaired * z) : dz;
         });
         each_particle(count, model.threads, [&](std::size_t i) {
             const Values<Real>& c = at.c[k + 1];
-            Vector<Real, D> total = dc[i] * at.moments[i].gamma + c[i] * moments_dot[i].gamma;
+            Vector<Real, D> total = walled_tangent(model, step, state.x, dot.x, effects_dot, c, dc, i);
             for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
                 const int j = pair->other;
                 const Vector<Real, D> dg = pair->hessian_product(dot.x[i] - dot.x[j]);

@@ -2,6 +2,7 @@
 // shifted. docs/projection.md has the formulas, by the same letters.
 #pragma once
 
+#include "images.hpp"
 #include "stress.hpp"
 
 namespace cortado {
@@ -13,20 +14,23 @@ Scalar hundredths(int count) {
 }
 
 // M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m and g = sum g_ij of fluid; of walls the sums of g_ib, along their
-// normals and whole, gamma, which is between the two, and nu.
+// normals and whole, gamma, which is between the two, and nu, and of walls that mirror the sum along normals and nu; of
+// images sum V W.
 template <class Scalar, int D>
 struct Moments {
     Matrix<Scalar, D> M = Matrix<Scalar, D>::Constant(Scalar(0)), Q = M;
     Vector<Scalar, D> g = Vector<Scalar, D>::Constant(Scalar(0)), normal = g, whole = g, gamma = g;
-    Scalar nu{0};
+    Vector<Scalar, D> mirror = g;
+    Scalar nu{0}, behind{0}, images{0};
 };
 
 // What follows from them: L, the diagonal a, and how much tension is let through (sigma), how full it is (f), how much
-// is shifted and repaired, and its share c of a coarse pressure.
+// is shifted and repaired, its share c of a coarse pressure, how much images count (h), and along what walls push then.
 template <class Scalar, int D>
 struct Effects {
     Matrix<Scalar, D> L = Matrix<Scalar, D>::Constant(Scalar(0));
-    Scalar a{0}, tension{0}, full{0}, shifted{0}, repaired{0}, shared{0};
+    Scalar a{0}, tension{0}, full{0}, shifted{0}, repaired{0}, shared{0}, image{0};
+    Vector<Scalar, D> push = Vector<Scalar, D>::Constant(Scalar(0));
 };
 
 // 0 below a first number, 1 above a second one, and a cubic between them; numbers are in hundredths.
@@ -106,12 +110,26 @@ Scalar newton() {
     return hundredths<Scalar>(33) / Scalar(10);
 }
 
+// B of nu: 1, and 0 beside walls; and its derivative.
+template <class Scalar>
+struct Away {
+    Scalar value, slope;
+
+    explicit Away(const Scalar& nu) {
+        const Scalar one(1), ratio = nu / hundredths<Scalar>(5);
+        value = one / (one + ratio * ratio * ratio * ratio);
+        slope = Scalar(-4) * value * value * ratio * ratio * ratio / hundredths<Scalar>(5);
+    }
+};
+
 // The effects of moments, with what is between them.
 template <class Scalar, int D>
 struct Surroundings {
     Filling<Scalar, D> filling;
-    Smoothstep<Scalar> tension, full, corrected, shifted, repaired, shared;
-    Scalar away;              // B
+    Smoothstep<Scalar> tension, full, corrected, shifted, repaired, shared, image;
+    Away<Scalar> away, open;          // B of nu + 9 nu of walls that mirror, and of others alone
+    Scalar behind;                    // nu of walls that mirror + 1e-6
+    Vector<Scalar, D> leaning;        // gamma of others
     Scalar direction, lean;   // the denominators of N and C
     Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
     Matrix<Scalar, D> J, K, N, P, C;
@@ -128,15 +146,19 @@ struct Surroundings {
           corrected(filling.H, 20, 50),
           shifted(filling.H, 50, 80),
           repaired(filling.H, 80, 95),
-          shared(Scalar(filling.H + of.nu + of.nu), 70, 95) {
-        const Scalar one(1), m = model.rest_density, ratio = of.nu / hundredths<Scalar>(5);
+          shared(Scalar(filling.H + of.nu + of.nu), 70, 95),
+          image(Scalar(of.images / (of.behind + hundredths<Scalar>(1) / Scalar(10000))), 70, 90),
+          away(Scalar(of.nu + Scalar(9) * of.behind)),
+          open(Scalar(of.nu - of.behind)),
+          behind(of.behind + hundredths<Scalar>(1) / Scalar(10000)),
+          leaning(of.gamma - of.mirror) {
+        const Scalar one(1), m = model.rest_density;
         const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
-        away = one / (one + ratio * ratio * ratio * ratio);
         J = regular_inverse<Scalar, D>(of.M);
         late = newton<Scalar>() * J * (J - unit);
         K = J + repaired.value * late;
-        direction = of.gamma.dot(of.gamma) + hundredths<Scalar>(1) * model.least_diagonal;
-        N = of.gamma * of.gamma.transpose() / direction;
+        direction = leaning.dot(leaning) + hundredths<Scalar>(1) * model.least_diagonal;
+        N = leaning * leaning.transpose() / direction;
         lean = of.M.cwiseProduct(N).sum() + hundredths<Scalar>(5);
         const Matrix<Scalar, D> across = (unit - N) * of.M * N;
         C = hundredths<Scalar>(105) / lean * (across + across.transpose());
@@ -144,15 +166,17 @@ struct Surroundings {
         below = of.M.cwiseProduct(P).sum() / Scalar(D - 1) + hundredths<Scalar>(5);
         lack = hundredths<Scalar>(20) * (hundredths<Scalar>(105) / below - one);
         beside = lack * P - (one + lack) * C;
-        bare = away * (K - unit) + (one - away) * beside;
+        bare = away.value * (K - unit) + (one - open.value) * beside;
         found.L = unit + corrected.value * bare;
         own = found.L * of.g + of.gamma;
         found.a = (own.dot(own) + model.least_diagonal) / m + (found.L * found.L).cwiseProduct(of.Q).sum();
-        found.tension = tension.value * away;
+        found.tension = tension.value * away.value;
         found.full = full.value;
         found.shifted = shifted.value;
-        found.repaired = repaired.value * away;
+        found.repaired = repaired.value * away.value;
         found.shared = shared.value;
+        found.image = image.value;
+        found.push = of.gamma - image.value * of.mirror;
     }
 };
 

@@ -23,16 +23,17 @@ class SurroundingsSlope {
 public:
     SurroundingsSlope(const Model<Real, D>& model, const Moments<Real, D>& of)
         : m_(model.rest_density), of_(of), at_(model, of) {
-        const Real ratio = of.nu / hundredths<Real>(5);
-        away_slope_ = -4 * at_.away * at_.away * ratio * ratio * ratio / hundredths<Real>(5);
         lack_slope_ = -hundredths<Real>(21) / (at_.below * at_.below * (D - 1));
-        mixed_ = at_.K - Matrix<Real, D>::Identity() - at_.beside;
+        inner_ = at_.K - Matrix<Real, D>::Identity();
     }
 
     Effects<Real, D> tangent(const Moments<Real, D>& dot) const {
-        const Real dH = at_.filling.slope.cwiseProduct(dot.M).sum(), dB = away_slope_ * dot.nu;
-        const Matrix<Real, D> grown = of_.gamma * dot.gamma.transpose() + dot.gamma * of_.gamma.transpose();
-        const Matrix<Real, D> dN = (grown - 2 * of_.gamma.dot(dot.gamma) * at_.N) / at_.direction;
+        const Real dH = at_.filling.slope.cwiseProduct(dot.M).sum(), dB = at_.away.slope * (dot.nu + 9 * dot.behind);
+        const Real open_dot = at_.open.slope * (dot.nu - dot.behind);
+        const Vector<Real, D>& leaning = at_.leaning;
+        const Vector<Real, D> leaning_dot = dot.gamma - dot.mirror;
+        const Matrix<Real, D> grown = leaning * leaning_dot.transpose() + leaning_dot * leaning.transpose();
+        const Matrix<Real, D> dN = (grown - 2 * leaning.dot(leaning_dot) * at_.N) / at_.direction;
         const Matrix<Real, D> across = at_.P * dot.M * at_.N + at_.P * of_.M * dN - dN * of_.M * at_.N;
         const Real lean_dot = dot.M.cwiseProduct(at_.N).sum() + of_.M.cwiseProduct(dN).sum();
         const Matrix<Real, D> dC = (hundredths<Real>(210) * even<Real, D>(across) - lean_dot * at_.C) / at_.lean;
@@ -40,18 +41,21 @@ public:
             of_inverse(inverse_change<Real, D>(at_.J, dot.M)) + at_.repaired.slope * dH * at_.late;
         const Real lack_dot = lack_slope_ * (dot.M.cwiseProduct(at_.P).sum() - of_.M.cwiseProduct(dN).sum());
         const Matrix<Real, D> beside_dot = lack_dot * (at_.P - at_.C) - at_.lack * dN - (1 + at_.lack) * dC;
-        const Matrix<Real, D> change = dB * mixed_ + at_.away * dK + (1 - at_.away) * beside_dot;
+        const Matrix<Real, D> change = dB * inner_ - open_dot * at_.beside + at_.away.value * dK +
+                                       (1 - at_.open.value) * beside_dot;
         Effects<Real, D> found;
         found.L = at_.corrected.slope * dH * at_.bare + at_.corrected.value * change;
         const Vector<Real, D> own_dot = found.L * of_.g + at_.found.L * dot.g + dot.gamma;
         const Matrix<Real, D> square = at_.found.L * at_.found.L, turned = of_.Q * at_.found.L;
         found.a = 2 * at_.own.dot(own_dot) / m_ + 2 * found.L.cwiseProduct(turned).sum() +
                   square.cwiseProduct(dot.Q).sum();
-        found.tension = at_.tension.slope * dH * at_.away + at_.tension.value * dB;
+        found.tension = at_.tension.slope * dH * at_.away.value + at_.tension.value * dB;
         found.full = at_.full.slope * (dH + dot.nu);
         found.shifted = at_.shifted.slope * dH;
-        found.repaired = at_.repaired.slope * dH * at_.away + at_.repaired.value * dB;
+        found.repaired = at_.repaired.slope * dH * at_.away.value + at_.repaired.value * dB;
         found.shared = at_.shared.slope * (dH + 2 * dot.nu);
+        found.image = at_.image.slope * (dot.images - of_.images / at_.behind * dot.behind) / at_.behind;
+        found.push = dot.gamma - at_.image.value * dot.mirror - found.image * of_.mirror;
         return found;
     }
 
@@ -64,22 +68,29 @@ public:
         const Matrix<Real, D> L_bar = even<Real, D>(bar.L + by_a), bare_bar = at_.corrected.value * L_bar;
         found.Q = bar.a * L * L;
         found.g = L * own_bar;
-        const Matrix<Real, D> K_bar = at_.away * bare_bar;
+        const Matrix<Real, D> K_bar = at_.away.value * bare_bar;
         const Real H_bar = at_.corrected.slope * L_bar.cwiseProduct(at_.bare).sum() +
-                           at_.tension.slope * at_.away * bar.tension + at_.full.slope * bar.full +
-                           at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away * bar.repaired +
+                           at_.tension.slope * at_.away.value * bar.tension + at_.full.slope * bar.full +
+                           at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away.value * bar.repaired +
                            at_.repaired.slope * K_bar.cwiseProduct(at_.late).sum() + at_.shared.slope * bar.shared;
-        const Real B_bar = bare_bar.cwiseProduct(mixed_).sum() + at_.tension.value * bar.tension +
+        const Real B_bar = bare_bar.cwiseProduct(inner_).sum() + at_.tension.value * bar.tension +
                            at_.repaired.value * bar.repaired;
-        found.nu = away_slope_ * B_bar + at_.full.slope * bar.full + 2 * at_.shared.slope * bar.shared;
-        const Matrix<Real, D> beside_bar = (1 - at_.away) * bare_bar, C_bar = -(1 + at_.lack) * beside_bar;
+        const Real by_away = at_.away.slope * B_bar;
+        const Real by_open = -at_.open.slope * bare_bar.cwiseProduct(at_.beside).sum();
+        const Real image_bar = bar.image - of_.mirror.dot(bar.push);
+        found.images = at_.image.slope * image_bar / at_.behind;
+        found.behind = 9 * by_away - by_open - of_.images / at_.behind * found.images;
+        found.nu = by_away + by_open + at_.full.slope * bar.full + 2 * at_.shared.slope * bar.shared;
+        const Matrix<Real, D> beside_bar = (1 - at_.open.value) * bare_bar, C_bar = -(1 + at_.lack) * beside_bar;
         const Matrix<Real, D> across_bar = hundredths<Real>(210) / at_.lean * C_bar;
         const Real lacked = lack_slope_ * beside_bar.cwiseProduct(at_.P - at_.C).sum();
         const Real lean_bar = -C_bar.cwiseProduct(at_.C).sum() / at_.lean;
         const Matrix<Real, D> N_bar = even<Real, D>(of_.M * at_.P * across_bar - across_bar * at_.N * of_.M) +
                                       (lean_bar - lacked) * of_.M - at_.lack * beside_bar;
         const Real along = N_bar.cwiseProduct(at_.N).sum();
-        found.gamma = own_bar + 2 / at_.direction * (N_bar * of_.gamma - along * of_.gamma);
+        const Vector<Real, D> leaning_bar = 2 / at_.direction * (N_bar * at_.leaning - along * at_.leaning);
+        found.gamma = own_bar + leaning_bar + bar.push;
+        found.mirror = -leaning_bar - at_.image.value * bar.push;
         found.M = H_bar * at_.filling.slope + inverse_change<Real, D>(at_.J, of_inverse(K_bar)) +
                   even<Real, D>(at_.P * across_bar * at_.N) + lean_bar * at_.N + lacked * at_.P;
         return found;
@@ -94,8 +105,8 @@ private:
     Real m_;
     Moments<Real, D> of_;
     Surroundings<Real, D> at_;
-    Matrix<Real, D> mixed_;  // K - 1 - t P + (1 + t) C
-    Real away_slope_, lack_slope_;  // of B by nu, of t by M : P
+    Matrix<Real, D> inner_;  // K - 1
+    Real lack_slope_;        // of t by M : P
 };
 
 // What the shift of a particle depends on but moments, and also a change of that and an adjoint.

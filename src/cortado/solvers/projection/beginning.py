@@ -49,7 +49,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         k_before: wp.array(dtype=real),
         kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
-        gamma: wp.array(dtype=vector),
+        beside: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
         # out
         k: wp.array(dtype=real),
@@ -59,7 +59,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     ):
         """``warm`` is 0 for each scene before."""
         i = wp.tid()
-        full = weights[i][1] * taken(kick_before[i], gamma[i], time_step[i // particles], spacing)
+        full = weights[i][1] * taken(kick_before[i], beside[i], time_step[i // particles], spacing)
         first = full * k_before[i]
         k[i] = first
         y[i] = first
@@ -75,7 +75,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         k_before: wp.array(dtype=real),
         kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
-        gamma: wp.array(dtype=vector),
+        beside: wp.array(dtype=vector),
         dot: bundle(k_before=real, kick_before=vector, weights=weights4, v_star=vector),
         # out
         k_dot: wp.array(dtype=real),
@@ -83,7 +83,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         u_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        part = taken(kick_before[i], gamma[i], time_step[i // particles], spacing)
+        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
         full, full_dot = part * weights[i][1], part * dot.weights[i][1]
         first = full_dot * k_before[i] + full * dot.k_before[i]
         k_dot[i] = first
@@ -98,7 +98,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         k_before: wp.array(dtype=real),
         kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
-        gamma: wp.array(dtype=vector),
+        beside: wp.array(dtype=vector),
         k_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         u_bar: wp.array(dtype=vector),
@@ -111,7 +111,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     ):
         """``v_bar`` is the adjoint of v*."""
         i = wp.tid()
-        part = taken(kick_before[i], gamma[i], time_step[i // particles], spacing)
+        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
         bar, full, no = k_bar[i] + y_bar[i], part * weights[i][1], real(0.0)
         k_before_bar[i] = full * bar
         kick_before_bar[i] = full * u_bar[i]

@@ -13,6 +13,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.coarse_hats import source_type
 from cortado.solvers.projection.effects import weights_type
+from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, symmetric
@@ -34,10 +35,13 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
     gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
     packed, wanted = symmetric(precision), clamp_functions(precision).wanted
     six, pack, topic = packed.kind, packed.pack, f"projection_{dimension}d"
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "weights")}
+    own = {
+        name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "weights", "image")
+    }
     seen = bundle(**own, coarse=real)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -66,10 +70,11 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         """A and the divergence are written to ``at``."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
+        widened = spread(i, x, at.u, s)
         if lane() > 0:
             return
         A = wp.matrix_from_rows(row_x, row_y, row_z)
-        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
+        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i] + of.image[i] * widened
         left = D - wanted(n[i], of.weights[i][1], time_step[i // s.particles])
         left *= counts(at.y[i], of.weights[i][0], left)
         at.A[i] = A
@@ -97,11 +102,13 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
     ):
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
+        widened, widened_dot = spread(i, x, at.u, s), spread_tangent(i, x, x_dot, at.u, dot.u, s)
         if lane() > 0:
             return
         member = i // s.particles
         D_dot = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + wp.ddot(dot.L[i], at.A[i]) - dot.drift[i]
         D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        D_dot += of.image[i] * widened_dot + dot.image[i] * widened
         dt, full = time_step[member], of.weights[i][1]
         b = wanted(n[i], full, dt)
         b_dot = -b * time_step_dot[member] / dt

@@ -94,7 +94,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "gamma", "coarse")}
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "beside", "coarse")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -118,7 +118,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         total, row_x, row_y, row_z = push(i, x, T, s)
         if lane() > 0:
             return
-        h[i] = total + times(T[i], of.g[i]) + of.coarse[i] * of.gamma[i]
+        h[i] = total + times(T[i], of.g[i]) + of.coarse[i] * of.beside[i]
         N[i] = wp.matrix_from_rows(row_x, row_y, row_z)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
@@ -145,7 +145,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         if lane() > 0:
             return
         own_part = times(T_dot[i], of.g[i]) + times(T[i], dot.g[i])
-        own_part += dot.coarse[i] * of.gamma[i] + of.coarse[i] * dot.gamma[i]
+        own_part += dot.coarse[i] * of.beside[i] + of.coarse[i] * dot.beside[i]
         h_dot[i] = total + own_part
         N_dot[i] = wp.matrix_from_rows(row_x, row_y, row_z)
 
@@ -168,8 +168,8 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         T_bar = whole(diagonal, others) + real(0.5) * (wp.outer(f, g) + wp.outer(g, f))
         bar.x[i] = bar.x[i] + x_part
         bar.L[i] = bar.L[i] + c * T_bar
-        bar.coarse[i] = bar.coarse[i] + wp.ddot(of.L[i], T_bar) + wp.dot(of.gamma[i], f)
+        bar.coarse[i] = bar.coarse[i] + wp.ddot(of.L[i], T_bar) + wp.dot(of.beside[i], f)
         bar.g[i] = bar.g[i] + times(T[i], f)
-        bar.gamma[i] = bar.gamma[i] + c * f
+        bar.beside[i] = bar.beside[i] + c * f
 
     return Kernels((pull, coarse_push), (pull_tangent, coarse_push_tangent), (pull, coarse_push_adjoint))

@@ -2,15 +2,17 @@
 
 With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.beside`,
 the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 +
-(nu / 0.05)^4), which is 0 beside walls:
+((nu + 9 nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror
+(`cortado.solvers.projection.images`):
 
     sigma = S(0.1, 0.5) B    how much tension is let through,
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,
     c = S(0.7, 0.95) of H + 2 nu   its share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
-    L = I + c (B (K - I) + (1 - B) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
+    L = I + c (B (K - I) + (1 - B_o) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
     K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
+    B_o = 1 / (1 + ((nu - nu_m) / 0.05)^4), beside walls that do not mirror, whose gamma C is made of,
     C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
@@ -32,6 +34,9 @@ SHARED = (0.7, 0.95)
 """The same of the share of a coarse pressure, of H + 2 nu."""
 WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
+MIRRORED = 9.0
+"""How many times more walls that mirror count in B. Images make up for what is missing beside them, which K would make
+up for too, and a block that falls from a lid has no tension to an image of its own."""
 REGULAR = 0.05
 """What is added to the diagonal of M before it is inverted."""
 NEWTON = 0.033
@@ -56,9 +61,9 @@ class EffectFunctions:
     """Warp functions of one particle."""
 
     weights: Any
-    """(sigma, f, u, r) of M and nu."""
+    """(sigma, f, u, r) of M, nu and that of walls that mirror."""
     correction: Any
-    """L of M, gamma, nu and 0.05 a_0."""
+    """L of M, gamma, nu, the parts of both that are of walls that mirror, and 0.05 a_0."""
     inverse: Any
     """1.05 (M + 0.05 I)^-1"""
     diagonal: Any
@@ -66,7 +71,8 @@ class EffectFunctions:
     share: Any
     """c of M and nu."""
     back: Any
-    """The adjoints of M, Q, g, gamma, nu and m for those of L, a, the weights and c."""
+    """The adjoints of M, Q, g, gamma, that of walls that mirror, nu, that of those walls and m, for those of L, a, the
+    weights and c."""
 
 
 @cache
@@ -77,6 +83,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)
     regular, newton, walled = (wp.constant(real(value)) for value in (REGULAR, NEWTON, WALLED))
+    mirrored = wp.constant(real(MIRRORED))
     along, direction = (wp.constant(real(value)) for value in (ALONG, DIRECTION))
     besides, axes = (wp.constant(real(value)) for value in (3 - dimension, dimension - 1))
     (t_0, t_1), (c_0, c_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (TENSION, CORRECTED))
@@ -99,8 +106,8 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         return (real(1.0) + regular) * invert(M + regular * unit())
 
     @wp.func
-    def weights(M: matrix, nu: real) -> weights4:
-        H, B = fullness(M), away(nu)
+    def weights(M: matrix, nu: real, behind: real) -> weights4:
+        H, B = fullness(M), away(nu + mirrored * behind)
         full, walled_in = smoothstep(H, t_0, t_1), smoothstep(H + nu, t_0, t_1)
         return weights4(full * B, walled_in, smoothstep(H, u_0, u_1), smoothstep(H, r_0, r_1) * B)
 
@@ -115,10 +122,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         return t * P - (real(1.0) + t) * C
 
     @wp.func
-    def correction(M: matrix, gamma: vector, nu: real, least: real) -> matrix:
-        H, B, J = fullness(M), away(nu), inverse(M)
+    def correction(M: matrix, gamma: vector, mirror: vector, nu: real, behind: real, least: real) -> matrix:
+        H, B, J = fullness(M), away(nu + mirrored * behind), inverse(M)
         K = J + (newton * smoothstep(H, r_0, r_1)) * (J * (J - unit()))
-        beside = (real(1.0) - B) * walled_correction(M, gamma, least)
+        beside = (real(1.0) - away(nu - behind)) * walled_correction(M, gamma - mirror, least)
         return unit() + smoothstep(H, c_0, c_1) * (B * (K - unit()) + beside)
 
     @wp.func
@@ -137,7 +144,9 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         Q: matrix,
         g: vector,
         gamma: vector,
+        mirror: vector,
         nu: real,
+        behind: real,
         m: real,
         least: real,
         L_bar: matrix,
@@ -145,8 +154,8 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         weights_bar: weights4,
         share_bar: real,
     ) -> real:
-        L = correction(M, gamma, nu, least)
-        total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu), weights_bar) + share_bar * share(M, nu)
+        L = correction(M, gamma, mirror, nu, behind, least)
+        total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu, behind), weights_bar) + share_bar * share(M, nu)
         return total + a_bar * diagonal(L, Q, g, gamma, m, least)
 
     @wp.func(module=module)
@@ -155,7 +164,9 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         Q: matrix,
         g: vector,
         gamma: vector,
+        mirror: vector,
         nu: real,
+        behind: real,
         m: real,
         least: real,
         L_bar: matrix,
@@ -163,10 +174,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         weights_bar: weights4,
         share_bar: real,
     ):
-        by_M, by_Q, by_g, by_gamma, by_nu, by_m, _least, _L, _a, _w, _c = wp.grad(work)(
-            M, Q, g, gamma, nu, m, least, L_bar, a_bar, weights_bar, share_bar
+        by_M, by_Q, by_g, by_gamma, by_mirror, by_nu, by_behind, by_m, _least, _L, _a, _w, _c = wp.grad(work)(
+            M, Q, g, gamma, mirror, nu, behind, m, least, L_bar, a_bar, weights_bar, share_bar
         )
         M_bar, Q_bar = real(0.5) * (by_M + wp.transpose(by_M)), real(0.5) * (by_Q + wp.transpose(by_Q))
-        return M_bar, Q_bar, by_g, by_gamma, by_nu, by_m
+        return M_bar, Q_bar, by_g, by_gamma, by_mirror, by_nu, by_behind, by_m
 
     return EffectFunctions(weights, correction, inverse, diagonal, share, back)

@@ -28,6 +28,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Parameters, State
 from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.derivatives import ProjectionAdjoint
+from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
@@ -60,10 +61,11 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, packed = neighbourhood_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
+    spread = image_sums(discretisation).spread
     gradient, clamp = projection_sums(discretisation).velocity_gradient, clamp_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, "fixed_point")
-    used = ("L", "gamma", "drift", "a", "weights")
+    used = ("L", "gamma", "drift", "a", "weights", "image")
     seen = bundle(**{name: kind for name, kind in entries(precision).items() if name in used})
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -84,11 +86,12 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def linearise(
-        particles: int,
+        s: neighbourhood,
         omega: real,
         time_step: wp.array(dtype=real),
         n: wp.array(dtype=real),
         of: seen,
+        x: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
         A: wp.array(dtype=matrix),
         y: wp.array(dtype=real),
@@ -100,10 +103,13 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         w: wp.array(dtype=real),
         r: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid() // LANES
+        widened = spread(i, x, u, s)
+        if lane() > 0:
+            return
         a = of.a[i]
-        D = wp.ddot(of.L[i], A[i]) + wp.dot(of.gamma[i], u[i]) - of.drift[i]
-        b = wanted(n[i], of.weights[i][1], time_step[i // particles])
+        D = wp.ddot(of.L[i], A[i]) + wp.dot(of.gamma[i], u[i]) - of.drift[i] + of.image[i] * widened
+        b = wanted(n[i], of.weights[i][1], time_step[i // s.particles])
         per = omega / a
         rise, fall = parts(y[i] + per * (D - b), y[i] + per * D)
         c = rise + fall * of.weights[i][0]
@@ -132,9 +138,10 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         """``u`` is -D^T y / m."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, u, s)
+        widened = spread(i, x, u, s)
         if lane() > 0:
             return
-        total = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z))
+        total = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + of.image[i] * widened
         found = rest[i] * p[i] - root[i] * (total + wp.dot(of.gamma[i], u[i]))
         product[i] = found / w[i]
         share[i] = p[i] * found

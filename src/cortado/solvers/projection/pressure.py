@@ -5,6 +5,8 @@ With k = dt p, the divergence D, in which walls that move have velocities v_b, a
     (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
+and what images add to both (`cortado.solvers.projection.images`),
+
 an iteration from y, an extrapolation of k (Nesterov 1983), is
 
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
@@ -28,6 +30,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.effects import weights_type
+from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, symmetric
@@ -52,12 +55,18 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     packed, matrix = symmetric(precision), matrix_type(precision)
     six, pack = packed.kind, packed.pack
+    mirrors = image_sums(discretisation)
+    spread, spread_tangent, lift, lift_back = mirrors.spread, mirrors.spread_tangent, mirrors.lift, mirrors.lift_back
     gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     weights4 = weights_type(precision)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "a", "weights")}
+    own = {
+        name: kind
+        for name, kind in entries(precision).items()
+        if name in ("L", "gamma", "drift", "a", "weights", "image")
+    }
     seen = bundle(**own)
     bars = bundle(x=vector, n=real, time_step=real, **own)
     iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
@@ -85,10 +94,11 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         inside and beside walls and 0 at free surfaces, and c. A and the divergence are written to ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
+        widened = spread(i, x, at.u, s)
         if lane() > 0:
             return
         dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
-        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
+        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i] + of.image[i] * widened
         b = wanted(n[i], of.weights[i][1], dt)
         per = omega / of.a[i]
         up = at.y[i] + per * (D - b)
@@ -130,12 +140,14 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     ):
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
+        widened, widened_dot = spread(i, x, at.u, s), spread_tangent(i, x, x_dot, at.u, dot.u, s)
         if lane() > 0:
             return
         member, change_of_A = i // s.particles, wp.matrix_from_rows(row_x, row_y, row_z)
         dt = time_step[member]
         D_dot = wp.ddot(of.L[i], change_of_A) + wp.ddot(dot.L[i], at.A[i]) - dot.drift[i]
         D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        D_dot += of.image[i] * widened_dot + dot.image[i] * widened
         out.A_dot[i] = change_of_A
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
@@ -223,12 +235,15 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         ):
             i = s.first + wp.tid() // LANES
             u_part, x_part = back(i, x, u, S, s)
+            u_lift = lift(i, x, d_bar, of.image, s)
+            widened, x_lift = lift_back(i, x, d_bar, of.image, u, s)
             if lane() > 0:
                 return
             bar.L[i] = bar.L[i] + (real(0.5) * d_bar[i]) * (A[i] + wp.transpose(A[i]))
             bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
-            bar.x[i] = bar.x[i] + x_part
-            u_bar[i] = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
+            bar.image[i] = bar.image[i] + d_bar[i] * widened
+            bar.x[i] = bar.x[i] + x_part + x_lift
+            u_bar[i] = u_part + u_lift + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
 
         divergence_adjoint.__qualname__ = f"pressure_kernels.<locals>.{name}"
         return wp.kernel(module=adjoint_module, enable_backward=False)(divergence_adjoint)

@@ -144,7 +144,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     shift_of = shift_functions(precision, dimension, module).shift
     along = shift_functions(precision, dimension, tangent_module).back
     back = shift_functions(precision, dimension, adjoint_module).back
-    names = ("M", "g", "crowd", "apart", "gamma", "weights")
+    names = ("M", "g", "crowd", "apart", "beside", "weights")
     own = {name: kind for name, kind in entries(precision).items() if name in names}
     seen = bundle(**own)
 
@@ -168,7 +168,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
             of.apart[i],
             of.M[i],
             of.g[i],
-            of.gamma[i],
+            of.beside[i],
             of.weights[i],
             k[i],
             m[i],
@@ -203,7 +203,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
                 of.apart[i],
                 of.M[i],
                 of.g[i],
-                of.gamma[i],
+                of.beside[i],
                 of.weights[i],
                 k[i],
                 m[i],
@@ -212,7 +212,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
                 unit,
             )
             entry = wp.ddot(by_A, dot.A[i]) + wp.dot(by_crowd, dot.crowd[i]) + wp.ddot(by_M, dot.M[i])
-            entry += wp.dot(by_apart, dot.apart[i]) + wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i])
+            entry += wp.dot(by_apart, dot.apart[i]) + wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.beside[i])
             entry += wp.dot(by_weights, dot.weights[i])
             total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
         delta_dot[i] = total
@@ -237,7 +237,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
             of.apart[i],
             of.M[i],
             of.g[i],
-            of.gamma[i],
+            of.beside[i],
             of.weights[i],
             k[i],
             m[i],
@@ -250,7 +250,7 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         bar.apart[i] = bar.apart[i] + by_apart
         bar.M[i] = bar.M[i] + by_M
         bar.g[i] = bar.g[i] + by_g
-        bar.gamma[i] = bar.gamma[i] + by_gamma
+        bar.beside[i] = bar.beside[i] + by_gamma
         bar.weights[i] = bar.weights[i] + by_weights
         bar.k[i] = bar.k[i] + by_k
         bar.m[i] = bar.m[i] + by_m

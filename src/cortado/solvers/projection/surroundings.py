@@ -14,6 +14,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.beside import beside_sums, edge_functions
 from cortado.solvers.projection.effects import effect_functions, weights_type
+from cortado.solvers.projection.images import image_share, image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
@@ -23,6 +24,7 @@ def entries(precision: Precision) -> dict[str, Any]:
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
+    own |= {"beside": vector, "mirror": vector, "behind": real, "images": real, "image": real}
     own |= {"crowd": vector, "apart": vector, "L": matrix, "a": real}
     return {**own, "weights": weights_type(precision), "coarse": real}
 
@@ -42,6 +44,10 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     moments, moments_tangent, moments_back = sums.moments, sums.moments_tangent, sums.moments_back
     walls = beside_sums(discretisation)
     beside, beside_tangent, beside_back = walls.sums, walls.tangent, walls.back
+    mirrors = image_sums(discretisation)
+    image_weights, image_weights_tangent, echo = mirrors.weights, mirrors.weights_tangent, mirrors.echo
+    mirror_walls, mirror_walls_tangent, mirror_walls_back = mirrors.walls, mirrors.walls_tangent, mirrors.walls_back
+    mirror_of = mirrors.mirror_of
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -54,6 +60,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     edge = edge_functions(precision, dimension, module).edge
     edge_along = edge_functions(precision, dimension, tangent_module).back
     edge_back = edge_functions(precision, dimension, adjoint_module).back
+    image_of = image_share(precision, dimension, module)[0]
+    image_along = image_share(precision, dimension, tangent_module)[1]
+    image_back = image_share(precision, dimension, adjoint_module)[1]
     around, bars = bundle(**entries(precision)), bundle(**bar_entries(precision))
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
@@ -74,18 +83,25 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
+        images = image_weights(i, x, s)
+        mirror, behind = mirror_walls(i, x, mirror_of(x[i], s), s)
         if lane() > 0:
             return
-        e = edge(normal, entire, least)
+        e, h = edge(normal, entire, least), image_of(images, behind)
         gamma = normal + e * (entire - normal)
         M, Q = whole(diagonal, others), change(square, mixed)
-        L = correction_of(M, gamma, nu, least)
-        n[i] = s.volume * real(1 - s.filling[i]) * s.self_weight + near + nu
+        L = correction_of(M, gamma, mirror, nu, behind, least)
+        n[i] = s.volume * real(1 - s.filling[i]) * s.self_weight + near + nu + h * (images - behind)
         of.M[i] = M
         of.Q[i] = Q
         of.g[i] = g
-        of.gamma[i] = gamma
+        of.gamma[i] = gamma - h * mirror
+        of.beside[i] = gamma
+        of.mirror[i] = mirror
         of.nu[i] = nu
+        of.behind[i] = behind
+        of.images[i] = images
+        of.image[i] = h
         of.drift[i] = normal_drift + e * (whole_drift - normal_drift)
         of.normal[i] = normal
         of.whole[i] = entire
@@ -96,7 +112,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.crowd[i] = crowd
         of.apart[i] = apart
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
-        of.weights[i] = weights_of(M, nu)
+        of.weights[i] = weights_of(M, nu, behind)
         of.coarse[i] = share_of(M, nu)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
@@ -122,16 +138,20 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
             i, x, x_dot, m, m_dot, per_nearest, per_apart, s
         )
         normal_dot, whole_dot, nu_i_dot, normal_drift_dot, whole_drift_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
+        images_i_dot = image_weights_tangent(i, x, x_dot, s)
+        mirror_i_dot, behind_i_dot = mirror_walls_tangent(i, x, x_dot, mirror_of(x[i], s), s)
         if lane() > 0:
             return
         e, off = of.edge[i], of.whole[i] - of.normal[i]
         by_normal, by_whole = edge_along(of.normal[i], of.whole[i], least, real(1.0))
         e_dot = wp.dot(by_normal, normal_dot) + wp.dot(by_whole, whole_dot)
+        by_images, by_behind = image_along(of.images[i], of.behind[i])
+        h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot
         gamma_i_dot = normal_dot + e * (whole_dot - normal_dot) + e_dot * off
         drift_i_dot = normal_drift_dot + e * (whole_drift_dot - normal_drift_dot)
         drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
-        M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i]
+        M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.beside[i], of.nu[i], m[i]
         L_dot, weights_dot, a_dot, coarse_dot = matrix(), weights4(), real(0.0), real(0.0)
         count = int(15)  # not a number: Warp would write the gradient out for each
         for k in range(count):
@@ -144,11 +164,12 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
                 a_unit = real(1.0)
             else:
                 coarse_unit = real(1.0)
-            by_M, by_Q, by_g, by_gamma, by_nu, by_m = along(
-                M, Q, g, gamma, nu, m_i, least, L_unit, a_unit, weights_unit, coarse_unit
+            by_M, by_Q, by_g, by_gamma, by_mirror, by_nu, by_walls, by_m = along(
+                M, Q, g, gamma, of.mirror[i], nu, of.behind[i], m_i, least, L_unit, a_unit, weights_unit, coarse_unit
             )
             entry = wp.ddot(by_M, M_i_dot) + wp.ddot(by_Q, Q_i_dot) + wp.dot(by_g, g_i_dot)
             entry += wp.dot(by_gamma, gamma_i_dot) + by_nu * nu_i_dot + by_m * m_dot[i]
+            entry += wp.dot(by_mirror, mirror_i_dot) + by_walls * behind_i_dot
             if k < 9:
                 L_dot[k // 3, k % 3] = entry
             elif k < 13:
@@ -157,11 +178,13 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
                 a_dot = entry
             else:
                 coarse_dot = entry
-        n_dot[i] = near_dot + nu_i_dot
+        n_dot[i] = near_dot + nu_i_dot + h * (images_i_dot - behind_i_dot) + h_dot * (of.images[i] - of.behind[i])
         dot.M[i] = M_i_dot
         dot.Q[i] = Q_i_dot
         dot.g[i] = g_i_dot
-        dot.gamma[i] = gamma_i_dot
+        dot.gamma[i] = gamma_i_dot - h * mirror_i_dot - h_dot * of.mirror[i]
+        dot.beside[i] = gamma_i_dot
+        dot.image[i] = h_dot
         dot.nu[i] = nu_i_dot
         dot.drift[i] = drift_i_dot
         dot.edge[i] = e_dot
@@ -187,16 +210,33 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         """Of what follows from the moments: adds to the adjoints of them."""
         i = wp.tid()
-        gamma = of.gamma[i]
-        M_bar, Q_bar, g_bar, gamma_bar, nu_bar, m_i_bar = back(
-            of.M[i], of.Q[i], of.g[i], gamma, of.nu[i], m[i], least, bar.L[i], bar.a[i], bar.weights[i], bar.coarse[i]
+        M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
+            of.M[i],
+            of.Q[i],
+            of.g[i],
+            of.beside[i],
+            of.mirror[i],
+            of.nu[i],
+            of.behind[i],
+            m[i],
+            least,
+            bar.L[i],
+            bar.a[i],
+            bar.weights[i],
+            bar.coarse[i],
         )
         m_bar[i] = m_bar[i] + m_i_bar
         M_pull[i] = pack(bar.M[i] + M_bar)
         Q_pull[i] = pack(Q_bar)
         bar.g[i] = bar.g[i] + g_bar
         bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i]
-        push_bar, drift_bar, e = bar.gamma[i] + gamma_bar, bar.drift[i], of.edge[i]
+        h, h_bar = of.image[i], bar.image[i] - wp.dot(bar.gamma[i], of.mirror[i])
+        h_bar += n_bar[i] * (of.images[i] - of.behind[i])
+        by_images, by_behind = image_back(of.images[i], of.behind[i])
+        bar.mirror[i] = mirror_bar - h * bar.gamma[i]
+        bar.images[i] = h * n_bar[i] + by_images * h_bar
+        bar.behind[i] = behind_bar - h * n_bar[i] + by_behind * h_bar
+        push_bar, drift_bar, e = bar.gamma[i] + bar.beside[i] + gamma_bar, bar.drift[i], of.edge[i]
         e_bar = bar.edge[i] + wp.dot(push_bar, of.whole[i] - of.normal[i])
         e_bar += drift_bar * (of.whole_drift[i] - of.normal_drift[i])
         normal_bar, whole_bar = edge_back(of.normal[i], of.whole[i], least, e_bar)
@@ -226,6 +266,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
             i, x, m, M_pull, Q_pull, bar.g, bar.crowd, bar.apart, n_bar, per_nearest, per_apart, s
         )
         wall_part = beside_back(i, x, v, bar.normal, bar.whole, bar.nu, bar.normal_drift, bar.whole_drift, s)
+        wall_part += mirror_walls_back(i, x, bar.mirror, bar.behind, mirror_of(x[i], s), s) + echo(i, x, bar.images, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_part + wall_part

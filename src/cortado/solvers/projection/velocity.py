@@ -9,6 +9,7 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
@@ -35,14 +36,16 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     force, force_tangent, force_back = sums.force, sums.force_tangent, sums.force_back
+    mirrors = image_sums(discretisation)
+    lift, lift_tangent, lift_back = mirrors.lift, mirrors.lift_tangent, mirrors.lift_back
     packed = symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma")}
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "image")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
-    pulled = bundle(y=real, T=six, g=vector, gamma=vector)
+    pulled = bundle(y=real, T=six, g=vector, gamma=vector, image=real)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
@@ -55,6 +58,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         T: wp.array(dtype=six),
         g: wp.array(dtype=vector),
         gamma: wp.array(dtype=vector),
+        image: wp.array(dtype=real),
         v_star: wp.array(dtype=vector),
         # out
         kick: wp.array(dtype=vector),
@@ -62,7 +66,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     ):
         """T is y L, and ``kick`` -D^T y / m."""
         i = s.first + wp.tid() // LANES
-        total = force(i, x, T, s)
+        total = force(i, x, T, s) + lift(i, x, y, image, s)
         if lane() > 0:
             return
         change = -(total + times(T[i], g[i]) + y[i] * gamma[i]) / m[i]
@@ -102,6 +106,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     ):
         i = s.first + wp.tid() // LANES
         total = force_tangent(i, x, x_dot, of.T, dot.T, s)
+        total += lift_tangent(i, x, x_dot, of.y, dot.y, of.image, dot.image, s)
         if lane() > 0:
             return
         change = total + times(dot.T[i], of.g[i]) + times(of.T[i], dot.g[i])
@@ -125,13 +130,15 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         """From f of all particles; T is y L."""
         i = s.first + wp.tid() // LANES
         diagonal, others, x_part = force_back(i, x, T, f, s)
+        widened, x_lift = lift_back(i, x, y, of.image, f, s)
         if lane() > 0:
             return
         A = whole(diagonal, others)
-        y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i])
+        y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i]) + of.image[i] * widened
+        bar.image[i] = bar.image[i] + y[i] * widened
         bar.L[i] = bar.L[i] + y[i] * A
         bar.gamma[i] = bar.gamma[i] + y[i] * f[i]
-        bar.x[i] = bar.x[i] + x_part
+        bar.x[i] = bar.x[i] + x_part + x_lift
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def own_adjoint(
