@@ -130,16 +130,18 @@ class Projection:
         return between(images / (behind + 1e-6), 0.7, 0.9), mirror, behind
 
     def density(self, x, h, before=None):
-        """Over the neighbours that particles have at positions before a step, with images h times."""
-        W, wall = self.pairs(x, x)[1], self.pairs(x, self.walls)[1]
-        if before is not None:
-            near, beside = (np.linalg.norm(self.pairs(before, y)[0], axis=-1) for y in (before, self.walls))
-            reach = (1 + SKIN) * self.support
-            W, wall = W * (near < reach), wall * (beside < reach)
-        found = W.sum(1) + wall @ (self.wall_weights * ~self.container)
-        found += (1 - h) * (wall @ (self.wall_weights * self.container))
-        kept = True if before is None else near < reach
-        return found + h * sum(((image * kept).sum(1) for _, _, image, _ in self.images(x)), np.zeros(len(x)))
+        """Over the neighbours and images that particles have at positions before a step, images h times."""
+        before, reach = x if before is None else before, (1 + SKIN) * self.support
+
+        def listed(W, apart):
+            return (W * (np.linalg.norm(apart, axis=-1) < reach)).sum(1)
+
+        wall = self.pairs(x, self.walls)[1] * (1 - h[:, None] * self.container) * self.wall_weights
+        found = listed(self.pairs(x, x)[1], self.pairs(before, before)[0])
+        found += listed(wall, self.pairs(before, self.walls)[0])
+        for now, then in zip(self.images(x), self.images(before), strict=True):
+            found += h * listed(now[2], then[1])
+        return found
 
     @cached_property
     def constants(self):
@@ -238,7 +240,11 @@ class Projection:
             return found
 
         share = between(H + 2 * nu, 0.7, 0.95)
-        correct = self.coarse(x, m, from_fluid(share) + share[:, None] * walled, L, g, share, yielding) if self.nodes else None
+        correct = (
+            self.coarse(x, m, from_fluid(share) + share[:, None] * walled, L, g, share, yielding)
+            if self.nodes
+            else None
+        )
         wanted = (1 - full) * np.maximum(1 - density, 0) / dt
         far = dt * np.linalg.norm(before[1], axis=1) > 0.1 * self.spacing
         taken = np.where(far & ((before[1] * walled).sum(1) > 0), 0, full)
@@ -270,7 +276,7 @@ class Projection:
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for root in np.cos(np.pi * (2 * np.arange(self.repairs) + 1) / (2 * self.repairs)):
-            z = c + min(dt / 0.02, 1) * omega * 3 / (2 - root) * (self.density(now, h, x) - 1) / a
+            z = c + omega * 3 / (2 - root) * (self.density(now, h, x) - 1) / a
             c = np.where(z > 0, z, low * z)
             back = (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma + lift(c)) / m[:, None]
             now = moved - back / np.maximum(np.linalg.norm(back, axis=1) / (self.spacing / 6), 1)[:, None]

@@ -27,7 +27,7 @@ LEAST_AT_ONCE = 8
 
 
 @cache
-def _append(discretisation: Discretisation) -> Any:
+def append_function(discretisation: Discretisation) -> Any:
     """A Warp function: append what lanes have found, in their order."""
     neighbourhood = neighbourhood_type(discretisation.precision)
     lanes = lane_functions(discretisation.precision, discretisation.lanes)
@@ -106,7 +106,7 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
     LANES = discretisation.lanes
-    lane, append = lane_functions(discretisation.precision, LANES).lane, _append(discretisation)
+    lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
 
     @wp.func
     def scan(
@@ -194,7 +194,7 @@ def scan_at_once(discretisation: Discretisation) -> Any:
     separation = pair_functions(discretisation).separation
     load = loads(discretisation.precision, discretisation.taped).vector
     LANES = discretisation.lanes
-    lane, append = lane_functions(discretisation.precision, LANES).lane, _append(discretisation)
+    lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
     scan_rows = scan_by_rows(discretisation)
     one_of_each_row = wp.types.vector(length=ROWS, dtype=wp.int32)
     candidates = wp.types.vector(length=UNROLL, dtype=wp.int32)

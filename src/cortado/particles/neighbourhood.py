@@ -73,12 +73,16 @@ def neighbourhood_type(precision: Precision) -> Any:
         particles: wp.int32
         """Of one scene: particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
-        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
+        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours, then images that
+        it sees (`cortado.particles.mirrors`)."""
         fluid_count: wp.array(dtype=wp.int32)
         """Of the filled list, a multiple of `UNROLL`."""
         filling: wp.array(dtype=wp.int32)
         """How many of them are the particle itself."""
         count: wp.array(dtype=wp.int32)
+        """Of these and wall neighbours."""
+        all_count: wp.array(dtype=wp.int32)
+        """Of these and images."""
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
@@ -159,9 +163,7 @@ class PairFunctions:
     wall_growth_dot: Any
     near_mirrors: Any
     reflects: Any
-    flip_of: Any
-    flip_of_six: Any
-    mirrored: Any
+    reflection: Any
     several: Any
     vectors: Any
     numbers: Any

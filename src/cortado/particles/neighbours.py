@@ -19,11 +19,17 @@ from cortado.device.grid import Grid
 from cortado.device.host import HostCopy
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
+from cortado.errors import InputError
 from cortado.particles.candidates import scan_around
+from cortado.particles.images import image_kernel
+from cortado.particles.mirrors import REFLECTIONS
 from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
+
+MOST_IMAGED = (2**31 - 1) // REFLECTIONS
+"""Particles whose images have numbers."""
 
 
 @cache
@@ -50,6 +56,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         fluid_count: wp.array(dtype=wp.int32),
         filling: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
+        all_count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
         """``needed``, for each range, becomes the longest list, also where that is more than there is room for. Scenes
@@ -61,6 +68,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
                 filling[i] = 0
                 fluid_count[i] = 0
                 count[i] = 0
+                all_count[i] = 0
             return
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -80,6 +88,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         filling[i] = to_fill
         fluid_count[i] = wp.min(filled, capacity)
         count[i] = wp.min(found, capacity)
+        all_count[i] = count[i]
         if found > needed[s.part]:
             wp.atomic_max(needed, s.part, found)
 
@@ -111,17 +120,26 @@ class NeighbourSearch:
         capacity: int,
         solids: int = 0,
         dimension: int = 3,
+        mirrored: bool = False,
     ):
         """``walls`` at rest are the same ones for all scenes of a batch; those that move stand behind them, one scene
-        after the other, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``."""
+        after the other, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``.
+        Lists of ``mirrored`` fluid have images."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
+        if mirrored and particles > MOST_IMAGED:
+            raise InputError(
+                f"{particles:,} particles are too many beside walls that mirror them: at most {MOST_IMAGED:,}, or give "
+                "the container no_slip walls."
+            )
         self.particles, self.device = particles, device
-        self._fill = fill_kernel(discretisation)
+        self._fill, self._fill_images = fill_kernel(discretisation), image_kernel(discretisation)
+        self._mirrored = mirrored
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
         self.order = self._sort.order
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
         self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
         self.count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.all_count = wp.zeros(particles, dtype=wp.int32, device=device)
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._seen = HostCopy(self._needed)
@@ -190,8 +208,18 @@ class NeighbourSearch:
             fluid_count=self.fluid_count,
             filling=self.filling,
             count=self.count,
+            all_count=self.all_count,
             needed=self._needed,
         )
+        if self._mirrored:
+            self._launch(
+                self._fill_images,
+                s=neighbourhood,
+                bad_step=bad_step,
+                x=positions,
+                all_count=self.all_count,
+                needed=self._needed,
+            )
 
     @property
     def needed(self) -> int:

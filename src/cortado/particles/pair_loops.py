@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.lanes import lane_functions, sum_over_lanes
+from cortado.particles.mirrors import REFLECTIONS
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.terms import own_entry
 
@@ -29,19 +30,12 @@ OVER_FLUID = """\
             {body}
 """
 OVER_IMAGES = """\
-    _near = _near_mirrors(_x_i, s)
-    _others = s.fluid_count[i] - s.filling[i]
-    for _code in range(1, _near + 1):
-        if _reflects(_code, _near):
-            _flip = _flip_of(_code)
-            {more}
-            for _place in range(_lane(), _others + 1, _LANES):
-                _j = i
-                if _place < _others:
-                    _j = _neighbour(_place, i, s)
-                _x_ij = _separation(_x_i, _mirrored(x[_j], _code, s), s)
-                {apart}
-                {body}
+    for _place in range(s.count[i] + _lane(), s.all_count[i], _LANES):
+        _image = _neighbour(_place, i, s)
+        _j = _image // _REFLECTIONS
+        _flip, _offset = _reflection(_image % _REFLECTIONS, s)
+        _x_ij = _separation(_x_i, _times(_flip, x[_j]) + _offset, s)
+        {body}
 """
 OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
@@ -80,19 +74,14 @@ def over_fluid(
     )
 
 
-def over_images(d: Discretisation, arrays: Types, body: Body, known: Iterable[str]) -> str:
-    """A loop over the images of the fluid and of the particle itself, which have what their particles have, mirrored:
-    vectors and matrices with it. Terms know what is ``known`` of `cortado.particles.terms.OF_IMAGES`."""
-    six = d.precision.six in arrays.values()
-    flips = {d.precision.real: "{0}[_j]", d.precision.vector: "_times(_flip, {0}[_j])"}
-    flips[d.precision.six] = "_times(_flip_six, {0}[_j])"
-    matrix = "_times({0}[_j], _outer(_flip, _flip))"
-    of_j = {array: flips.get(kind, matrix).format(array) for array, kind in arrays.items()}
-    return OVER_IMAGES.format(
-        more="_flip_six = _flip_of_six(_flip)" if six else "",
-        apart="_apart = _separation(_x_i, x[_j], s)" if "apart" in known else "",
-        body=_lines(16, body(of_j)),
-    )
+def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
+    """A loop over the images of the fluid and of the particle itself, which have the numbers of their particles and
+    their vectors, mirrored."""
+    of_j = {
+        array: f"{array}[_j]" if kind is d.precision.real else f"_times(_flip, {array}[_j])"
+        for array, kind in arrays.items()
+    }
+    return OVER_IMAGES.format(body=_lines(8, body(of_j)))
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool, of_one: bool) -> str:
@@ -157,11 +146,7 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 def _known(d: Discretisation) -> dict[str, Any]:
     pair = pair_functions(d)
     used = (
-        "near_mirrors",
-        "reflects",
-        "flip_of",
-        "flip_of_six",
-        "mirrored",
+        "reflection",
         "separation",
         "neighbour",
         "several",
@@ -181,7 +166,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
     )
     return {
         **{f"_{name}": getattr(pair, name) for name in used},
-        **{"_times": wp.cw_mul, "_outer": wp.outer},
+        **{"_times": wp.cw_mul, "_REFLECTIONS": REFLECTIONS},
         **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},
         **{"_lane": lane_functions(d.precision, d.lanes).lane, "_LANES": d.lanes, "_UNROLL": UNROLL},
     }

@@ -57,7 +57,7 @@ def image_sum(d: Discretisation) -> Decorator:
 
     def make(function: Function) -> Any:
         term = Term.of(function)
-        return _made(term, d, over_images(d, term.of_neighbours, _adding_up(term), term.parameters), term)
+        return _made(term, d, over_images(d, term.of_neighbours, _adding_up(term)), term)
 
     return make
 

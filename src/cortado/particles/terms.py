@@ -5,8 +5,6 @@ c_i, c_j, v_ij     an array's entry of the particle, that of its neighbour, and 
 i, j               their numbers; j is -1 for a particle of a wall
 foot               of a particle of a wall, from it to the surface of the container; in terms of walls alone
 turn_dot           of a particle of a wall, the tangent of how its solid is turned; in tangents of terms of walls alone
-flip, apart        of an image, what its reflection does to vectors, along each axis, and x_i less the place of the
-                   particle that it is of; in terms of images alone
 s                  the neighbourhood
 any other          what is the same for all neighbours of a particle
 """
@@ -20,8 +18,6 @@ NUMBERS = ("i", "j")
 INDICES = ("i", "j", "ij")
 OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot"}
 """What terms of walls know of a wall particle, and its text."""
-OF_IMAGES = {"flip": "_flip", "apart": "_apart"}
-"""The same of terms of images."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +62,12 @@ class Term:
     @property
     def others(self) -> dict[str, Any]:
         """Types of what is the same for all neighbours, by name."""
-        known = (*NUMBERS, *OF_WALLS, *OF_IMAGES, "s")
+        known = (*NUMBERS, *OF_WALLS, "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
         """The text of its arguments, given those of a neighbour's entries and of its number."""
-        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS, **OF_IMAGES})
+        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
         """The same with the particles exchanged."""

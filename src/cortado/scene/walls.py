@@ -22,6 +22,7 @@ from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.room import resting_room
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
+from cortado.scene.solvers import ProjectionSolver
 
 WHOLE = 1e-6
 """By how much, relative, a solid may be shorter than a period that it fills."""
@@ -162,7 +163,10 @@ def _weighed(
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
     """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
-    does."""
+    does, as with solvers that know of no images."""
+    nowhere = np.full(3, np.inf)
+    if not isinstance(scene.solver, ProjectionSolver):
+        return -nowhere, nowhere
     lower, upper = scene.container.mirrors(scene.dimension, scene.discretisation.support_radius)
     flat = (0, 3 - scene.dimension)
     return np.pad(lower, flat, constant_values=-np.inf), np.pad(upper, flat, constant_values=np.inf)

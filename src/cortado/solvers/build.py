@@ -99,7 +99,8 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     grips = walls.weights * walls.sticks
     arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
-    return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension)
+    mirrored = bool(np.isfinite(mirrors_of(scene)).any())
+    return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, mirrored)
 
 
 def _forces(

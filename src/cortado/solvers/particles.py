@@ -306,7 +306,7 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s = neighbourhood_type(precision)()
     s.particles = system.layout.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
-    s.filling, s.count = search.filling, search.count
+    s.filling, s.count, s.all_count = search.filling, search.count, search.all_count
     for name, array in search.walls.items():
         setattr(s, name, array)
     s.support, s.per_support, s.reach = lattice.support, 1.0 / lattice.support, (1.0 + SKIN) * lattice.support

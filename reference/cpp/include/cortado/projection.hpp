@@ -57,9 +57,7 @@ struct Projection {
     Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
     // The same of a repair.
     Scalar repair_step_of(const Model<Scalar, D>& model, std::size_t repair, std::size_t i) const {
-        const Real lasts = Real(1) / Real(50), dt = real_part(model.time_step);
-        const Scalar part(dt < lasts ? Real(dt / lasts) : Real(1));
-        return part * model.repair_relaxations[repair] / effects[i].a;
+        return model.repair_relaxations[repair] / effects[i].a;
     }
     // How much a particle is pulled after all iterations, by which it is shifted.
     Scalar pulled(std::size_t i) const { return effects[i].repaired * k.back()[i]; }

@@ -144,7 +144,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._around = self.density.around
         self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
         self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
-        self._still = solver.vectors()
         self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
         six = solver.pull.dtype
         pull = solver.layout.arrays(T=six, S=six)
@@ -242,12 +241,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             measured = {"c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
             own = {"c_bar": self._c_bar, "n_now_bar": self._n_now_bar, "f": self._f}
             context.launch(move, *known, measured, own, omega=solver.repair_relaxations[k])
-            own = {
-                "x_now": at["x_now"],
-                "n_now_bar": self._n_now_bar,
-                "x_now_bar": self._x_now_bar,
-                "still": self._still,
-            }
+            own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
             context.launch(kernels.measure.adjoint, *known, own)
             densities = partial(density_solid_kernel, solver.discretisation, solver.topic)
             self.bar.solids.add(context.launch, densities, *known, x=at["x_now"], bar=self._n_now_bar)

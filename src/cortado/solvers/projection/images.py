@@ -62,6 +62,11 @@ class ImageSums:
     walls_tangent: Any
     walls_back: Any
     """What adjoints of both give to x."""
+    behind: Any
+    """nu alone."""
+    behind_tangent: Any
+    behind_back: Any
+    """Its gradient."""
     mirror_of: Any
     """The number of the container, or of nothing where no wall mirrors."""
 
@@ -147,13 +152,26 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
         bent = hessian_product(x_ij, normal(mirror_bar_i, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))
 
+    @solid_sum(discretisation)
+    def behind(x_ij: vector, solid: int, s: neighbourhood) -> real:
+        return s.volume * weight(x_ij, s)
+
+    @tangent_of(behind)
+    @solid_sum(discretisation)
+    def behind_tangent(x_ij: vector, x_dot_i: vector, solid: int, s: neighbourhood) -> real:
+        return s.volume * wp.dot(gradient(x_ij, s), x_dot_i)
+
+    @solid_sum(discretisation)
+    def behind_back(x_ij: vector, solid: int, s: neighbourhood) -> vector:
+        return s.volume * gradient(x_ij, s)
+
     @wp.func
     def mirror_of(x: vector, s: neighbourhood) -> int:
         return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
 
     return ImageSums(
         *(image_weights, image_weights_tangent, lift, lift_tangent, lift_back, echo, spread, spread_tangent),
-        *(mirror_walls, mirror_walls_tangent, mirror_walls_back, mirror_of),
+        *(mirror_walls, mirror_walls_tangent, mirror_walls_back, behind, behind_tangent, behind_back, mirror_of),
     )
 
 

@@ -1,6 +1,6 @@
 """Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
 
-    lambda' = z if z > 0, else r z,   z = lambda + omega_k min(1, dt / tau) (n(x_k) - 1) / a,
+    lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
 with images in n and d (`cortado.solvers.projection.images`).
@@ -10,10 +10,7 @@ is in them, densities cannot be right, and a particle would be thrown through a 
 
 omega_k is another one in each (`cortado.solvers.projection.constants`). Velocities stay as they are: in them a repair
 would be a force that acts once more in the next step. r of `cortado.solvers.projection.effects` lets low densities
-be repaired in the interior alone. They take a time tau, whatever steps are: a density that rises as
-particles are drawn out would lift fluid in each of many short steps.
-
-g and a are those of the start of the step, n is that of the positions, over the
+be repaired in the interior alone. g and a are those of the start of the step, n is that of the positions, over the
 neighbours of the start.
 """
 
@@ -35,9 +32,6 @@ from cortado.sph.density import density_sums
 FARTHEST = 1.0 / 6.0
 """In spacings: how far the repairs of a step take a particle at most. In dams, with an obstacle, on a beach and with a
 cube that falls they went 0.155 at most."""
-LASTS = 0.02
-"""tau [s]. In steps of 1 ms a dam break has 1.0010, 1.0002 and 1.0000 to 1.0004 of its first energy with 0, 0.01
-and 0.02, and is compressed by 0.03, 0.12 and 0.16 %."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +55,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     mirrors = image_sums(discretisation)
     image_weights, image_weights_tangent = mirrors.weights, mirrors.weights_tangent
     lift, lift_tangent, lift_back = mirrors.lift, mirrors.lift_tangent, mirrors.lift_back
-    walls, walls_tangent, walls_back, mirror_of = (
-        mirrors.walls,
-        mirrors.walls_tangent,
-        mirrors.walls_back,
-        mirrors.mirror_of,
-    )
+    behind, behind_tangent, behind_back = mirrors.behind, mirrors.behind_tangent, mirrors.behind_back
+    mirror_of = mirrors.mirror_of
     weights, weights_tangent, weights_adjoint = (
         densities.weights,
         densities.weights_tangent,
@@ -76,10 +66,10 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights", "image")}
-    seen, bars = bundle(**own), bundle(x=vector, m=real, time_step=real, **own)
+    seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
-    farthest, lasts = wp.constant(real(FARTHEST)), wp.constant(real(LASTS))
+    farthest = wp.constant(real(FARTHEST))
 
     @wp.func
     def along(change: vector, back: vector, held: real) -> vector:
@@ -88,20 +78,10 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
             return held * (change - (wp.dot(back, change) / wp.dot(back, back)) * back)
         return change
 
-    @wp.func
-    def part(dt: real) -> real:
-        """Of a repair, in a step."""
-        return wp.min(dt / lasts, real(1.0))
-
-    @wp.func
-    def part_slope(dt: real) -> real:
-        return wp.where(dt < lasts, real(1.0) / lasts, real(0.0))
-
     @wp.kernel(module=module)
     def measure(
         s: neighbourhood,
         omega: real,
-        time_step: wp.array(dtype=real),
         of: seen,
         x_now: wp.array(dtype=vector),
         c_in: wp.array(dtype=real),
@@ -113,13 +93,12 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         """``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for a sum and a maximum)."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
-        images = image_weights(i, x_now, s)
-        _push, behind = walls(i, x_now, mirror_of(x_now[i], s), s)
+        surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], s), s)
         if lane() > 0:
             return
         over = s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - real(1.0)
-        over += of.image[i] * (images - behind)
-        z = c_in[i] + part(time_step[i // s.particles]) * omega * over / of.a[i]
+        over += of.image[i] * surplus
+        z = c_in[i] + omega * over / of.a[i]
         if z < real(0.0):
             z = of.weights[i][3] * z
         compression = wp.max(over, real(0.0))
@@ -131,8 +110,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def measure_tangent(
         s: neighbourhood,
         omega: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
         of: seen,
         dot: seen,
         x_now: wp.array(dtype=vector),
@@ -145,17 +122,15 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     ):
         i = s.first + wp.tid() // LANES
         total = s.volume * weights_tangent(i, x_now, x_now_dot, s)
-        images, images_dot = image_weights(i, x_now, s), image_weights_tangent(i, x_now, x_now_dot, s)
-        _push, behind = walls(i, x_now, mirror_of(x_now[i], s), s)
-        _push_dot, behind_dot = walls_tangent(i, x_now, x_now_dot, mirror_of(x_now[i], s), s)
+        solid = mirror_of(x_now[i], s)
+        surplus = image_weights(i, x_now, s) - behind(i, x_now, solid, s)
+        change = image_weights_tangent(i, x_now, x_now_dot, s) - behind_tangent(i, x_now, x_now_dot, solid, s)
         if lane() > 0:
             return
-        total += of.image[i] * (images_dot - behind_dot) + dot.image[i] * (images - behind)
-        member = i // s.particles
-        dt, per = time_step[member], part(time_step[member]) * omega / of.a[i]
+        total += of.image[i] * change + dot.image[i] * surplus
+        per = omega / of.a[i]
         z = c_in[i] + per * excess[i]
-        grown = part_slope(dt) / part(dt) * time_step_dot[member] - dot.a[i] / of.a[i]
-        z_dot = c_in_dot[i] + per * (total + grown * excess[i])
+        z_dot = c_in_dot[i] + per * (total - dot.a[i] / of.a[i] * excess[i])
         if z < real(0.0):
             z_dot = of.weights[i][3] * z_dot + dot.weights[i][3] * z
         c_out_dot[i] = z_dot
@@ -165,7 +140,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         s: neighbourhood,
         x_now: wp.array(dtype=vector),
         image: wp.array(dtype=real),
-        still: wp.array(dtype=vector),
         n_now_bar: wp.array(dtype=real),
         # in and out
         image_bar: wp.array(dtype=real),
@@ -174,13 +148,13 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     ):
         i = s.first + wp.tid() // LANES
         total = weights_adjoint(i, x_now, n_now_bar, s)
-        images, solid = image_weights(i, x_now, s), mirror_of(x_now[i], s)
-        _push, behind = walls(i, x_now, solid, s)
-        lifted, walled = lift(i, x_now, n_now_bar, image, s), walls_back(i, x_now, still, n_now_bar, solid, s)
+        solid = mirror_of(x_now[i], s)
+        surplus = image_weights(i, x_now, s) - behind(i, x_now, solid, s)
+        lifted, walled = lift(i, x_now, n_now_bar, image, s), behind_back(i, x_now, solid, s)
         if lane() > 0:
             return
-        image_bar[i] = image_bar[i] + n_now_bar[i] * (images - behind)
-        x_now_bar[i] = s.volume * total + lifted - image[i] * walled
+        image_bar[i] = image_bar[i] + n_now_bar[i] * surplus
+        x_now_bar[i] = s.volume * total + lifted - (image[i] * n_now_bar[i]) * walled
 
     @wp.kernel(module=module)
     def move(
@@ -202,11 +176,11 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         if lane() > 0:
             return
         back = (total + c[i] * gamma[i]) / m[i]
-        most, length, kept = farthest * spacing, wp.length(back), real(1.0)
+        most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
-            kept = most / length
-        held[i] = kept
-        x_now[i] = x_moved[i] - kept * back
+            part = most / length
+        held[i] = part
+        x_now[i] = x_moved[i] - part * back
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def move_tangent(
@@ -257,7 +231,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def move_adjoint(
         s: neighbourhood,
         omega: real,
-        time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         of: seen,
         c_in: wp.array(dtype=real),
@@ -276,8 +249,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         widened, x_lift = lift_back(i, x, c_out, of.image, f, s)
         if lane() > 0:
             return
-        a, dt = of.a[i], time_step[i // s.particles]
-        per = part(dt) * omega / a
+        a = of.a[i]
+        per = omega / a
         z_bar = c_bar[i] + by_c + wp.dot(of.gamma[i], f[i]) + of.image[i] * widened
         bar.image[i] = bar.image[i] + c_out[i] * widened
         z = c_in[i] + per * excess[i]
@@ -287,7 +260,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
             z_bar = of.weights[i][3] * z_bar
         bar.gamma[i] = bar.gamma[i] + c_out[i] * f[i]
         bar.a[i] = bar.a[i] - per * excess[i] / a * z_bar
-        bar.time_step[i] = bar.time_step[i] + part_slope(dt) * omega / a * excess[i] * z_bar
         bar.x[i] = bar.x[i] + x_part + x_lift
         n_now_bar[i] = per * z_bar
         c_bar[i] = z_bar
