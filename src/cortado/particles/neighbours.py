@@ -129,7 +129,7 @@ class NeighbourSearch:
         if mirrored and particles > MOST_IMAGED:
             raise InputError(
                 f"{particles:,} particles are too many beside walls that mirror them: at most {MOST_IMAGED:,}, or any "
-                "number with container.slip = \"no\"."
+                'number with container.slip = "no".'
             )
         self.particles, self.device = particles, device
         self._fill, self._fill_images = fill_kernel(discretisation), image_kernel(discretisation)
