@@ -132,8 +132,8 @@ def test_there_is_a_launch_to_speak_of():
 
 MOST_ARGUMENTS = 14
 """Of a kernel: more can hardly be read."""
-LOOPS = {"particles.pair_loops", "particles.solid_shares", "particles.wall_terms", "particles.neighbours"}
-"""Modules that may count neighbours: three write loops, the other lists neighbours."""
+LOOPS = {f"particles.{name}" for name in ("pair_loops", "solid_shares", "wall_terms", "neighbours", "images")}
+"""Modules that may count neighbours: three write loops, the others list neighbours and images."""
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))

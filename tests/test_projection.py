@@ -118,6 +118,12 @@ def resting(**solver):
     )
 
 
+def test_more_images_than_have_numbers_are_refused(monkeypatch):
+    monkeypatch.setattr("cortado.particles.neighbours.MOST_IMAGED", 99)
+    with pytest.raises(InputError, match="100 particles are too many beside walls that mirror them: at most 99"):
+        Simulation(resting())
+
+
 @pytest.mark.filterwarnings("ignore:solver.time_step is")
 def test_a_divergence_that_is_left_is_told():
     """In steps that are nearly twice as long as they may be."""

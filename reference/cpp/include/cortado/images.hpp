@@ -15,16 +15,18 @@ struct Image : Pair<Scalar, D> {
     Vector<Scalar, D> of(const Vector<Scalar, D>& v) const { return flip.cwiseProduct(v); }
 };
 
-// `body(image)` for all images that particle i sees, at positions x over a list.
+// `body(image)` for all images that particle i sees, at positions x, of those within reach where the list begins.
 template <class Scalar, int D, class Body>
 void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
                 std::size_t i, const Body& body) {
     using Real = typename RealOf<Scalar>::type;
+    const Vectors<Scalar, D>& start = fluid.start();
+    const Real reach_squared = Real(model.reach) * Real(model.reach);
     int near = 0;  // a bit for each wall within reach: those at lower ends first
     for (int axis = 0; axis < D; ++axis) {
-        const Real place = real_part(x[i][axis]), support = real_part(model.smoothing.h);
-        if (place - Real(model.mirror_lower[axis]) < support) near |= 1 << axis;
-        if (Real(model.mirror_upper[axis]) - place < support) near |= 1 << (D + axis);
+        const Real place = real_part(start[i][axis]);
+        if (place - Real(model.mirror_lower[axis]) < Real(model.reach)) near |= 1 << axis;
+        if (Real(model.mirror_upper[axis]) - place < Real(model.reach)) near |= 1 << (D + axis);
     }
     for (int code = 1; code <= near; ++code) {
         if ((code & near) != code || (code & (code >> D)) != 0) continue;
@@ -36,10 +38,13 @@ void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, co
             offset[axis] = Scalar(Real(2) * Real(lower ? model.mirror_lower[axis] : model.mirror_upper[axis]));
         }
         const auto visit = [&](int j) {
-            const Vector<Scalar, D> mirrored = flip.cwiseProduct(x[j]) + offset;
-            const Vector<Scalar, D> x_ij = model.period.nearest(x[i] - mirrored);
+            const auto apart = [&](const Vectors<Scalar, D>& at) -> Vector<Scalar, D> {
+                const Vector<Scalar, D> mirrored = flip.cwiseProduct(at[j]) + offset;
+                return model.period.nearest(at[i] - mirrored);
+            };
+            const Vector<Scalar, D> then = apart(start), x_ij = apart(x);
             const Scalar r_squared = x_ij.dot(x_ij);
-            if (!model.smoothing.near(r_squared)) return;
+            if (!(real_part(then.dot(then)) < reach_squared) || !model.smoothing.near(r_squared)) return;
             const Scalar q = model.smoothing.q_of(r_squared);
             Image<Scalar, D> image;
             image.other = j;

@@ -66,6 +66,7 @@ public:
               double reach, const Period<Scalar, D>& period, const Smoothing<Scalar>& smoothing, int threads) {
         using Real = typename RealOf<Scalar>::type;
         const Real reach_squared = Real(reach) * Real(reach);
+        start_ = x;
         begin_.resize(x.size());
         end_.resize(x.size());
         parts_.resize(threads);
@@ -98,6 +99,8 @@ public:
     }
     const Pair<Scalar, D>* begin_of(std::size_t i) const { return begin_[i]; }
     const Pair<Scalar, D>* end_of(std::size_t i) const { return end_[i]; }
+    // The x that they were found for.
+    const Vectors<Scalar, D>& start() const { return start_; }
 
     // What second derivatives of W need.
     void bend(const Smoothing<Scalar>& smoothing, int threads) {
@@ -110,6 +113,7 @@ public:
     }
 
 private:
+    Vectors<Scalar, D> start_;
     std::vector<Pair<Scalar, D>*> begin_, end_;
     std::vector<std::vector<Pair<Scalar, D>>> parts_;  // each thread's
 };

@@ -92,9 +92,7 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         n: wp.array(dtype=real),
         of: seen,
         x: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
-        A: wp.array(dtype=matrix),
-        y: wp.array(dtype=real),
+        at: bundle(u=vector, A=matrix, y=real),
         k_bar: wp.array(dtype=real),
         # out
         d: wp.array(dtype=real),
@@ -104,14 +102,14 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         r: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        widened = spread(i, x, u, s)
+        widened = spread(i, x, at.u, s)
         if lane() > 0:
             return
         a = of.a[i]
-        D = wp.ddot(of.L[i], A[i]) + wp.dot(of.gamma[i], u[i]) - of.drift[i] + of.image[i] * widened
+        D = wp.ddot(of.L[i], at.A[i]) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i] + of.image[i] * widened
         b = wanted(n[i], of.weights[i][1], time_step[i // s.particles])
         per = omega / a
-        rise, fall = parts(y[i] + per * (D - b), y[i] + per * D)
+        rise, fall = parts(at.y[i] + per * (D - b), at.y[i] + per * D)
         c = rise + fall * of.weights[i][0]
         remainder = (real(1.0) - c) * a / omega
         weight = c * a + remainder

@@ -23,7 +23,6 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, solid_sum
 from cortado.solvers.projection.beside import normal_part
@@ -83,7 +82,6 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def image_weights(x_ij: vector, s: neighbourhood) -> real:
         return s.volume * weight(x_ij, s)
 
-    @tangent_of(image_weights)
     @image_sum(discretisation)
     def image_weights_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> real:
         return s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
@@ -92,7 +90,6 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def lift(x_ij: vector, y_i: real, y_j: real, image_i: real, image_j: real, s: neighbourhood) -> vector:
         return ((image_i * y_i + image_j * y_j) * s.volume) * gradient(x_ij, s)
 
-    @tangent_of(lift)
     @image_sum(discretisation)
     def lift_tangent(
         x_ij: vector,
@@ -126,7 +123,6 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def spread(x_ij: vector, u_ij: vector, s: neighbourhood) -> real:
         return s.volume * wp.dot(gradient(x_ij, s), u_ij)
 
-    @tangent_of(spread)
     @image_sum(discretisation)
     def spread_tangent(x_ij: vector, x_dot_ij: vector, u_ij: vector, u_dot_ij: vector, s: neighbourhood) -> real:
         bent = wp.dot(hessian_product(x_ij, x_dot_ij, s), u_ij)
@@ -136,7 +132,6 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def mirror_walls(x_ij: vector, foot: vector, solid: int, s: neighbourhood) -> tuple[vector, real]:
         return s.volume * normal(gradient(x_ij, s), foot), s.volume * weight(x_ij, s)
 
-    @tangent_of(mirror_walls)
     @solid_sum(discretisation)
     def mirror_walls_tangent(
         x_ij: vector, x_dot_i: vector, foot: vector, solid: int, s: neighbourhood
@@ -156,7 +151,6 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def behind(x_ij: vector, solid: int, s: neighbourhood) -> real:
         return s.volume * weight(x_ij, s)
 
-    @tangent_of(behind)
     @solid_sum(discretisation)
     def behind_tangent(x_ij: vector, x_dot_i: vector, solid: int, s: neighbourhood) -> real:
         return s.volume * wp.dot(gradient(x_ij, s), x_dot_i)

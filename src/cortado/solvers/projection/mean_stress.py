@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from cortado.device.binding import Named
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
@@ -111,7 +110,6 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def images(x_ij: vector, k_i: real, k_j: real, image_i: real, image_j: real, s: neighbourhood) -> real:
         return real(-0.5) * s.volume * (image_i * k_i + image_j * k_j) * wp.dot(gradient(x_ij, s), x_ij)
 
-    @tangent_of(images)
     @image_sum(discretisation)
     def images_tangent(
         x_ij: vector,
