@@ -74,9 +74,9 @@ def test_nothing_hangs_from_a_lid():
 
 @pytest.mark.parametrize(("time_step", "most"), [(0.0025, 1.00005), (0.001, 1.0015)])
 def test_a_dam_break_makes_no_energy_and_is_not_compressed(time_step, most):
-    """And pairs are moved apart: 1 to 2 % of particles would be nearer than half a spacing to another. Stirred particles
-    take up 0.1 % more room than a lattice of their density, so that repairs lift the fluid: in the step that the scene
-    would choose it loses more, in a shorter one less."""
+    """And pairs are moved apart: 1 to 2 % of particles would be nearer than half a spacing to another. Stirred
+    particles take up 0.1 % more room than a lattice of their density, so that repairs lift the fluid: in the step that
+    the scene would choose it loses more, in a shorter one less."""
     energy, compression, smooth, found, near = dam_break(time_step=time_step)
     assert energy < most and compression < 0.001 and smooth < 0.0005 and found < 0.001 and near < 0.001
 
@@ -88,6 +88,6 @@ def test_water_at_rest_has_no_lasting_vortex():
 
 @pytest.mark.parametrize("given", [{}, {"wavelength": 4.0}, {"wavelength": 4.0, "walls": True}])
 def test_a_standing_wave_lasts_as_it_must(given):
-    """Lamb (1932), in deep water, over a floor and between walls: rows of wall particles would damp it twice as fast."""
+    """Lamb (1932), in deep water, over a floor and between walls, whose particles would damp it twice as fast."""
     wave = standing_wave(24, **given)
     assert abs(wave.frequency - 1.0) < 0.005 and 0.9 < wave.damping < 1.3
