@@ -27,6 +27,8 @@ UNNAMED = {
     "sph.surface_stress": {"tension_functions.stress_derivative"},
     "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.shifting": {"shift_functions.back"},
+    "solvers.projection.images": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
+    "solvers.projection.coarse_sums": {"coarse_sums.push_back"},
     "solvers.projection.following": {"change_functions.back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),

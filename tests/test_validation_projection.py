@@ -86,7 +86,11 @@ def test_water_at_rest_has_no_lasting_vortex():
     assert still_water(20, 5.0).speed < 0.1
 
 
-@pytest.mark.parametrize("given", [{}, {"wavelength": 4.0}, {"wavelength": 4.0, "walls": True}])
+@pytest.mark.parametrize(
+    "given",
+    [{}, {"wavelength": 4.0}, {"wavelength": 4.0, "walls": True}],
+    ids=["deep water", "over a floor", "between walls"],
+)
 def test_a_standing_wave_lasts_as_it_must(given):
     """Lamb (1932), in deep water, over a floor and between walls, whose particles would damp it twice as fast."""
     wave = standing_wave(24, **given)
