@@ -183,13 +183,13 @@ def length_kernels(precision: Precision) -> LengthKernels:
     ):
         """``alpha_bar`` is that of each scene. The adjoint of u' is that of u, too."""
         i = wp.tid()
-        both, no = sums[i // particles], real(0.0)
+        both = sums[i // particles]
         alpha, along_bar, energy_bar = length(both), real(0.0), real(0.0)
         if bends(both):
             along_bar = alpha_bar[i // particles] / both[1]
             energy_bar = -alpha * along_bar
         new_bar, f = k_bar[i] + y_bar[i], of.thrust[i]
-        k_bar[i] = no
+        k_bar[i] = real(0.0)
         y_bar[i] = new_bar
         dt, own_bar = time_step[i // particles], real(1 - first) * along_bar + energy_bar
         bar.m[i] = bar.m[i] + energy_bar * wp.dot(f, f) + own_bar * least(real(1.0), spacing, dt)

@@ -172,7 +172,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         s_value[i] = c * z_bar
         s_slope[i] = vector()
         s_bent[i] = vector()
-        s_own[i] = no
+        s_own[i] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def source_adjoint(
