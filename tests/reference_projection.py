@@ -111,16 +111,21 @@ class Projection:
         a = self.volume * sigma / self.support**2 * reference.slope(self.kernel.name, q)
         return apart, W, a[..., None] * apart
 
-    def images(self, x):
-        """Of each reflection what it does to vectors, the separations from images, and V W and V grad W of them."""
+    def images(self, x, before=None):
+        """Of each reflection what it does to vectors, the separations from images, and V W and V grad W of them, of
+        what is in front of its walls at positions before a step."""
+        before, (lower, upper) = x if before is None else before, self.mirrors
         ways = [
-            ((1, 0), *((-1, 2 * end[axis]) for end in self.mirrors if np.isfinite(end[axis])))
-            for axis in range(x.shape[1])
+            [(1, 0, 0), *((-1, 2 * end, side) for end, side in ((low, 1), (high, -1)) if np.isfinite(end))]
+            for low, high in zip(lower, upper, strict=True)
         ]
         for way in itertools.product(*ways):
-            flip, offset = np.array(way, dtype=float).T
+            flip, offset, side = np.array(way, dtype=float).T
             if (flip < 0).any():
-                yield flip, *self.pairs(x, flip * x + offset)
+                front = (side * (before - offset / 2) >= 0).all(axis=1)
+                both = front[:, None] & front[None, :]
+                apart, W, g = self.pairs(x, flip * x + offset)
+                yield flip, apart, W * both, g * both[..., None]
 
     def share(self, x):
         """h, and of walls that mirror the push and nu."""
@@ -139,7 +144,7 @@ class Projection:
         wall = self.pairs(x, self.walls)[1] * (1 - h[:, None] * self.container) * self.wall_weights
         found = listed(self.pairs(x, x)[1], self.pairs(before, before)[0])
         found += listed(wall, self.pairs(before, self.walls)[0])
-        for now, then in zip(self.images(x), self.images(before), strict=True):
+        for now, then in zip(self.images(x, before), self.images(before), strict=True):
             found += h * listed(now[2], then[1])
         return found
 

@@ -118,6 +118,23 @@ def resting(**solver):
     )
 
 
+def test_a_column_behind_a_wall_has_no_image_in_it():
+    """A jet comes out of it a spacing from the wall, and would meet the image of what follows, at 0.4 of its speed."""
+    nozzle = {"outlet": [0.02, 0.5], "direction": [1.0, 0.0], "radius": 0.08, "length": 0.3, "flow_rate": 0.16}
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+    made = plane(
+        discretisation={"spacing": 0.02},
+        fluid=[],
+        emitter={"phase": "water", **nozzle},
+        container=room,
+        forces={"gravity": [0.0, 0.0]},
+        solver={**SOLVER, "time_step": 0.001},
+    )
+    run = Simulation(made).run(200, record_every=200)
+    out = run.positions[-1][:, 0] > 0.04
+    assert out.sum() > 60 and abs(run.velocities[-1][out, 0].mean() - 1.0) < 0.05
+
+
 def test_more_images_than_have_numbers_are_refused(monkeypatch):
     monkeypatch.setattr("cortado.particles.neighbours.MOST_IMAGED", 99)
     with pytest.raises(InputError, match="100 particles are too many beside walls that mirror them: at most 99"):

@@ -17,7 +17,8 @@ def image_kernel(discretisation: Discretisation) -> Any:
     """The kernel that appends images to lists of neighbours, of which and of the particle itself they are."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
     pair, load = pair_functions(discretisation), loads(discretisation.precision, discretisation.taped)
-    separation, near_mirrors, reflects, reflection = pair.separation, pair.near_mirrors, pair.reflects, pair.reflection
+    separation, reflects, reflection = pair.separation, pair.reflects, pair.reflection
+    near_mirrors, before_mirrors = pair.near_mirrors, pair.before_mirrors
     load_vector, neighbour = load.vector, pair.neighbour
     LANES = discretisation.lanes
     lane, append = lane_functions(discretisation.precision, LANES).lane, append_function(discretisation)
@@ -34,7 +35,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
         """``needed`` as in `cortado.particles.neighbours.fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
-        near_walls = near_mirrors(x_i, s)
+        near_walls = near_mirrors(x_i, s) & before_mirrors(x_i, s)
         if near_walls == 0 or bad_step[i // s.particles] >= 0:
             return
         others = s.fluid_count[i] - s.filling[i]
@@ -45,8 +46,9 @@ def image_kernel(discretisation: Discretisation) -> Any:
                     place, j = first + lane(), int(i)
                     if place < others:
                         j = neighbour(place, i, s)
-                    x_ij = separation(x_i, wp.cw_mul(flip, load_vector(x, j)) + offset, s)
-                    is_near = place <= others and wp.dot(x_ij, x_ij) < limit
+                    x_j = load_vector(x, j)
+                    x_ij = separation(x_i, wp.cw_mul(flip, x_j) + offset, s)
+                    is_near = place <= others and wp.dot(x_ij, x_ij) < limit and reflects(bits, before_mirrors(x_j, s))
                     found = append(i, wp.static(REFLECTIONS) * j + bits, is_near, found, s)
         if lane() > 0:
             return

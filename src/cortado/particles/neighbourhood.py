@@ -162,6 +162,7 @@ class PairFunctions:
     wall_turn_dot: Any
     wall_growth_dot: Any
     near_mirrors: Any
+    before_mirrors: Any
     reflects: Any
     reflection: Any
     several: Any

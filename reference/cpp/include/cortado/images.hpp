@@ -15,6 +15,19 @@ struct Image : Pair<Scalar, D> {
     Vector<Scalar, D> of(const Vector<Scalar, D>& v) const { return flip.cwiseProduct(v); }
 };
 
+// A bit for each wall that mirrors and that x is in front of: a wall mirrors nothing else.
+template <class Scalar, int D>
+int before_mirrors(const Model<Scalar, D>& model, const Vector<Scalar, D>& x) {
+    using Real = typename RealOf<Scalar>::type;
+    int before = 0;
+    for (int axis = 0; axis < D; ++axis) {
+        const Real place = real_part(x[axis]);
+        if (place >= Real(model.mirror_lower[axis])) before |= 1 << axis;
+        if (place <= Real(model.mirror_upper[axis])) before |= 1 << (D + axis);
+    }
+    return before;
+}
+
 // `body(image)` for all images that particle i sees, at positions x, of those within reach where the list begins.
 template <class Scalar, int D, class Body>
 void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
@@ -28,6 +41,7 @@ void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, co
         if (place - Real(model.mirror_lower[axis]) < Real(model.reach)) near |= 1 << axis;
         if (Real(model.mirror_upper[axis]) - place < Real(model.reach)) near |= 1 << (D + axis);
     }
+    near &= before_mirrors(model, start[i]);
     for (int code = 1; code <= near; ++code) {
         if ((code & near) != code || (code & (code >> D)) != 0) continue;
         Vector<Scalar, D> flip = Vector<Scalar, D>::Constant(Scalar(1)), offset = flip - flip;
@@ -38,6 +52,7 @@ void each_image(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, co
             offset[axis] = Scalar(Real(2) * Real(lower ? model.mirror_lower[axis] : model.mirror_upper[axis]));
         }
         const auto visit = [&](int j) {
+            if ((code & before_mirrors(model, start[j])) != code) return;
             const auto apart = [&](const Vectors<Scalar, D>& at) -> Vector<Scalar, D> {
                 const Vector<Scalar, D> mirrored = flip.cwiseProduct(at[j]) + offset;
                 return model.period.nearest(at[i] - mirrored);
