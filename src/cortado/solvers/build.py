@@ -59,7 +59,8 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
-    search = _search(scene, discrete, shared, layout)
+    mirrors = mirrors_of(scene)
+    search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()))
 
     def system(discretisation: Discretisation) -> ParticleSystem:
         return ParticleSystem(
@@ -73,7 +74,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
-            mirrors_of(scene),
+            mirrors,
             _named_solids(scene),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
@@ -81,7 +82,9 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     return system(shared)
 
 
-def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout) -> NeighbourSearch:
+def _search(
+    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, mirrored: bool
+) -> NeighbourSearch:
     """The search for neighbours within the support, and a little beyond."""
     support = discrete.lattice.support
     grid = Grid.around(
@@ -99,7 +102,6 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     grips = walls.weights * walls.sticks
     arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
-    mirrored = bool(np.isfinite(mirrors_of(scene)).any())
     return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, mirrored)
 
 

@@ -16,6 +16,8 @@ class ClampFunctions:
 
     wanted: Any
     """b of n, f and dt."""
+    wanted_tangent: Any
+    """Its tangent, given each of them with its own."""
     parts: Any
     """The parts of two slopes that k' has."""
 
@@ -29,6 +31,13 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
     def wanted(n: real, full: real, dt: real) -> real:
         """b"""
         return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
+
+    @wp.func
+    def wanted_tangent(n: real, n_dot: real, full: real, full_dot: real, dt: real, dt_dot: real) -> real:
+        found = -wanted(n, full, dt) * dt_dot / dt
+        if n < real(1.0):
+            found -= ((real(1.0) - full) * n_dot + full_dot * (real(1.0) - n)) / dt
+        return found
 
     @wp.func
     def parts(up: real, down: real):
@@ -47,4 +56,4 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
                 fall = real(0.5)
         return rise, fall
 
-    return ClampFunctions(wanted, parts)
+    return ClampFunctions(wanted, wanted_tangent, parts)

@@ -37,7 +37,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
     gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
-    packed, wanted = symmetric(precision), clamp_functions(precision).wanted
+    packed, clamp = symmetric(precision), clamp_functions(precision)
+    wanted, wanted_tangent = clamp.wanted, clamp.wanted_tangent
     six, pack, topic = packed.kind, packed.pack, f"projection_{dimension}d"
     own = {
         name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "weights", "image")
@@ -111,9 +112,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         D_dot += of.image[i] * widened_dot + dot.image[i] * widened
         dt, full = time_step[member], of.weights[i][1]
         b = wanted(n[i], full, dt)
-        b_dot = -b * time_step_dot[member] / dt
-        if n[i] < real(1.0):
-            b_dot -= ((real(1.0) - full) * n_dot[i] + dot.weights[i][1] * (real(1.0) - n[i])) / dt
+        b_dot = wanted_tangent(n[i], n_dot[i], full, dot.weights[i][1], dt, time_step_dot[member])
         r_dot[i] = counts(at.y[i], of.weights[i][0], at.d[i] - b) * (D_dot - b_dot)
 
     @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)

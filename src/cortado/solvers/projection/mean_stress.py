@@ -45,9 +45,7 @@ class MeanStress:
         self._kernels = mean_stress_kernels(discretisation, dimension)
         self._reach = WallSums(reach_term(discretisation), layout)
         self._mirrors = WallSums(mirror_term(discretisation), layout)
-        self._arrays = layout.arrays(
-            q=layout.precision.real, reach_bar=layout.precision.vector, mirrors_bar=layout.precision.vector
-        )
+        self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
 
     def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
         """(n,) dt p [Pa s]"""
@@ -71,12 +69,11 @@ class MeanStress:
         """From ``q_bar`` in ``at`` add to ``k_bar`` there, to the adjoints of particles, and to those of ``around``."""
         own, pairs = self._kernels.adjoint
         reach, reach_bar = self._reach.total(context, ALL_WALLS, *around), self._arrays["reach_bar"]
-        mirrors, mirrors_bar = self._mirrors.total(context, CONTAINER, *around), self._arrays["mirrors_bar"]
-        walls = {"reach": reach, "mirrors": mirrors, "reach_bar": reach_bar, "mirrors_bar": mirrors_bar}
-        context.launch(own, *bar.named, at, walls)
+        mirrors = self._mirrors.total(context, CONTAINER, *around)
+        context.launch(own, *bar.named, at, reach=reach, mirrors=mirrors, reach_bar=reach_bar)
         context.launch(pairs, *bar.named, *around, at)
         self._reach.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
-        self._mirrors.adjoint(context, bar, CONTAINER, mirrors_bar, mirrors_bar, *around)
+        self._mirrors.adjoint(context, bar, CONTAINER, reach_bar, reach_bar, *around)
 
 
 def spread_term(d: Discretisation) -> Any:
@@ -92,7 +89,7 @@ def spread_term(d: Discretisation) -> Any:
 
 @cache
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of dt p, given r as the first component of the array ``reach``."""
+    """The kernels of dt p, given r as the first component of the sum of the arrays ``reach`` and ``mirrors``."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
@@ -156,7 +153,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         total = spread(i, x, T, s) + images(i, x, k, image, s)
         if lane() > 0:
             return
-        q[i] = per * (total - k[i] * (reach[i][0] - mirrors[i][0]))
+        q[i] = per * (total - k[i] * (reach[i][0] + mirrors[i][0]))
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def mean_stress_tangent(
@@ -180,7 +177,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         total = spread_tangent(i, x, x_dot, T, T_dot, s) + images_tangent(i, x, x_dot, k, k_dot, image, image_dot, s)
         if lane() > 0:
             return
-        change = k_dot[i] * (reach[i][0] - mirrors[i][0]) + k[i] * (reach_dot[i][0] - mirrors_dot[i][0])
+        change = k_dot[i] * (reach[i][0] + mirrors[i][0]) + k[i] * (reach_dot[i][0] + mirrors_dot[i][0])
         q_dot[i] = per * (total - change)
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
@@ -193,13 +190,11 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         k_bar: wp.array(dtype=real),
         # out
         reach_bar: wp.array(dtype=vector),
-        mirrors_bar: wp.array(dtype=vector),
     ):
         i = wp.tid()
         bar = per * q_bar[i]
-        k_bar[i] = k_bar[i] - bar * (reach[i][0] - mirrors[i][0])
+        k_bar[i] = k_bar[i] - bar * (reach[i][0] + mirrors[i][0])
         reach_bar[i] = vector(-bar * k[i], real(0.0), real(0.0))
-        mirrors_bar[i] = vector(bar * k[i], real(0.0), real(0.0))
         q_bar[i] = bar
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
@@ -252,16 +247,16 @@ def _reach_work(d: Discretisation) -> Any:
 
 
 def mirror_term(discretisation: Discretisation) -> WallTerm:
-    """(h r, 0, 0) of walls that mirror, with the adjoint ``mirrors_bar``."""
-    return WallTerm(discretisation, TOPIC, _mirror_work, "mirrors_bar")
+    """(-h r, 0, 0) of walls that mirror, which count 1 - h times, with the same adjoint."""
+    return WallTerm(discretisation, TOPIC, _mirror_work, "reach_bar")
 
 
 def _mirror_work(d: Discretisation) -> Any:
     real, vector, gradient, normal = d.precision.real, d.precision.vector, pair_functions(d).gradient, normal_part(d)
 
     def mirror_work(
-        x_ij: vector, image_i: real, mirrors_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)
+        x_ij: vector, image_i: real, reach_bar_i: vector, foot: vector, s: neighbourhood_type(d.precision)
     ) -> real:
-        return wp.dot(s.volume * normal(gradient(x_ij, s), foot), x_ij - foot) * image_i * mirrors_bar_i[0]
+        return -wp.dot(s.volume * normal(gradient(x_ij, s), foot), x_ij - foot) * image_i * reach_bar_i[0]
 
     return mirror_work

@@ -71,7 +71,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     bars = bundle(x=vector, n=real, time_step=real, **own)
     iterate = bundle(u=vector, A=matrix, d=real, y=real, k=real)
     clamp, LANES = clamp_functions(precision), discretisation.lanes
-    wanted, parts = clamp.wanted, clamp.parts
+    wanted, wanted_tangent, parts = clamp.wanted, clamp.wanted_tangent, clamp.parts
     lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=module)
@@ -151,9 +151,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         out.A_dot[i] = change_of_A
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
-        b_dot = -b * time_step_dot[member] / dt
-        if n[i] < real(1.0):
-            b_dot -= ((real(1.0) - full) * n_dot[i] + dot.weights[i][1] * (real(1.0) - n[i])) / dt
+        b_dot = wanted_tangent(n[i], n_dot[i], full, dot.weights[i][1], dt, time_step_dot[member])
         per = omega / of.a[i]
         per_dot = -per * dot.a[i] / of.a[i]
         down = at.y[i] + per * D
