@@ -128,11 +128,12 @@ class Projection:
                 yield flip, apart, W * both, g * both[..., None]
 
     def share(self, x):
-        """h, and of walls that mirror the push and nu."""
+        """h, of walls that mirror the push and nu, and how far others are away."""
         _, wall_W, wall_g = self.pairs(x, self.walls)
+        alone = 1 / (1 + (wall_W @ (self.wall_weights * ~self.container) / 0.005) ** 4)
         mirror, behind = self.pushes(wall_g, self.container)[0], wall_W @ (self.wall_weights * self.container)
         images = sum((W.sum(1) for _, _, W, _ in self.images(x)), np.zeros(len(x)))
-        return between(images / (behind + 1e-6), 0.7, 0.9), mirror, behind
+        return between(images / (behind + 1e-6), 0.7, 0.9) * alone, mirror, behind, alone
 
     def density(self, x, h, before=None):
         """Over the neighbours and images that particles have at positions before a step, images h times."""
@@ -195,11 +196,11 @@ class Projection:
         """Positions, velocities, and k with what it adds to velocities, after the step, from predicted velocities and
         those two of the step before; and the divergence that the last iteration found, times the step. Bodies begin at
         rest and fall with the ``gravity``."""
-        (n, d), (h, mirror, behind) = x.shape, self.share(x)
+        (n, d), (h, mirror, behind, alone) = x.shape, self.share(x)
         density = self.density(x, h)
         _, g, total, walled, nu, M, H, inverse = self.around(x)
-        B, Bo = (1 / (1 + (each / 0.05) ** 4) for each in (nu + 9 * behind, nu - behind))
-        gamma = walled - mirror
+        B, Bo = (1 / (1 + (each / 0.05) ** 4) for each in (nu + 9 * alone * behind, nu - alone * behind))
+        gamma = walled - alone[:, None] * mirror
         tension = between(H, 0.1, 0.5) * B
         omega, square = self.constants
         N = gamma[:, :, None] * gamma[:, None, :]
@@ -322,10 +323,10 @@ class Projection:
     def shift(self, x, v, dt, pull=0.0):
         """By velocities, and dt^2 p / rho of every particle."""
         (W, g, total, gamma, nu, _, H, inverse), s, d = self.around(x), self.spacing, x.shape[1]
-        behind = self.share(x)[2]
+        _, _, behind, alone = self.share(x)
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
-        c = between(H, 0.8, 0.95) / (1 + ((nu + 9 * behind) / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
+        c = between(H, 0.8, 0.95) / (1 + ((nu + 9 * alone * behind) / 0.05) ** 4) * np.maximum(-pull, 0.0) / s**2
         rate = rate + 60 * c**2 / (c + 0.004) ** 1.5
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4

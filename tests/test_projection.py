@@ -135,6 +135,20 @@ def test_a_column_behind_a_wall_has_no_image_in_it():
     assert out.sum() > 60 and abs(run.velocities[-1][out, 0].mean() - 1.0) < 0.05
 
 
+def test_water_rests_between_solids_that_stand_on_the_floor_of_a_box():
+    """Where images went on to their feet it moved with 0.15 m/s."""
+    ends = [("left", -0.2, 0.0), ("right", 1.0, 1.2)]
+    made = plane(
+        discretisation={"spacing": 0.04},
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.6], "phase": "water"}],
+        container={"shape": "box", "lower": [-1.0, 0.0], "upper": [2.2, 1.2]},
+        solid=[{"name": name, "shape": "box", "lower": [a, 0.0], "upper": [b, 1.1]} for name, a, b in ends],
+        solver={**SOLVER, "time_step": 0.004},
+    )
+    run = Simulation(made).run(250, record_every=10)
+    assert np.sqrt((run.velocities[12:] ** 2).sum(axis=2).mean()) < 0.1
+
+
 def test_more_images_than_have_numbers_are_refused(monkeypatch):
     monkeypatch.setattr("cortado.particles.neighbours.MOST_IMAGED", 99)
     with pytest.raises(InputError, match="100 particles are too many beside walls that mirror them: at most 99"):

@@ -115,10 +115,10 @@ template <class Scalar>
 struct Away {
     Scalar value, slope;
 
-    explicit Away(const Scalar& nu) {
-        const Scalar one(1), ratio = nu / hundredths<Scalar>(5);
+    Away(const Scalar& nu, const Scalar& half) {
+        const Scalar one(1), ratio = nu / half;
         value = one / (one + ratio * ratio * ratio * ratio);
-        slope = Scalar(-4) * value * value * ratio * ratio * ratio / hundredths<Scalar>(5);
+        slope = Scalar(-4) * value * value * ratio * ratio * ratio / half;
     }
 };
 
@@ -127,9 +127,10 @@ template <class Scalar, int D>
 struct Surroundings {
     Filling<Scalar, D> filling;
     Smoothstep<Scalar> tension, full, corrected, shifted, repaired, shared, image;
-    Away<Scalar> away, open;          // B of nu + 9 nu of walls that mirror, and of others alone
-    Scalar behind;                    // nu of walls that mirror + 1e-6
-    Vector<Scalar, D> leaning;        // gamma of others
+    Away<Scalar> alone;       // q: 0 beside walls that do not mirror
+    Away<Scalar> away, open;  // B of nu + 9 q nu of walls that mirror, and without q nu of them
+    Scalar behind;            // nu of walls that mirror + 1e-6
+    Vector<Scalar, D> leaning;  // gamma of others
     Scalar direction, lean;   // the denominators of N and C
     Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
     Matrix<Scalar, D> J, K, N, P, C;
@@ -148,10 +149,11 @@ struct Surroundings {
           repaired(filling.H, 80, 95),
           shared(Scalar(filling.H + of.nu + of.nu), 70, 95),
           image(Scalar(of.images / (of.behind + hundredths<Scalar>(1) / Scalar(10000))), 70, 90),
-          away(Scalar(of.nu + Scalar(9) * of.behind)),
-          open(Scalar(of.nu - of.behind)),
+          alone(Scalar(of.nu - of.behind), Scalar(hundredths<Scalar>(1) / Scalar(2))),
+          away(Scalar(of.nu + Scalar(9) * alone.value * of.behind), hundredths<Scalar>(5)),
+          open(Scalar(of.nu - alone.value * of.behind), hundredths<Scalar>(5)),
           behind(of.behind + hundredths<Scalar>(1) / Scalar(10000)),
-          leaning(of.gamma - of.mirror) {
+          leaning(of.gamma - alone.value * of.mirror) {
         const Scalar one(1), m = model.rest_density;
         const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
         J = regular_inverse<Scalar, D>(of.M);
@@ -175,8 +177,8 @@ struct Surroundings {
         found.shifted = shifted.value;
         found.repaired = repaired.value * away.value;
         found.shared = shared.value;
-        found.image = image.value;
-        found.push = of.gamma - image.value * of.mirror;
+        found.image = image.value * alone.value;
+        found.push = of.gamma - found.image * of.mirror;
     }
 };
 

@@ -28,10 +28,12 @@ public:
     }
 
     Effects<Real, D> tangent(const Moments<Real, D>& dot) const {
-        const Real dH = at_.filling.slope.cwiseProduct(dot.M).sum(), dB = at_.away.slope * (dot.nu + 9 * dot.behind);
-        const Real open_dot = at_.open.slope * (dot.nu - dot.behind);
+        const Real alone_dot = at_.alone.slope * (dot.nu - dot.behind);
+        const Real behind_dot = alone_dot * of_.behind + at_.alone.value * dot.behind;
+        const Real dH = at_.filling.slope.cwiseProduct(dot.M).sum(), dB = at_.away.slope * (dot.nu + 9 * behind_dot);
+        const Real open_dot = at_.open.slope * (dot.nu - behind_dot);
         const Vector<Real, D>& leaning = at_.leaning;
-        const Vector<Real, D> leaning_dot = dot.gamma - dot.mirror;
+        const Vector<Real, D> leaning_dot = dot.gamma - at_.alone.value * dot.mirror - alone_dot * of_.mirror;
         const Matrix<Real, D> grown = leaning * leaning_dot.transpose() + leaning_dot * leaning.transpose();
         const Matrix<Real, D> dN = (grown - 2 * leaning.dot(leaning_dot) * at_.N) / at_.direction;
         const Matrix<Real, D> across = at_.P * dot.M * at_.N + at_.P * of_.M * dN - dN * of_.M * at_.N;
@@ -54,8 +56,9 @@ public:
         found.shifted = at_.shifted.slope * dH;
         found.repaired = at_.repaired.slope * dH * at_.away.value + at_.repaired.value * dB;
         found.shared = at_.shared.slope * (dH + 2 * dot.nu);
-        found.image = at_.image.slope * (dot.images - of_.images / at_.behind * dot.behind) / at_.behind;
-        found.push = dot.gamma - at_.image.value * dot.mirror - found.image * of_.mirror;
+        const Real image_dot = at_.image.slope * (dot.images - of_.images / at_.behind * dot.behind) / at_.behind;
+        found.image = image_dot * at_.alone.value + at_.image.value * alone_dot;
+        found.push = dot.gamma - at_.found.image * dot.mirror - found.image * of_.mirror;
         return found;
     }
 
@@ -78,8 +81,7 @@ public:
         const Real by_away = at_.away.slope * B_bar;
         const Real by_open = -at_.open.slope * bare_bar.cwiseProduct(at_.beside).sum();
         const Real image_bar = bar.image - of_.mirror.dot(bar.push);
-        found.images = at_.image.slope * image_bar / at_.behind;
-        found.behind = 9 * by_away - by_open - of_.images / at_.behind * found.images;
+        found.images = at_.image.slope * at_.alone.value * image_bar / at_.behind;
         found.nu = by_away + by_open + at_.full.slope * bar.full + 2 * at_.shared.slope * bar.shared;
         const Matrix<Real, D> beside_bar = (1 - at_.open.value) * bare_bar, C_bar = -(1 + at_.lack) * beside_bar;
         const Matrix<Real, D> across_bar = hundredths<Real>(210) / at_.lean * C_bar;
@@ -90,7 +92,12 @@ public:
         const Real along = N_bar.cwiseProduct(at_.N).sum();
         const Vector<Real, D> leaning_bar = 2 / at_.direction * (N_bar * at_.leaning - along * at_.leaning);
         found.gamma = own_bar + leaning_bar + bar.push;
-        found.mirror = -leaning_bar - at_.image.value * bar.push;
+        found.mirror = -at_.alone.value * leaning_bar - at_.found.image * bar.push;
+        const Real behind_bar = 9 * by_away - by_open;
+        const Real by_alone = at_.alone.slope * (behind_bar * of_.behind - leaning_bar.dot(of_.mirror) +
+                                                 at_.image.value * image_bar);
+        found.nu += by_alone;
+        found.behind = at_.alone.value * behind_bar - of_.images / at_.behind * found.images - by_alone;
         found.M = H_bar * at_.filling.slope + inverse_change<Real, D>(at_.J, of_inverse(K_bar)) +
                   even<Real, D>(at_.P * across_bar * at_.N) + lean_bar * at_.N + lacked * at_.P;
         return found;

@@ -2,7 +2,7 @@
 
 With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.beside`,
 the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 +
-((nu + 9 nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror
+((nu + 9 q nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror and q, which is 0 beside others
 (`cortado.solvers.projection.images`):
 
     sigma = S(0.1, 0.5) B    how much tension is let through,
@@ -12,7 +12,7 @@ the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from
     c = S(0.7, 0.95) of H + 2 nu   its share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
     L = I + c (B (K - I) + (1 - B_o) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
     K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
-    B_o = 1 / (1 + ((nu - nu_m) / 0.05)^4), beside walls that do not mirror, whose gamma C is made of,
+    B_o = 1 / (1 + ((nu - q nu_m) / 0.05)^4), beside walls that do not mirror, whose gamma C is made of,
     C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
@@ -34,6 +34,10 @@ SHARED = (0.7, 0.95)
 """The same of the share of a coarse pressure, of H + 2 nu."""
 WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
+APART = 0.005
+"""nu of walls that do not mirror at which a particle is half as much beside a mirror, so that it is next to none of
+them where it is. Mirrors do not mirror them: with images up to its foot water at rest beside a solid moves twice as
+fast."""
 MIRRORED = 9.0
 """How many times more walls that mirror count in B. Images make up for what is missing beside them, which K would make
 up for too, and a block that falls from a lid has no tension to an image of its own."""
@@ -54,6 +58,19 @@ vortex, and with 1, where divergences are right, the second row has 6 % too much
 def weights_type(precision: Precision) -> Any:
     """The Warp type of (sigma, f, u, r)."""
     return wp.types.vector(length=4, dtype=precision.real)
+
+
+@cache
+def away_function(precision: Precision) -> Any:
+    """The Warp function 1 / (1 + (nu / half)^4) of nu and half, which is 0 beside walls."""
+    real = precision.real
+
+    @wp.func
+    def away(nu: real, half: real) -> real:
+        ratio = nu / half
+        return real(1.0) / (real(1.0) + ratio * ratio * ratio * ratio)
+
+    return away
 
 
 @dataclass(frozen=True)
@@ -82,7 +99,8 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)
-    regular, newton, walled = (wp.constant(real(value)) for value in (REGULAR, NEWTON, WALLED))
+    away = away_function(precision)
+    regular, newton, walled, apart = (wp.constant(real(value)) for value in (REGULAR, NEWTON, WALLED, APART))
     mirrored = wp.constant(real(MIRRORED))
     along, direction = (wp.constant(real(value)) for value in (ALONG, DIRECTION))
     besides, axes = (wp.constant(real(value)) for value in (3 - dimension, dimension - 1))
@@ -96,18 +114,12 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
         return matrix(one, no, no, no, one, no, no, no, one)
 
     @wp.func
-    def away(nu: real) -> real:
-        """B"""
-        ratio = nu / walled
-        return real(1.0) / (real(1.0) + ratio * ratio * ratio * ratio)
-
-    @wp.func
     def inverse(M: matrix) -> matrix:
         return (real(1.0) + regular) * invert(M + regular * unit())
 
     @wp.func
     def weights(M: matrix, nu: real, behind: real) -> weights4:
-        H, B = fullness(M), away(nu + mirrored * behind)
+        H, B = fullness(M), away(nu + mirrored * away(nu - behind, apart) * behind, walled)
         full, walled_in = smoothstep(H, t_0, t_1), smoothstep(H + nu, t_0, t_1)
         return weights4(full * B, walled_in, smoothstep(H, u_0, u_1), smoothstep(H, r_0, r_1) * B)
 
@@ -123,9 +135,10 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def correction(M: matrix, gamma: vector, mirror: vector, nu: real, behind: real, least: real) -> matrix:
-        H, B, J = fullness(M), away(nu + mirrored * behind), inverse(M)
+        H, J, alone = fullness(M), inverse(M), away(nu - behind, apart)
+        B, B_o = away(nu + mirrored * alone * behind, walled), away(nu - alone * behind, walled)
         K = J + (newton * smoothstep(H, r_0, r_1)) * (J * (J - unit()))
-        beside = (real(1.0) - away(nu - behind)) * walled_correction(M, gamma - mirror, least)
+        beside = (real(1.0) - B_o) * walled_correction(M, gamma - alone * mirror, least)
         return unit() + smoothstep(H, c_0, c_1) * (B * (K - unit()) + beside)
 
     @wp.func

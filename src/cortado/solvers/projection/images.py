@@ -4,10 +4,11 @@ Wall particles hold what is alone, but rows that a wave draws out beside a wall 
 compressed, which damps waves, and still water is stirred. A mirror is right wherever rows stand. So images count h
 times, and the particles of walls that mirror 1 - h times, with
 
-    h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6),
+    h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
 
 the images' part in the number density over nu_m, that of the walls: 1 where as much fluid is beside a wall as it
-expects, and 0 in spray. With g_i' = V grad W of the separation from an image x_j' = R x_j + o, images add
+expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad W of the separation from an
+image x_j' = R x_j + o, images add
 
     h_i sum (v_i - R v_j) . g_i'                   to the divergence,
     sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,
@@ -26,6 +27,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, solid_sum
 from cortado.solvers.projection.beside import normal_part
+from cortado.solvers.projection.effects import APART, away_function
 from cortado.sph.moment_functions import moment_functions
 
 CONTAINER = -1
@@ -171,17 +173,19 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """The Warp functions of h, of the images' part in the density and nu of the walls, and of its gradient."""
+    """The Warp functions of h, of the images' part in the density, nu of the walls that mirror and of all, and of its
+    gradient."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
-    first, last, least = (wp.constant(real(value)) for value in (*EVEN, LEAST))
+    away = away_function(precision)
+    first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))
 
     @wp.func
-    def share(images: real, behind: real) -> real:
-        return smoothstep(images / (behind + least), first, last)
+    def share(images: real, behind: real, nu: real) -> real:
+        return smoothstep(images / (behind + least), first, last) * away(nu - behind, apart)
 
     @wp.func(module=module)
-    def slope(images: real, behind: real):
-        by_images, by_behind = wp.grad(share)(images, behind)
-        return by_images, by_behind
+    def slope(images: real, behind: real, nu: real):
+        by_images, by_behind, by_nu = wp.grad(share)(images, behind, nu)
+        return by_images, by_behind, by_nu
 
     return share, slope

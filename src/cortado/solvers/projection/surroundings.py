@@ -87,7 +87,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         mirror, behind = mirror_walls(i, x, mirror_of(x[i], s), s)
         if lane() > 0:
             return
-        e, h = edge(normal, entire, least), image_of(images, behind)
+        e, h = edge(normal, entire, least), image_of(images, behind, nu)
         gamma = normal + e * (entire - normal)
         M, Q = whole(diagonal, others), change(square, mixed)
         L = correction_of(M, gamma, mirror, nu, behind, least)
@@ -145,8 +145,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         e, off = of.edge[i], of.whole[i] - of.normal[i]
         by_normal, by_whole = edge_along(of.normal[i], of.whole[i], least, real(1.0))
         e_dot = wp.dot(by_normal, normal_dot) + wp.dot(by_whole, whole_dot)
-        by_images, by_behind = image_along(of.images[i], of.behind[i])
-        h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot
+        by_images, by_behind, by_walls = image_along(of.images[i], of.behind[i], of.nu[i])
+        h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot + by_walls * nu_i_dot
         gamma_i_dot = normal_dot + e * (whole_dot - normal_dot) + e_dot * off
         drift_i_dot = normal_drift_dot + e * (whole_drift_dot - normal_drift_dot)
         drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
@@ -229,10 +229,10 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         M_pull[i] = pack(bar.M[i] + M_bar)
         Q_pull[i] = pack(Q_bar)
         bar.g[i] = bar.g[i] + g_bar
-        bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i]
         h, h_bar = of.image[i], bar.image[i] - wp.dot(bar.gamma[i], of.mirror[i])
         h_bar += n_bar[i] * (of.images[i] - of.behind[i])
-        by_images, by_behind = image_back(of.images[i], of.behind[i])
+        by_images, by_behind, by_walls = image_back(of.images[i], of.behind[i], of.nu[i])
+        bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i] + by_walls * h_bar
         bar.mirror[i] = mirror_bar - h * bar.gamma[i]
         bar.images[i] = h * n_bar[i] + by_images * h_bar
         bar.behind[i] = behind_bar - h * n_bar[i] + by_behind * h_bar
