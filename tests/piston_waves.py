@@ -24,7 +24,7 @@ def piston(deep: int, depth_times_wavenumber: float, steepness: float, device: s
     group = 0.5 * omega / k * (1.0 + 2 * k / np.sinh(2 * k))
     end = (2.0 * long - max(gauges)) / (SOONER * group)
     start = end - 2.0 * period
-    step = 0.04 * spacing
+    step = 0.1 * spacing
     times = np.arange(0.0, end + 0.02, 0.01)
     places = 0.5 * stroke * np.minimum(times / period, 1.0) * np.sin(omega * times)
     middle, edge = np.array([-0.25, 0.75]), 5.0 * spacing
