@@ -12,6 +12,7 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import greatest_speed
 from cortado.scene.stability import stability_limits
+from cortado.scene.standing_solids import standing_sentences
 from cortado.scene.turns import rotation_matrix
 from scenes import jet
 
@@ -424,3 +425,30 @@ def test_a_solid_that_no_run_moved_is_a_sentence():
         run.solids["paddle"]
     assert run[-1:].solids["rotor"].positions.shape == (1, 2)
     assert "paddle" not in run.solids
+
+
+@pytest.mark.parametrize(
+    ("lower", "motion", "told"),
+    [
+        (0.0, {"velocity": [0.1, 0.0]}, ["y = 0 m"]),
+        (-0.02, {"velocity": [0.1, 0.0]}, ["y = 0 m"]),
+        (-0.06, {"velocity": [0.1, 0.0]}, []),
+        (0.0, {"velocity": [0.0, 0.1]}, []),
+        (0.0, {"times": [0.0, 1.0], "positions": [[0.3, 0.25], [0.5, 0.25]]}, ["y = 0 m"]),
+        (0.0, {"velocity": [0.1, 0.0], "angular_velocity": 0.1}, []),
+    ],
+    ids=["piston", "too little", "through the floor", "gate", "on a path", "turns"],
+)
+def test_a_solid_that_moves_along_a_wall_and_ends_on_it_is_told(lower, motion, told):
+    piston = {"name": "piston", "shape": "box", "lower": [0.2, lower], "upper": [0.4, 0.5 - lower], "motion": "path"}
+    scene = Scene(
+        dimension=2,
+        discretisation={"spacing": 0.05},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[{"shape": "box", "lower": [0.4, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+        solid=[{**piston, **motion}],
+        solver={"kind": "projection", "time_step": 0.002},
+    )
+    found = list(standing_sentences(scene))
+    assert len(found) == len(told) and all(place in sentence for place, sentence in zip(told, found, strict=True))

@@ -28,6 +28,7 @@ from cortado.scene.fluid_masses import FluidMasses
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.sampling import FluidSample, fluid_particles, period
 from cortado.scene.scene import Scene
+from cortado.scene.standing_solids import standing_sentences
 from cortado.scene.thin_walls import thin_sentences
 from cortado.scene.walls import Walls, walls_of
 
@@ -109,7 +110,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     walls = walls_of(scene, layers, at_rest)
     fluid = _packed(fluid, walls, at_rest, *period(scene))
     masses = FluidMasses.of(scene, fluid)
-    for sentence in thin_sentences(scene):
+    for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
         warn(sentence)
     if masses.warning:
         warn(masses.warning, MassWarning)
