@@ -19,7 +19,7 @@ FACING = 0.9
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
-    """One of each solid that moves along a flat wall of the container and ends on it."""
+    """One of each flat wall of the container that a solid moves along and ends on."""
     box = scene.container
     if not isinstance(box, BoxContainer):
         return
