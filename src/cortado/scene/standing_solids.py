@@ -8,6 +8,7 @@ import numpy as np
 from cortado.discretise.solids.surface_points import surface_feet
 from cortado.scene.containers import BoxContainer
 from cortado.scene.model import SceneTables
+from cortado.scene.motions import Steady, courses, told
 from cortado.scene.solids import SolidTable
 
 THROUGH = 1.5
@@ -24,27 +25,28 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
     if not isinstance(box, BoxContainer):
         return
     spacing, ends = scene.discretisation.spacing, box.extent()
-    for table in scene.solid:
-        if table.motion != "path" or table.side == "inside":
+    for table in told(scene.solid):
+        axes = [axis for axis in range(scene.dimension) if not box.periodic[axis] and _stays(table, axis, spacing)]
+        if table.side == "inside" or not axes:
             continue
         feet, away = surface_feet(table.solid(), spacing)
-        for axis, upper in product(range(scene.dimension), (False, True)):
+        for axis, upper in product(axes, (False, True)):
             sign = 1.0 if upper else -1.0
             through = sign * (feet[:, axis] - ends[upper][axis])
             on_it = (sign * away[:, axis] > FACING) & (through > -0.5 * spacing) & (through < 0.75 * spacing)
-            if not box.periodic[axis] and np.count_nonzero(on_it) > 2 and _stays(table, axis, spacing):
-                way = "xyz"[axis]
+            if np.count_nonzero(on_it) > 2:
                 yield (
-                    f"the solid {table.name!r} moves along the wall of the container at {way} = "
+                    f"the solid {table.name!r} moves along the wall of the container at {'xyz'[axis]} = "
                     f"{ends[upper][axis]:g} m and ends on it, which stirs fluid in the corner between them: let it "
                     f"reach through the wall by {THROUGH * spacing:.3g} m or more."
                 )
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """Whether a path keeps its middle as far from a wall across an axis."""
-    if table.rotations is not None or table.angular_velocity is not None:
+    """Whether a path does not turn a solid, and keeps its middle as far from a wall across an axis."""
+    shifts, turns = courses(table)
+    if turns.greatest() > 0.0:
         return False
-    if table.positions is not None:
-        return bool(np.ptp(np.array(table.positions)[:, axis]) < 0.5 * spacing)
-    return table.velocity is None or table.velocity[axis] == 0.0
+    if isinstance(shifts, Steady):
+        return bool(shifts.rate[axis] == 0.0)
+    return bool(np.ptp(shifts.values[:, axis]) < 0.5 * spacing)

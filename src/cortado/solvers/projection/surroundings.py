@@ -145,8 +145,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         e, off = of.edge[i], of.whole[i] - of.normal[i]
         by_normal, by_whole = edge_along(of.normal[i], of.whole[i], least, real(1.0))
         e_dot = wp.dot(by_normal, normal_dot) + wp.dot(by_whole, whole_dot)
-        by_images, by_behind, by_walls = image_along(of.images[i], of.behind[i], of.nu[i])
-        h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot + by_walls * nu_i_dot
+        by_images, by_behind, by_all = image_along(of.images[i], of.behind[i], of.nu[i])
+        h, h_dot = of.image[i], by_images * images_i_dot + by_behind * behind_i_dot + by_all * nu_i_dot
         gamma_i_dot = normal_dot + e * (whole_dot - normal_dot) + e_dot * off
         drift_i_dot = normal_drift_dot + e * (whole_drift_dot - normal_drift_dot)
         drift_i_dot += e_dot * (of.whole_drift[i] - of.normal_drift[i])
@@ -231,8 +231,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bar.g[i] = bar.g[i] + g_bar
         h, h_bar = of.image[i], bar.image[i] - wp.dot(bar.gamma[i], of.mirror[i])
         h_bar += n_bar[i] * (of.images[i] - of.behind[i])
-        by_images, by_behind, by_walls = image_back(of.images[i], of.behind[i], of.nu[i])
-        bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i] + by_walls * h_bar
+        by_images, by_behind, by_all = image_back(of.images[i], of.behind[i], of.nu[i])
+        bar.nu[i] = bar.nu[i] + nu_bar + n_bar[i] + by_all * h_bar
         bar.mirror[i] = mirror_bar - h * bar.gamma[i]
         bar.images[i] = h * n_bar[i] + by_images * h_bar
         bar.behind[i] = behind_bar - h * n_bar[i] + by_behind * h_bar
