@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.ticker import NullFormatter
 from speed import busiest
 
-from cortado.pictures.canvas import DASHED, PALETTE, drawing
+from cortado.pictures.plots import DASHED, PALETTE, drawing
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = DOCS / "performance.md"

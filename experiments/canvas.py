@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cortado.files.atomic import write_atomically
-from cortado.pictures.canvas import STYLE
+from cortado.pictures.plots import STYLE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def blank(width: float = 9.0, height: float = 5.2) -> Figure:
-    """An empty figure of so many inches; `cortado.pictures.canvas` has the colours."""
+    """An empty figure of so many inches; `cortado.pictures.plots` has the colours."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine

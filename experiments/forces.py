@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import DASHED, PALETTE
+from cortado.pictures.plots import DASHED, PALETTE
 from cortado.reference import Terms
 from cortado.scene.fields import OneOf, Several, count, quantity
 from experiments.canvas import blank

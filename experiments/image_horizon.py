@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.gradients import Exact, Tape
 from cortado.losses import FinalPositions, Image
-from cortado.pictures.canvas import PALETTE
+from cortado.pictures.plots import PALETTE
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.fields import Several, Vector, count, quantity

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from cortado.discretise.smoothing import smoothing_kernel
-from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE
+from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from experiments import spatial_scales

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import INK, PALETTE
+from cortado.pictures.plots import INK, PALETTE
 from experiments.canvas import blank
 from experiments.estimates import Estimate, Line
 from experiments.experiment import ExperimentType

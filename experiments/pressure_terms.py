@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import PALETTE
+from cortado.pictures.plots import PALETTE
 from cortado.reference import Terms
 from cortado.scene.fields import OneOf, Several, count
 from experiments.canvas import blank

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE
+from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
 from cortado.scene.fields import OneOf, Several, Vector, count, quantity
 from experiments.canvas import blank

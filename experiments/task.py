@@ -12,7 +12,7 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.setup import Setup, setup
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import Record, optimise
-from cortado.pictures.canvas import PALETTE, whole_numbers
+from cortado.pictures.plots import PALETTE, whole_numbers
 from cortado.scene.fields import Several, Text
 from experiments.canvas import blank
 from experiments.experiment import DeviceSettings, ExperimentType, Progress

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from cortado import gradients, losses, reference
-from cortado.pictures.canvas import DASHED, INK, PALETTE
+from cortado.pictures.plots import DASHED, INK, PALETTE
 from cortado.problem import Problem
 from cortado.scene.fields import Several, count, quantity
 from cortado.simulation import Simulation

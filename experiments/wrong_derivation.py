@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import DASHED, INK, PALETTE
+from cortado.pictures.plots import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from experiments.canvas import blank

@@ -6,7 +6,7 @@ from PIL import Image
 
 from cortado.errors import InputError
 from cortado.files.srgb import to_srgb
-from cortado.pictures import figures
+from cortado.pictures import plots
 from cortado.runs.run_figures import density_errors
 from cortado.runs.trajectory import Trajectory
 
@@ -39,7 +39,7 @@ def trajectory_of(steps: int) -> Trajectory:
     "losses", [[3.0, 1.0, 0.1], [0.0, 0.0], [], [1.0, np.nan, np.inf, 2.0], [5.0], [1.0, 0.0, 1e-9]]
 )
 def test_loss_curve_takes_any_losses(tmp_path, losses):
-    image = pixels(figures.loss_curve(losses, tmp_path / "loss.png"))
+    image = pixels(plots.loss_curve(losses, tmp_path / "loss.png"))
     assert (share_of((0x3D, 0x6B, 0x8E), image) > 1e-5) == bool(losses)
 
 
@@ -50,7 +50,7 @@ def test_nearer_particles_hide_farther_ones(tmp_path):
     for first, second in ((near, far), (far, near)):  # in whatever order they come
         colours = np.concatenate([red, green] if first is near else [green, red])
         positions = np.concatenate([first, second])
-        image = pixels(figures.particles([positions], ["a"], tmp_path / "a.png", colours=[colours]))
+        image = pixels(plots.particles([positions], ["a"], tmp_path / "a.png", colours=[colours]))
         assert share_of((203, 0, 0), image) > 0.1  # of linear light, in sRGB
         assert share_of((0, 203, 0), image) == 0.0
 
@@ -59,7 +59,7 @@ def test_nearer_particles_hide_farther_ones(tmp_path):
 def test_particles_side_by_side_share_their_scale(tmp_path, dimension):
     points = block(dimension)
     corners = (np.full(dimension, -0.1), np.full(dimension, 0.8))
-    path = figures.particles(
+    path = plots.particles(
         [points, points + 0.1],
         ["before", "after"],
         tmp_path / "a.png",
@@ -75,15 +75,15 @@ def test_particles_side_by_side_share_their_scale(tmp_path, dimension):
 def test_particles_by_speed_have_a_colour_bar(tmp_path):
     points = block(2)
     speed = np.linalg.norm(points, axis=1)
-    plain = figures.particles([points], ["a"], tmp_path / "a.png")
-    coloured = figures.particles([points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]")
+    plain = plots.particles([points], ["a"], tmp_path / "a.png")
+    coloured = plots.particles([points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]")
     yellow = (254, 232, 56)
     assert share_of(yellow, pixels(coloured)) > 0.002 and share_of(yellow, pixels(plain)) == 0.0
 
 
 @pytest.mark.parametrize("points", [np.full((3, 2), np.nan), np.zeros((1, 3)), np.zeros((0, 2)), np.zeros((4, 3))])
 def test_particles_that_cannot_be_seen_do_not_stop_the_picture(tmp_path, points):
-    pixels(figures.particles([points], ["odd"], tmp_path / "a.png"))
+    pixels(plots.particles([points], ["odd"], tmp_path / "a.png"))
 
 
 def test_steps_that_did_not_converge_are_marked(tmp_path):
@@ -97,7 +97,7 @@ def test_steps_that_did_not_converge_are_marked(tmp_path):
 def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
     found, ink = [[0.0], [1.0], [2.0]], (0x2B, 0x2A, 0x28)
     alone, both = (
-        pixels(figures.panels(range(3), found, tmp_path / "a.png", names=["a"], title="", x_label="", true=true))
+        pixels(plots.panels(range(3), found, tmp_path / "a.png", names=["a"], title="", x_label="", true=true))
         for true in (None, found)
     )
     assert share_of(ink, both) > share_of(ink, alone) + 1e-3
@@ -105,14 +105,14 @@ def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
 
 @pytest.mark.parametrize("losses", [[1.0, np.nan, 0.0, 10.0], [-1.0, 0.0, np.inf, np.nan]])
 def test_a_loss_without_a_place_on_the_curve_is_left_out(tmp_path, losses):
-    image = pixels(figures.loss_curve(losses, tmp_path / "a.png"))
+    image = pixels(plots.loss_curve(losses, tmp_path / "a.png"))
     assert share_of((0x3D, 0x6B, 0x8E), image) > 1e-3
 
 
 @pytest.mark.parametrize("count", [1, 3, 6])
 def test_images_are_shown_in_srgb(tmp_path, count):
     shades = [(0.05 + 0.15 * k) * np.ones((16, 24, 3)) for k in range(count)]
-    image = pixels(figures.images(shades, [f"step {k}" for k in range(count)], tmp_path / "a.png", "moments"))
+    image = pixels(plots.images(shades, [f"step {k}" for k in range(count)], tmp_path / "a.png", "moments"))
     places = []
     for shade in shades:
         level = int(to_srgb(shade)[0, 0, 0])
@@ -128,9 +128,9 @@ def test_images_are_shown_in_srgb(tmp_path, count):
 def test_images_without_titles_are_a_sentence(tmp_path):
     for shown, titles in (([], []), ([np.zeros((2, 2, 3))], [])):
         with pytest.raises(InputError, match="titles"):
-            figures.images(shown, titles, tmp_path / "a.png")
+            plots.images(shown, titles, tmp_path / "a.png")
 
 
 def test_unwritable_picture_is_a_sentence(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
-        figures.loss_curve([1.0], tmp_path / "absent" / "loss.png")
+        plots.loss_curve([1.0], tmp_path / "absent" / "loss.png")

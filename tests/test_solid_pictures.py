@@ -9,7 +9,7 @@ from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.pictures.mirrored import mirrored
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.particle_sets import particles
+from cortado.pictures.plots import particles
 from cortado.pictures.scene_view import container_outline, outline, scene_view
 from cortado.pictures.shadow import NODES, REACH, FloorShadow
 from cortado.pictures.shown_solids import shown_solids

@@ -26,7 +26,7 @@ import numpy as np
 from cortado import Problem, Scene, Simulation, gradients, losses
 from cortado.files.progress import track
 from cortado.losses.image_losses import Pyramid
-from cortado.pictures.canvas import INK, PALETTE, drawing
+from cortado.pictures.plots import INK, PALETTE, drawing
 from cortado.render.scene_renderer import scene_renderer
 
 SPACING, GRAVITY = 0.025, (0.0, -9.81)

@@ -8,7 +8,7 @@ import numpy as np
 from cortado import DivergedError, InputError, Problem
 from cortado.files.srgb import to_srgb
 from cortado.losses import Image
-from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE, drawing
+from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing
 
 from .catalogue import task
 from .contenders import CONTENDERS

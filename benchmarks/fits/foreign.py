@@ -8,7 +8,7 @@ import cortado
 from cortado.optimisation.fitting.figures import AGREE
 from cortado.optimisation.fitting.fitted import Fit, with_error
 from cortado.optimisation.inverse.fit_task import load_fit
-from cortado.pictures.figures import images
+from cortado.pictures.plots import images
 
 from .dissipation import viscosity_by_energy
 from .film import column_of

@@ -24,7 +24,7 @@ from cortado.errors import InputError, shown, unwarned, warn
 from cortado.fixed import fixed
 from cortado.particles.state import State
 from cortado.pictures.notebook import with_picture
-from cortado.pictures.particle_sets import particles
+from cortado.pictures.plots import particles
 from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.durations import end_after, expected_frames, steps_of_run
 from cortado.rollout.outcome import trouble

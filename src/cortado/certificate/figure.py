@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE, drawing
+from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing
 
 if TYPE_CHECKING:
     from cortado.certificate import Certificate

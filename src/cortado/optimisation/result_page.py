@@ -10,8 +10,8 @@ import numpy as np
 
 from cortado.errors import CortadoError
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
-from cortado.pictures.figures import images, loss_curve, particles
 from cortado.pictures.notebook import as_words, picture, table
+from cortado.pictures.plots import images, loss_curve, particles
 from cortado.pictures.solid_lines import solid_outline
 from cortado.problem import Problem
 from cortado.scene.parameters.values import UNITS

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.pictures.canvas import DASHED, FAINT, PALETTE, drawing, whole_numbers
+from cortado.pictures.plots import DASHED, FAINT, PALETTE, drawing, whole_numbers
 from cortado.runs.sensors.log import Readings
 from cortado.runs.sensors.measured import Measured
 from cortado.runs.trajectory import Trajectory

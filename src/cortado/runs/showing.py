@@ -67,7 +67,7 @@ class Showing:
 
     def _repr_html_(self) -> str:
         """In motion, with y up; and its first, middle and last frame, coloured by speed."""
-        from cortado.pictures.particle_sets import particles
+        from cortado.pictures.plots import particles
 
         own = cast("Trajectory", self)
         if not len(own):

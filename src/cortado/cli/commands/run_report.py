@@ -9,9 +9,9 @@ import numpy as np
 from cortado.cli.commands.run_summary import simulated, sizes_in_words
 from cortado.files.terminal import say
 from cortado.files.video import write_video
-from cortado.pictures.figures import images, particles
 from cortado.pictures.film import lacking
 from cortado.pictures.pace import Pace
+from cortado.pictures.plots import images, particles
 from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.outcome import divergence_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout

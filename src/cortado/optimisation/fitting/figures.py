@@ -7,8 +7,7 @@ import numpy as np
 
 from cortado.optimisation.fitting.fitted import Fit, FittedPart, Profile, unit_of
 from cortado.optimisation.fitting.video import Video
-from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE, drawing
-from cortado.pictures.figures import images
+from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 from cortado.runs.report import Figures
 
 GREATEST_SERIES = 4

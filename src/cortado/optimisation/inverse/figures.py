@@ -11,8 +11,8 @@ from cortado.optimisation.inverse.shaded import step_pace
 from cortado.optimisation.inverse.task import Task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
-from cortado.pictures.figures import images, loss_curve, panels, particles
 from cortado.pictures.painter import colours_of
+from cortado.pictures.plots import images, loss_curve, panels, particles
 from cortado.pictures.solid_lines import solid_outline
 from cortado.runs.report import Figures
 from cortado.scene.parameters.parameter import Axis

@@ -1,16 +1,165 @@
-"""Particles side by side, seen along the third axis."""
+"""Plots by matplotlib: one look for all of them, and a PNG of each that appears whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.errors import InputError
+from cortado.files.atomic import write_atomically
 from cortado.files.srgb import to_srgb
-from cortado.pictures.canvas import FAINT, INK, drawing
+
+PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
+"""Muted colours that stay apart in print and for most eyes."""
+INK, FAINT = "#2b2a28", "#8a857c"
+DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
+STYLE = {
+    "font.size": 11,
+    "axes.titlesize": 12,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#ece8e1",
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "lines.linewidth": 1.8,
+    "legend.frameon": False,
+}
+
+
+@contextmanager
+def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
+    """A figure of so many inches, saved under `path` in one go when the block ends well."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    content = BytesIO()
+    with matplotlib.rc_context(STYLE):
+        layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
+        figure = Figure(figsize=(width, height), dpi=150, layout=layout)
+        FigureCanvasAgg(figure)
+        yield figure
+        figure.savefig(content, format="png")
+    write_atomically(Path(path), content.getvalue())
+
+
+def whole_numbers(axis: Any) -> None:
+    """Ticks of an axis at whole numbers only."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+
+
+def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
+    """Losses (evaluations,) over the evaluations, on a logarithmic scale where any is positive. What is not finite, and
+    on that scale what is not positive, is left out."""
+    values = np.asarray(losses, dtype=float)
+    shown = np.isfinite(values)
+    logarithmic = bool(np.any(values[shown] > 0.0))
+    shown &= (values > 0.0) | (not logarithmic)
+    numbers, values = np.flatnonzero(shown), values[shown]
+    with drawing(path) as figure:
+        axes = figure.subplots()
+        if logarithmic:
+            axes.set_yscale("log")
+        axes.plot(numbers, values, marker="o", markersize=4 if len(values) <= 40 else 0, color=PALETTE[0])
+        labels = {0: {"xytext": (0, 9), "ha": "center"}, len(values) - 1: {"xytext": (9, 0), "va": "center"}}
+        for k, place in labels.items() if len(values) else ():
+            end = (numbers[k], values[k])
+            axes.plot(*end, "o", color=PALETTE[0], markersize=7)
+            axes.annotate(f"{values[k]:.3g}", end, textcoords="offset points", weight="bold", **place)
+        axes.margins(x=0.06, y=0.14)
+        axes.set(title=title, xlabel="evaluation", ylabel=label)
+        whole_numbers(axes.xaxis)
+    return Path(path)
+
+
+def panels(
+    x: ArrayLike,
+    found: ArrayLike,
+    path: str | Path,
+    *,
+    names: Sequence[str],
+    title: str,
+    x_label: str,
+    unit: str = "",
+    true: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+) -> Path:
+    """Each component of what was found in a panel of its own, over whole numbers.
+
+    Args:
+        x: (k,) evaluations or steps.
+        found: (k, c).
+        names: c of them.
+        true: (c,) or (k, c), dashed; None where it is not known.
+        start: (c,) or (k, c), the first guess, faint.
+    """
+    x, found = np.asarray(x), np.asarray(found, dtype=float)
+    count = found.shape[1]
+    with drawing(path, height=1.6 + 1.9 * count) as figure:
+        rows = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+        for k, axes in enumerate(rows):
+            if start is not None:
+                axes.plot(x, np.broadcast_to(start, found.shape)[:, k], color=FAINT, linewidth=1.2, label="first guess")
+            axes.plot(x, found[:, k], color=PALETTE[k % len(PALETTE)], label="found")
+            if true is not None:
+                axes.plot(x, np.broadcast_to(true, found.shape)[:, k], **DASHED, color=INK, label="hidden")
+            axes.set_ylabel(f"{names[k]} [{unit}]" if unit else names[k])
+            axes.margins(x=0.02, y=0.15)
+        rows[0].set_title(title, pad=26)
+        rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+        rows[-1].set_xlabel(x_label)
+        whole_numbers(rows[-1].xaxis)
+        figure.align_ylabels()
+    return Path(path)
+
+
+_MOST_IN_A_ROW = 4
+
+
+def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
+    """Images in a row, such as start, target and result; more than 4 in a grid, such as moments on the way.
+
+    Args:
+        images: one (rows, columns, 3) linear image for each panel, from 0 to 1; the first row is at the top.
+        titles: one for each panel.
+        title: of the whole.
+    """
+    shown = [to_srgb(image) for image in images]
+    if not shown or len(shown) != len(titles):
+        raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
+    across = len(shown) if len(shown) <= _MOST_IN_A_ROW else ceil(sqrt(len(shown)))
+    down = -(-len(shown) // across)
+    tallness = max(image.shape[0] / image.shape[1] for image in shown)
+    panel = min(6.0, 11.0 / across, 7.0 / tallness)  # width [inch]
+    height = down * (panel * tallness + 0.35) + (0.6 if title else 0.25)
+    with drawing(path, max(across * (panel + 0.1), 8.0), max(height, 2.4)) as figure:
+        panels = figure.subplots(down, across, squeeze=False).ravel()
+        for axes in panels:
+            axes.set_axis_off()
+        for axes, image, name in zip(panels, shown, titles, strict=False):
+            axes.imshow(image)
+            axes.set_title(name)
+        if title:
+            figure.suptitle(title, weight="bold")
+    return Path(path)
+
 
 _FAR, _NEAR = "#c9d9e4", "#27506f"
 _MOST_DRAWN = 150_000
