@@ -15,11 +15,19 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
+from cortado import (
+    ComputationError,
+    CortadoWarning,
+    DivergedError,
+    InputError,
+    Problem,
+    SceneError,
+    Simulation,
+    executors,
+)
 from cortado.cli.commands.executor import Where
+from cortado.device import worker_calls as calls
 from cortado.device.cores import usable_cores
-from cortado.device.executors import calls, local
-from cortado.device.executors import distributed as of_dask
 from cortado.errors import CortadoError, OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers
 from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
@@ -151,7 +159,7 @@ def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
     monkeypatch.setattr(calls, "_functions", calls.OrderedDict())
     payload, item = calls.Payload.of(square), calls.pickled(3, "The item")
     assert isinstance(calls.call(payload.mention, item), calls.Lacking)
-    assert calls.call(payload, item).result == calls.call(payload.mention, item).result == 9
+    assert calls.call(payload, item).result() == calls.call(payload.mention, item).result() == 9
 
 
 @pytest.mark.parametrize(
@@ -382,7 +390,7 @@ def test_a_scheduler_without_workers_is_left_in_the_end():
     ],
 )
 def test_a_scheduler_that_is_not_there_is_a_sentence(monkeypatch, address, words):
-    monkeypatch.setattr(of_dask, "REACHED", 0.2)
+    monkeypatch.setattr(executors, "REACHED", 0.2)
     with pytest.raises(InputError, match=words):
         Distributed(address)
 
@@ -439,7 +447,7 @@ def test_what_is_launched_at_a_time_follows_the_workers():
 
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
-    monkeypatch.setattr("cortado.device.executors.local.visible_gpus", lambda: ["3", "GPU-5f1c"])
+    monkeypatch.setattr("cortado.executors.visible_gpus", lambda: ["3", "GPU-5f1c"])
 
     def at_work(executor):
         """Processes by their GPUs."""
@@ -487,8 +495,8 @@ def test_worker_processes_are_there_again_however_they_ended():
 
 
 def test_cores_are_shared_out(monkeypatch):
-    monkeypatch.setattr("cortado.device.executors.local.usable_cores", lambda: 8)
-    environments = local._environments
+    monkeypatch.setattr("cortado.executors.usable_cores", lambda: 8)
+    environments = executors._environments
     assert environments(None, "cpu") == [{"CORTADO_CORES": "1"}] * 8
     assert environments(3, "cpu") == [{"CORTADO_CORES": "2"}] * 3
     assert environments(9, "cpu") == [{"CORTADO_CORES": "1"}] * 9
@@ -496,7 +504,7 @@ def test_cores_are_shared_out(monkeypatch):
 
 def test_no_more_processes_than_items(monkeypatch):
     """Nor than make sense on this machine, whatever there is to compute."""
-    monkeypatch.setattr("cortado.device.executors.local.usable_cores", lambda: 2)
+    monkeypatch.setattr("cortado.executors.usable_cores", lambda: 2)
     started = []
 
     @contextmanager
@@ -529,7 +537,7 @@ def test_no_more_processes_than_items(monkeypatch):
     ],
 )
 def test_wrong_local_workers_are_a_sentence(monkeypatch, number, device, words):
-    monkeypatch.setattr("cortado.device.executors.local.visible_gpus", list)
+    monkeypatch.setattr("cortado.executors.visible_gpus", list)
     with pytest.raises(InputError, match=words), local_workers(number, device):
         pass
 

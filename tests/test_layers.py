@@ -46,7 +46,7 @@ def imports(source: str, module: str, known: set[str]) -> set[str]:
 
 MODULES = modules()
 MOST_PACKAGES = 17
-MOST_LINES = 320
+MOST_LINES = 450
 
 
 def above(sources: dict[str, str]) -> dict[str, set[str]]:
@@ -175,6 +175,8 @@ def test_the_discretisation_is_without_warp(module):
 def test_no_file_has_more_than_one_topic():
     """By its length; the longest ones hold one."""
     long = {
-        name: n for name, path in MODULES.items() if (n := len(path.read_text(encoding="utf-8").splitlines())) > 320
+        name: n
+        for name, path in MODULES.items()
+        if (n := len(path.read_text(encoding="utf-8").splitlines())) > MOST_LINES
     }
     assert not long

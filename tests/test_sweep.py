@@ -18,9 +18,9 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from compiling_notice import without_compiling
 from cortado import InputError
+from cortado import executors as of_dask
 from cortado.cli import main
 from cortado.cli.arguments import ALL_FRAMES
-from cortado.device.executors import distributed as of_dask
 from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
 from cortado.optimisation.sweep.combinations import combinations

@@ -1,5 +1,447 @@
-"""Where independent work is computed, such as the members of an ensemble; see `docs/many_machines.md`."""
+"""Executors: where work is computed whose parts do not depend on one another, such as the members of an ensemble.
 
-from cortado.device.executors import *  # noqa: F403
-from cortado.device.executors import __all__ as __all__
-from cortado.device.executors import __dir__ as __dir__
+`InProcess`, one after the other, is the default. `Distributed` has the workers of a scheduler of Dask's distributed, on
+any number of machines; `local_workers` starts some on this one, such as one for each GPU.
+"""
+
+import asyncio
+import logging
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+from uuid import uuid4
+
+from cortado.arrays import require_arguments, require_function, require_whole
+from cortado.calls import face
+from cortado.device.cores import VARIABLE as CORES
+from cortado.device.cores import usable_cores
+from cortado.device.driver import VISIBLE, visible_gpus
+from cortado.device.worker_calls import Answer, Lacking, Payload, call, in_words, pickled
+from cortado.errors import ComputationError, InputError, shown, warn
+from cortado.files.interruption import Hold
+from cortado.words import counted
+
+if TYPE_CHECKING:
+    import distributed
+
+__all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+OnResult = Callable[[int, Any], None]
+"""Called in the caller's thread with the number of an item, from 0, and its result, as results arrive."""
+
+
+class Executor(ABC):
+    """Computes a function of many items that do not depend on one another.
+
+    Where an executor computes changes no bit of a result on the same kind of processor.
+    """
+
+    def threads(self) -> int:
+        """How many items are computed at a time."""
+        return 1
+
+    @abstractmethod
+    def map(
+        self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
+    ) -> list[Result]:
+        """The function's result for every item, in the order of the items.
+
+        The function keeps what is large, such as a problem, and items are small. Items are taken as they are needed.
+        Raises what the function raised for the first item, in their order, for which it raised anything.
+        """
+
+
+@dataclass(frozen=True)
+class InProcess(Executor):
+    """Computes one item after the other in this process."""
+
+    def map(
+        self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
+    ) -> list[Result]:
+        _check_call(function, items, on_result)
+        results = []
+        for number, item in enumerate(items):
+            results.append(function(item))
+            if on_result is not None:
+                on_result(number, results[-1])
+        return results
+
+
+def _check_call(function: Any, items: Any, on_result: Any) -> None:
+    """Raises `InputError` for arguments of `Executor.map` that it cannot work with."""
+    require_arguments("function", function, ("an item",))
+    if not isinstance(items, Iterable):
+        raise InputError(f"items is {shown(items)}, but must be a list of them.")
+    require_function("on_result", on_result, "the number of an item", "its result")
+
+
+def checked_executor(executor: Any) -> Executor:
+    """The executor; raises `InputError` for anything else, such as a client of Dask, whose ``map`` is another."""
+    if not isinstance(executor, Executor):
+        is_class = isinstance(executor, type)
+        found = f"the class {executor.__name__}" if is_class else f"of the type {type(executor).__name__}"
+        raise InputError(
+            f"executor is {found}, but must be an object such as cortado.executors.InProcess() or "
+            "Distributed(scheduler)."
+        )
+    return executor
+
+
+# ---- workers of a scheduler --------------------------------------------------------------------------------------
+
+REACHED = 10.0
+"""[s] within which a scheduler answers."""
+LOOK = 1.0
+"""[s] after which workers are counted again."""
+WAIT = 0.1
+"""[s] after which the first worker is looked for again."""
+AHEAD = 2
+"""Items at a time for each thread of a worker: one that is computed and others that wait, so that none is idle."""
+
+
+class Distributed(Executor):
+    """Computes on the workers of a scheduler of Dask's distributed.
+
+    What a lost worker was computing is computed again by another one. Results arrive in the order of the items, with
+    the bits that they have in one process, and errors are raised here as they were there. A worker computes one item
+    at a time, and keeps the last functions that it was sent, with their problems.
+    """
+
+    def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
+        """``scheduler``: its address, such as "tcp://10.0.0.1:8786", or a client of it; ``patience`` [s]: how long to
+        wait where there is no worker left.
+
+        Raises `InputError` where distributed is not installed, or where there is no scheduler.
+        """
+        module = _distributed()
+        self.patience = patience
+        self._owned = isinstance(scheduler, str)
+        self.client = _connected(module, scheduler) if isinstance(scheduler, str) else scheduler
+        if not isinstance(self.client, module.Client) or self.client.asynchronous:
+            wanted = 'an address such as "tcp://10.0.0.1:8786", or a distributed.Client that is not asynchronous'
+            raise InputError(f"scheduler is {shown(scheduler)}, but must be {wanted}.")
+        self.address: str = self.client.scheduler.address
+
+    def __repr__(self) -> str:
+        return f"Distributed({self.address!r})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise InputError("An executor cannot be used within what an executor computes: leave one of the two out.")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the scheduler, unless with a client that was given."""
+        if self._owned:
+            self.client.close()
+
+    def map(
+        self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
+    ) -> list[Result]:
+        """See `Executor.map`. ``function``, items and results are pickled.
+
+        Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
+        scheduler or all workers are lost for good, or an item ends its process.
+        """
+        _check_call(function, items, on_result)
+        return _Map(self, Payload.of(function), on_result).results(items)
+
+    def threads(self) -> int:
+        """How many items workers compute at a time; raises `ComputationError` where the scheduler is lost."""
+        if self.client.status != "running":
+            raise self.lost()
+        try:
+            return sum(self.client.nthreads().values())
+        except OSError as error:
+            raise self.lost() from error
+
+    def replace_workers(self) -> None:
+        """Start workers in the place of those that have ended, where they are processes of this machine; called every
+        second while there is something to compute."""
+
+    def lost(self) -> ComputationError:
+        """The error where the scheduler is not there any more."""
+        return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
+
+    def deserted(self, seconds: float) -> ComputationError:
+        """The error where there was no worker for so long [s]."""
+        return ComputationError(
+            f"The scheduler {self.address} has had no worker for {seconds:.0f} s; start some, such as by "
+            f"`dask worker {self.address} --nthreads 1`."
+        )
+
+
+class _Map:
+    """One function, mapped over items by the workers."""
+
+    def __init__(self, executor: Distributed, payload: Payload, on_result: OnResult | None):
+        self._executor, self._payload, self._on_result = executor, payload, on_result
+        self._calls = executor.client.get_executor(pure=False)
+        self._sent: dict[Future[Any], tuple[int, bytes]] = {}
+        """Numbers and items that workers have, by their futures."""
+        self._results: dict[int, Any] = {}
+        self._failed: tuple[int, BaseException] | None = None
+        """The first item, in their order, whose error is known, and its error."""
+        self._name = f"cortado-{uuid4().hex}"
+        self._lost: deque[str] = deque()
+        """Addresses of workers that were lost with items, of which nothing was said yet."""
+        self._most = 0
+        """How many items workers are given at a time."""
+        self._counted, self._manned = -LOOK, time.monotonic()
+        """When the workers were counted last, and when there were any [s]."""
+
+    def results(self, items: Iterable[Item]) -> list[Any]:
+        """The results in the order of the items."""
+        import dask
+
+        with self._watched(), dask.config.set({"distributed.admin.large-graph-warning-threshold": 2**40}):
+            left = enumerate(items)
+            try:
+                while self._fill(left):
+                    done, _ = wait(self._sent, LOOK, FIRST_COMPLETED)
+                    self._count_workers(LOOK)
+                    self._warn()
+                    for future in done:
+                        if future in self._sent:  # or else given up, as an item before it failed
+                            self._take(future)
+            finally:
+                with suppress(OSError):  # the scheduler may be lost
+                    self._calls.shutdown(wait=False)
+        self._warn()
+        if self._failed is not None:
+            raise self._failed[1]
+        return [self._results[number] for number in range(len(self._results))]
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Within it workers that are lost with items of this map are noted."""
+
+        def hear(event: tuple[float, dict[str, Any]]) -> None:
+            _, said = event
+            tasks = said.get("processing-tasks", ()) if said.get("action") == "remove-worker" else ()
+            if any(str(key).startswith(self._name) for key in tasks):
+                self._lost.append(str(said.get("worker")))
+
+        client = self._executor.client
+        client.subscribe_topic("all", hear)
+        try:
+            yield
+        finally:
+            with suppress(ValueError, OSError):
+                client.unsubscribe_topic("all")
+
+    def _warn(self) -> None:
+        while self._lost:
+            worker = self._lost.popleft()
+            warn(f"The worker {worker} was lost; what it was computing is computed again by another one.")
+
+    def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
+        """Send as many items as workers need, none after an error; whether there is anything to wait for."""
+        self._count_workers(LOOK)
+        while not self._most and not self._sent:  # how much an item asks for may depend on how many workers there are
+            time.sleep(WAIT)
+            self._count_workers(WAIT)
+        while len(self._sent) < self._most and self._failed is None and (pair := next(left, None)):
+            number, item = pair
+            self._send(self._payload.mention, number, pickled(item, f"Item {number}"))
+        return bool(self._sent)
+
+    def _send(self, payload: Payload, number: int, item: bytes) -> None:
+        # The function is no task of its own: items would queue up for the worker that has it while others are idle.
+        key = f"{self._name}-{number}{'-again' * (payload.content is not None)}"
+        self._sent[self._calls.submit(call, payload, item, key=key)] = number, item
+
+    def _count_workers(self, interval: float) -> None:
+        """Count workers, unless they were counted within the interval [s]; raises `ComputationError` where the
+        scheduler is lost, or where there was no worker for too long."""
+        now = time.monotonic()
+        if now - self._counted < interval:
+            return
+        self._counted = now
+        self._executor.replace_workers()
+        threads = self._executor.threads()
+        self._most = AHEAD * threads
+        self._manned = now if threads else self._manned
+        if now - self._manned > self._executor.patience:
+            raise self._executor.deserted(now - self._manned)
+
+    def _take(self, future: Future[Any]) -> None:
+        """Take the result of a call that has ended; the whole function goes to a worker that does not have it."""
+        number, item = self._sent.pop(future)
+        try:
+            answer = self._answer(future, number)
+            if isinstance(answer, Lacking):
+                return self._send(self._payload, number, item)
+            self._results[number] = answer.result()
+        except Exception as error:
+            return self._fail(number, error)
+        if self._on_result is not None:
+            self._on_result(number, self._results[number])
+
+    def _answer(self, future: Future[Any], number: int) -> Answer | Lacking:
+        """The answer of a call that has ended; raises `ComputationError` where there is none."""
+        try:
+            answer = future.result()
+        except CancelledError:
+            raise self._executor.lost() from None
+        except _distributed().KilledWorker as error:
+            raise ComputationError(
+                f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost one after the other "
+                "while they had it: they may have too little memory for it."
+            ) from None
+        except Exception as error:  # of distributed itself, such as a worker without Cortado
+            raise ComputationError(f"Item {number} could not be computed by a worker: {in_words(error)}.") from error
+        assert isinstance(answer, (Answer, Lacking))
+        return answer
+
+    def _fail(self, number: int, error: BaseException) -> None:
+        """Note an error; only items before it are still of interest."""
+        if self._failed is None or number < self._failed[0]:
+            self._failed = number, error
+        for future in [future for future, (other, _) in self._sent.items() if other > self._failed[0]]:
+            del self._sent[future]
+            future.cancel()
+
+
+def _distributed() -> Any:
+    """Dask's distributed; raises `InputError` where it is not installed."""
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        raise InputError(
+            "Several processes need Dask's distributed, which is not installed: pip install distributed."
+        ) from None
+    return distributed
+
+
+def _connected(module: Any, address: str) -> Any:
+    """A client of the scheduler at an address; raises `InputError` where there is none."""
+    from distributed.comm import connect
+
+    async def meet() -> None:
+        """Raises `OSError` unless something of Dask's answers. A client that fails would go on trying for a while."""
+        comm = await connect(address, timeout=REACHED)
+        await comm.close()
+
+    # In a thread, as notebooks have an event loop in theirs.
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            thread.submit(asyncio.run, meet()).result()
+        except (OSError, ValueError, TypeError) as error:
+            reason = f"nothing there answers as one within {REACHED:g} s" if isinstance(error, OSError) else error
+            raise InputError(
+                f"There is no scheduler at {address!r}, but an address such as tcp://10.0.0.1:8786 is needed: {reason}."
+            ) from None
+    return module.Client(address, timeout=REACHED, set_as_default=False)
+
+
+# ---- worker processes on this machine ----------------------------------------------------------------------------
+
+LOOPBACK = "127.0.0.1"
+GONE = "3 s"
+"""After so long another process takes the place of one that has ended, and was not started again."""
+PROCESSES_A_CORE = 4
+"""At most; each has some 200 MB of its own."""
+LEAST_LIMIT = 64
+"""The limit where there are few cores."""
+IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""Leaves Ctrl-C, which a terminal sends to all processes, to the one that started the workers."""
+
+
+class LocalWorkers(Distributed):
+    """Worker processes on this machine, each with a nanny in this process that starts it again when it is killed."""
+
+    def __init__(self, client: Any, cluster: Any):
+        super().__init__(client)
+        self._cluster = cluster
+
+    def replace_workers(self) -> None:
+        """Where a nanny ended with its worker, the cluster lets go of it after `GONE`; this starts another one."""
+        self._cluster.scale(len(self._cluster.worker_spec))
+
+    def deserted(self, seconds: float) -> ComputationError:
+        """The error where there was no worker for so long [s]."""
+        return ComputationError(
+            f"No worker process has started for {seconds:.0f} s; there may be too little memory for it, or the script "
+            'does not begin under `if __name__ == "__main__":`.'
+        )
+
+
+@contextmanager
+def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
+    """Worker processes on this machine, which a scheduler in this process starts, starts again when they are lost, and
+    ends with the block.
+
+    ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda". The cores are
+    shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin under
+    ``if __name__ == "__main__":``, as every process imports it. Raises `InputError` for more processes than there are
+    GPUs, or than four for each core, and 64.
+    """
+    import dask
+
+    module = _distributed()
+    environments = _environments(number, device)
+    options: dict[str, Any] = {"nthreads": 1, "memory_limit": None, "silence_logs": logging.CRITICAL, "host": LOOPBACK}
+    options["preload"] = [IGNORE_INTERRUPTS]
+    workers = {
+        name: {"cls": module.Nanny, "options": {**options, "env": variables}}
+        for name, variables in enumerate(environments)
+    }
+    somewhere = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0", "dashboard": False}
+    scheduler = {"cls": module.Scheduler, "options": somewhere}
+    hold = Hold()
+    with ExitStack() as stack:
+        if sys.platform != "win32":  # a thread that starts it, to remove semaphores, would let Ctrl-C through again
+            from multiprocessing import resource_tracker
+
+            resource_tracker.ensure_running()
+        hold.begin()
+        stack.callback(hold.end)
+        stack.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": GONE}))
+        cluster = stack.enter_context(module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL))
+        client = stack.enter_context(module.Client(cluster, set_as_default=False))
+        stack.callback(hold.begin)  # first of all at the end, as a second Ctrl-C would leave workers behind
+        hold.end()
+        yield LocalWorkers(client, cluster)
+
+
+def _environments(number: int | None, device: str) -> list[dict[str, str]]:
+    """Environment variables of each process."""
+    if number is not None:
+        require_processes("number", number)
+    if device == "cpu":
+        number = number or usable_cores()
+        return [{CORES: str(max(usable_cores() // number, 1))}] * number
+    if device != "cuda":
+        raise InputError(f'device is {shown(device)}, but must be "cpu", or "cuda" for all GPUs.')
+    gpus = visible_gpus()
+    if (number or 1) > len(gpus):
+        raise InputError(f"{number or 1} worker processes need a GPU each, but there are {len(gpus)}.")
+    return [{VISIBLE: gpu} for gpu in gpus[:number]]
+
+
+def require_processes(what: str, number: object) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless so many processes make sense here."""
+    require_whole(what, number, 1)
+    cores = usable_cores()
+    most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)
+    if number > most:  # type: ignore[operator]
+        raise InputError(
+            f"{what} is {shown(number)}, but must be at most {most}, as this machine has {counted(cores, 'core')}: "
+            "more processes than cores compute nothing sooner."
+        )
+
+
+__dir__ = face(globals())

@@ -2,15 +2,19 @@
 then finds no GPU."""
 
 import ctypes
+import os
 import sys
 from contextlib import suppress
 from typing import Any
 
 import warp as wp
 
+from cortado.device.kernel_cache import start_warp
 from cortado.errors import InputError, shown
 
 Version = tuple[int, int]
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+"""The environment variable that says which GPUs a process has."""
 PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
 
 
@@ -60,3 +64,11 @@ def device_named(name: str) -> Any:
         return wp.get_device(name)
     except (RuntimeError, ValueError) as error:
         raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.") from error
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as CUDA names them."""
+    start_warp()
+    given = [name.strip() for name in os.environ.get(VISIBLE, "").split(",") if name.strip()]
+    present = wp.get_cuda_device_count()
+    return given[:present] if given else [str(k) for k in range(present)]

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cortado.arrays import as_numbers, is_whole, require_at_most, require_whole
-from cortado.device.executors.executor import Executor, InProcess, checked_executor
 from cortado.device.memory import require
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
+from cortado.executors import Executor, InProcess, checked_executor
 from cortado.fixed import keep_own
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
 from cortado.gradients.points import Point, Sample, evaluated

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cortado.device.executors.executor import Executor, OnResult
 from cortado.errors import DivergedError, InputError, OutOfRangeError
+from cortado.executors import Executor, OnResult
 from cortado.gradients.estimator import (
     AdjointEstimator,
     Batchable,

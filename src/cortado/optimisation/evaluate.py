@@ -6,8 +6,8 @@ import numpy as np
 
 from cortado.arrays import as_one_number, require_function, require_methods, require_table
 from cortado.calls import public
-from cortado.device.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.errors import InputError, shown, warn
+from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
 from cortado.gradients.points import FalliblePoint, evaluated, without_runs

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
-from cortado.device.executors.executor import InProcess
 from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.executors import InProcess
 from cortado.gradients.left_out import Tally
 from cortado.gradients.points import FalliblePoint, evaluated
 from cortado.optimisation.differentiable import Optimisable, loss_and_gradient

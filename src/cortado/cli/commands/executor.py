@@ -4,9 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from cortado.device.executors.local import require_processes
 from cortado.errors import InputError
-from cortado.executors import Distributed, Executor, InProcess, local_workers
+from cortado.executors import Distributed, Executor, InProcess, local_workers, require_processes
 from cortado.files.interruption import keeping
 
 

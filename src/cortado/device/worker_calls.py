@@ -16,7 +16,7 @@ from hashlib import sha256
 from importlib import metadata
 from typing import Any
 
-from cortado.errors import ComputationError, CortadoError, InputError
+from cortado.errors import ComputationError, CortadoError, InputError, warn
 from cortado.version import __version__
 
 KEPT = 2
@@ -66,10 +66,15 @@ class Answer:
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
     """(text, category) of each warning."""
 
-    @property
     def result(self) -> Any:
-        """What the function returned."""
-        return pickle.loads(self.content)
+        """What the function returned, with its warnings; raises what it raised."""
+        for text, category in self.warnings:
+            warn(text, category)
+        if self.error is None:
+            return pickle.loads(self.content)
+        if self.traceback:
+            self.error.add_note(f"In a worker process:\n{self.traceback}")
+        raise self.error
 
 
 def pickled(value: Any, what: str) -> bytes:
