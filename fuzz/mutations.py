@@ -34,7 +34,7 @@ EDGES: Mapping[str, Sequence[Any]] = {
     "viscosity": (0.0, 1e3, "none", "laminar", "pairwise", [0.1]),
     "kernel": ("cubic_spline", "wendland_c2", "wendland_c4"),
     "optimiser": ("adam", "gradient_descent", "lbfgs"),
-    "name": ("exact", "frozen_geometry", "adjoint_viscosity", "water"),
+    "name": ("exact", "adjoint_viscosity", "water"),
     "periodic": ([True, True], [True, False, True], [False, False, True]),
     "pressure": (False,),
     "lid": (False, True),

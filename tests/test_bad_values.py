@@ -120,7 +120,6 @@ def calls():
         "LBFGS": (optimisers.LBFGS, {"memory": 5}),
         "GradientDescent": (optimisers.GradientDescent, {"learning_rate": 0.1}),
         "LineSearch": (optimisers.LineSearch, {}),
-        "Damped": (gradients.Damped, {}),
         "Guided": (gradients.Guided, {"samples": 4, "spread": 0.1}),
         "RandomizedSmoothing": (gradients.RandomizedSmoothing, {"samples": 4, "spread": 0.1}),
         "EnsembleMean": (
@@ -193,7 +192,6 @@ ARGUMENTS = [
         "GradientDescent": ("learning_rate",),
         "LBFGS": ("memory", "tolerance", "scale"),
         "LineSearch": ("scale", "trials", "shortest", "momentum"),
-        "Damped": ("rate",),
         "Guided": ("samples", "spread", "seed"),
         "RandomizedSmoothing": ("samples", "spread", "seed"),
         "EnsembleMean": ("samples", "spread", "seed", "estimator"),

@@ -22,9 +22,7 @@ FREE = {
 RANDOM = np.random.default_rng(3)
 ESTIMATORS = [
     gradients.Exact(),
-    gradients.FrozenGeometry(),
     gradients.AdjointViscosity(20.0, order=2),
-    gradients.Damped(3.0),
     gradients.Tape(),
 ]
 

@@ -82,9 +82,9 @@ def centre(simulation):
 
 @cache
 def long():
-    """250 steps of a splash in the plane, long beyond its horizon; after 300 no estimator agrees by more than 0.75."""
+    """235 steps of a splash in the plane, long beyond its horizon; after 300 no estimator agrees by more than 0.75."""
     forces = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
-    return certify(problem_of(plane(forces=forces), 250, centre), ["gravity"])
+    return certify(problem_of(plane(forces=forces), 235, centre), ["gravity"])
 
 
 def test_beyond_the_horizon_another_estimator_is_advised():
@@ -104,10 +104,10 @@ def test_averages_are_tried_where_no_single_run_is_good(monkeypatch):
     problem = problem_of(plane(), 20)
     found = certify(problem)
     names = [judged.estimator for judged in found.alignment.estimators]
-    assert names[3:] == ["EnsembleMean(spread)", "Guided(spread)"] and found.estimator == "Exact()"
-    assert all(judged.cosine > 0.99 for judged in found.alignment.estimators[3:])
+    assert names[2:] == ["EnsembleMean(spread)", "Guided(spread)"] and found.estimator == "Exact()"
+    assert all(judged.cosine > 0.99 for judged in found.alignment.estimators[2:])
     late = replace(found, horizons=tuple(replace(one, exact=10.0 * one.exact) for one in found.horizons))
-    guided = tuple(one for one in late.alignment.estimators if one.estimator != "EnsembleMean(spread)")[::3]
+    guided = tuple(one for one in late.alignment.estimators if one.estimator != "EnsembleMean(spread)")[::2]
     advised = replace(late, alignment=replace(late.alignment, estimators=guided))
     assert "use gradients.Guided(spread) with spread = {'gravity': 0." in str(advised)
 
@@ -430,13 +430,13 @@ def test_the_advice():
     found = replace(long(), horizons=(far,))
     judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity()", 0.8, 1.0)]
     for (cosine, size), wanted in {
-        (0.9, 1.0): "FrozenGeometry()",
+        (0.9, 1.0): "EnsembleMean(spread)",
         (0.9, 3.0): "AdjointViscosity()",
         (0.7, 1.0): "AdjointViscosity()",
     }.items():
-        both = (*judged, Judged("FrozenGeometry()", cosine, size))
+        both = (*judged, Judged("EnsembleMean(spread)", cosine, size))
         assert replace(found, alignment=Alignment(0.1, both)).estimator == wanted
-    lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
+    lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("EnsembleMean(spread)", 0.2, 1.0))
     assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, alignment=None).estimator == "AdjointViscosity()"
 

@@ -137,12 +137,6 @@ class Twin:
         found = self.slow.step(x, v, self.gravity, 1000.0 * self.volume * ones, 1000.0 * ones, 5.0 * ones, DT, 5)
         return np.concatenate([array.ravel() for array in found])
 
-    def detached(self, jacobian):
-        """That of (x, v) -> (x + dt v', v'), where v' knows v alone."""
-        n = len(jacobian) // 2
-        b = jacobian[n:, n:]
-        return np.block([[np.eye(n), DT * b], [np.zeros((n, n)), b]])
-
     def viscosity(self, state, coefficient):
         """(n, n) what a filter of the adjoint of one coordinate is."""
         x, v = state.reshape(2, *self.shape)
@@ -160,9 +154,8 @@ class Twin:
         chain = [estimator]
         while hasattr(chain[0], "base"):
             chain.insert(0, chain[0].base)
-        frozen = isinstance(chain[0], gradients.FrozenGeometry)
         for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
-            bar = (self.detached(jacobian) if frozen else jacobian).T @ bar
+            bar = jacobian.T @ bar
             for each in chain[1:]:
                 bar = self.filtered(bar, state, each)
         return bar
@@ -170,8 +163,6 @@ class Twin:
     def filtered(self, bar, state, estimator):
         """What an estimator does to the adjoint of a state."""
         x_bar, v_bar = bar.reshape(2, *self.shape)
-        if isinstance(estimator, gradients.Damped):
-            v_bar = np.exp(-estimator.rate * DT) * v_bar
         if isinstance(estimator, gradients.AdjointViscosity):
             viscosity = self.viscosity(state, estimator.coefficient)
             x_bar, v_bar = (limited(viscosity @ a, estimator.limit) for a in (x_bar, v_bar))
@@ -187,16 +178,12 @@ def limited(vectors, times):
 twin_of = cache(Twin)
 ESTIMATORS = (
     gradients.Exact(),
-    gradients.FrozenGeometry(),
     gradients.AdjointViscosity(),
     gradients.AdjointViscosity(5.0),
     gradients.AdjointViscosity(1000.0, limit=np.inf),
     gradients.AdjointViscosity(5.0, limit=1.1),
     gradients.AdjointViscosity(5.0, limit=1.1, order=2),
-    gradients.AdjointViscosity(5.0, base=gradients.FrozenGeometry()),
     gradients.AdjointViscosity(5.0, base=gradients.Tape()),
-    gradients.Damped(100.0),
-    gradients.Damped(100.0, base=gradients.AdjointViscosity(5.0)),
 )
 
 
@@ -211,52 +198,6 @@ def test_gradients_equal_those_of_the_twin(estimator, dimension):
     gradient = np.concatenate([found[name].ravel() for name in slow.point])
     np.testing.assert_allclose(gradient, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
     assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (estimator != gradients.Exact())
-
-
-# ---- velocities only ------------------------------------------------------------------------------------------------
-
-
-@kinds
-def test_velocity_only_leaves_out_positions_and_nothing_else(kind):
-    """Of one step everything but the first positions' derivative is exact; theirs is that without forces."""
-    simulation = simulation_of(kind)
-    problem, point = Problem(simulation, 1, Mixed(simulation)), point_of(simulation)
-    _, exact = problem.value_and_gradient(point)
-    _, found = problem.value_and_gradient(point, gradients.FrozenGeometry())
-    first = exact.pop("initial_positions")
-    for name, wanted in exact.items():
-        np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-12 * np.abs(wanted).max(), err_msg=name)
-    alone = problem.loss.weights[0].copy()
-    if simulation.scene.emitter:
-        alone[~moved(problem, point)] = 0.0
-    np.testing.assert_array_equal(found["initial_positions"], alone)
-    assert np.linalg.norm(first - alone) > 0.01 * np.linalg.norm(alone)
-
-
-def moved(problem, point):
-    """(n,) which particles of a step are free: those that a change of all velocities moves."""
-    changed = {**point, "initial_velocities": point["initial_velocities"] + 1.0}
-    return (problem.end(point).positions != problem.end(changed).positions).any(axis=1)
-
-
-@pytest.mark.parametrize("make", [splash, plane])
-def test_velocity_only_grows_at_most_linearly(make):
-    simulation = Simulation(make(), precision="float64")
-    steps = 300
-    problem, dt = Problem(simulation, steps, losses.FinalPositions(simulation.positions + 0.1)), 0.0021
-    point = {"initial_positions": point_of(simulation)["initial_positions"]}
-    norms = norms_of(problem, point, gradients.FrozenGeometry())
-    np.testing.assert_allclose(norms[:, 0], norms[-1, 0], rtol=1e-13)
-    back = steps - np.arange(steps + 1)
-    assert (norms[:, 1] <= 1.05 * back * dt * norms[:, 0]).all()
-    exact = norms_of(problem, point, gradients.Exact())
-    assert exact[0, 1] > 10.0 * steps * dt * exact[-1, 0]
-
-
-def norms_of(problem, point, estimator):
-    norms = gradients.AdjointNorms(problem.simulation.solver, problem.steps)
-    problem.estimate(point, estimator, norms)
-    return norms.numpy()
 
 
 # ---- smoothing ------------------------------------------------------------------------------------------------------
@@ -368,12 +309,11 @@ def test_a_shear_flow_has_the_strain_rate_that_one_knows(kind, axes):
 
 
 @kinds
-@pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(0), gradients.Damped(0.0)], ids=repr)
-def test_without_strength_an_estimator_is_exact_bit_for_bit(kind, estimator):
+def test_without_strength_a_viscosity_is_exact_bit_for_bit(kind):
     simulation = simulation_of(kind)
     problem, point = Problem(simulation, 5, losses.FinalPositions(simulation.positions + 0.1)), point_of(simulation)
     _, exact = problem.value_and_gradient(point)
-    found = problem.estimate(point, estimator)
+    found = problem.estimate(point, gradients.AdjointViscosity(0))
     for name, wanted in exact.items():
         assert found.gradient[name].tobytes() == wanted.tobytes(), name
 
@@ -406,18 +346,18 @@ def test_where_the_flow_is_calm_the_gradient_is_exact(make):
 
 
 @kinds
-@pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(), gradients.FrozenGeometry()], ids=repr)
-def test_the_same_bits_twice_and_float32_is_near(kind, estimator):
-    gradients = []
+def test_the_same_bits_twice_and_float32_is_near(kind):
+    found = []
     for precision in ("float64", "float64", "float32"):
         simulation = Simulation(MAKERS[kind](), precision=precision)
         loss = losses.FinalPositions(simulation.positions + 0.1)
-        gradients.append(Problem(simulation, 20, loss).value_and_gradient(point_of(simulation), estimator)[1])
-    for name, wanted in gradients[0].items():
-        assert wanted.tobytes() == gradients[1][name].tobytes(), name
+        problem = Problem(simulation, 20, loss)
+        found.append(problem.value_and_gradient(point_of(simulation), gradients.AdjointViscosity())[1])
+    for name, wanted in found[0].items():
+        assert wanted.tobytes() == found[1][name].tobytes(), name
     for name in ("gravity", "initial_velocities"):
-        size = np.linalg.norm(gradients[0][name])
-        assert np.linalg.norm(gradients[2][name] - gradients[0][name]) < 1e-2 * size, name
+        size = np.linalg.norm(found[0][name])
+        assert np.linalg.norm(found[2][name] - found[0][name]) < 1e-2 * size, name
 
 
 # ---- long runs ------------------------------------------------------------------------------------------------------
@@ -1018,7 +958,6 @@ MISTAKES = {
     "coefficient below 0": lambda p: gradients.AdjointViscosity(-1.0),
     "endless coefficient": lambda p: gradients.AdjointViscosity(np.inf),
     "limit below 1": lambda p: gradients.AdjointViscosity(limit=0.5),
-    "rate below 0": lambda p: gradients.Damped(-1.0),
     "one sample": lambda p: gradients.RandomizedSmoothing(samples=1),
     "an odd number of guiding samples": lambda p: gradients.Guided(samples=3),
     "a spread in words": lambda p: gradients.Guided("wide"),

@@ -297,7 +297,6 @@ def test_some_particles_have_left_the_nozzle_and_some_have_not():
 
 
 ELSEWHERE = {
-    "frozen_force_adjoint": "an estimator that is not exact: tests/test_estimators.py",
     "implicit_kernels": "of what comes before and after a solve: whole steps in tests/test_implicit_viscosity.py",
     "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
     "velocity_kernels": "the same",

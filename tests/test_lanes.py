@@ -18,7 +18,6 @@ from cortado.gradients.filter_kernels import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import fill_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
-from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
@@ -91,7 +90,6 @@ def kernels_of(discretisation):
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
     alone = [
         fill_kernel(discretisation),
-        frozen_force_adjoint(discretisation),
         filters.crowd,
         filters.strength,
         filters.viscosity,

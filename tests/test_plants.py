@@ -84,7 +84,6 @@ ELSEWHERE = {
     "solvers.projection.mean_stress": "of a quantity too: tests/test_mean_stress.py",
     "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
     "sph.stress_wall_kernels": "of loads too",
-    "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""
 FEWEST = {"functions": 48, "plants": 226}

@@ -81,7 +81,6 @@ FORCES = {"forces of one's own": [forces.Body(swirl, rate=2.0), forces.Pair(spri
 ESTIMATORS = {
     "exact": gradients.Exact(),
     "adjoint viscosity": gradients.AdjointViscosity(5.0),
-    "frozen geometry": gradients.FrozenGeometry(),
     "implicit pressure": gradients.ImplicitPressure(),
 }
 CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))
@@ -134,8 +133,6 @@ def results(name) -> dict[str, bytes]:
     found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
     for label, estimator in ESTIMATORS.items():
         is_pcisph = simulation.scene.solver.kind == "pcisph"
-        if label == "frozen geometry" and not is_pcisph:
-            continue
         is_free = any(solid.motion == "free" for solid in simulation.scene.solid)
         if label == "implicit pressure" and (is_pcisph or is_free):
             continue

@@ -300,7 +300,6 @@ def test_a_solver_without_derivatives_says_so():
     problem = Problem(Simulation(plane(), solver=MakeFalling()), 3, losses.FinalPositions(np.zeros((64, 2))))
     at = {"gravity": np.array([0.0, -1.0])}
     estimators = {"reverse mode: try gradients.Tape": gradients.Exact(), "tape: try": gradients.Tape()}
-    estimators["reverse mode with a frozen geometry: try"] = gradients.FrozenGeometry()
     for what, estimator in estimators.items():
         with pytest.raises(InputError, match=f"the solver MakeFalling has no {what}"):
             problem.value_and_gradient(at, estimator)

@@ -13,7 +13,7 @@ from PIL import Image
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
-from cortado.gradients import Exact, FrozenGeometry
+from cortado.gradients import AdjointViscosity, Exact
 from cortado.optimisation.inverse.setup import setup
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import optimise
@@ -85,14 +85,14 @@ def test_a_task_is_searched_with_its_own_gradient(tmp_path):
     file = tmp_path / "task.toml"
     file.write_text(TINY_LATTE)
     losses = {}
-    for name, estimator in (("frozen_geometry", FrozenGeometry()), ("exact", Exact())):
+    for name, estimator in (("adjoint_viscosity", AdjointViscosity()), ("exact", Exact())):
         overrides = [f"optimise.gradient.name={name}"]
         settings = TaskSettings(title="a cup", task=str(file), overrides=overrides)
         made = setup(load_task(file, overrides), "cpu", "float32")
         wanted = optimise(made.search, made.start, Adam(0.5), 3, gradient=estimator)
         losses[name] = TASK.measure(settings, no_progress).where(picture="")["loss"]
         np.testing.assert_array_equal(losses[name], [record.loss for record in wanted.history])
-    assert (losses["frozen_geometry"][1:] != losses["exact"][1:]).all()
+    assert (losses["adjoint_viscosity"][1:] != losses["exact"][1:]).all()
 
 
 def no_progress(total):

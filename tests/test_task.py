@@ -132,7 +132,6 @@ SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
 SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"]
 ESTIMATORS = {
     "exact": ([], gradients.Exact()),
-    "velocity only": (['optimise.gradient.name="frozen_geometry"'], gradients.FrozenGeometry()),
     "a fixed point": (['optimise.gradient.name="implicit_pressure"'], gradients.ImplicitPressure()),
     "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
     "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),

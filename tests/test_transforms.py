@@ -194,7 +194,7 @@ def test_without_coordinates_it_is_the_problem_itself(problem):
     assert loss == wanted and all(gradient[name].tobytes() == exact[name].tobytes() for name in point)
 
 
-@pytest.mark.parametrize("estimator", [gradients.FrozenGeometry(), gradients.AdjointViscosity(order=2)], ids=repr)
+@pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(), gradients.AdjointViscosity(order=2)], ids=repr)
 def test_estimators_go_back_to_coordinates(problem, estimator):
     search = Transformed(problem, COORDINATES)
     u = search.coordinate(start_of(problem))

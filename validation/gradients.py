@@ -40,7 +40,6 @@ TILT, TRUE_SPREAD = 3.0, 1.0
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
 ESTIMATORS: dict[str, gradients.GradientEstimator] = {
     "exact": gradients.Exact(),
-    "frozen geometry": gradients.FrozenGeometry(),
     "viscosity": gradients.AdjointViscosity(),
     "mean over 8": gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE, seed=77),
 }

@@ -40,7 +40,6 @@ GROUPS = 20
 VISCOSITY = gradients.AdjointViscosity()
 ESTIMATORS: dict[str, Callable[[int], gradients.GradientEstimator]] = {
     "Exact()": lambda seed: gradients.Exact(),
-    "FrozenGeometry()": lambda seed: gradients.FrozenGeometry(),
     "AdjointViscosity()": lambda seed: VISCOSITY,
     "EnsembleMean, 8": lambda seed: gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE, seed, VISCOSITY),
     "Guided, 4 parts": lambda seed: gradients.Guided(SPREAD, 4, POSITION_NOISE, seed, parts=4),

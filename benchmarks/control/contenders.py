@@ -65,8 +65,6 @@ class RandomSearch:
 LINE_SEARCH = Descent(gradients.AdjointViscosity(), optimisers.LineSearch())
 CONTENDERS: dict[str, Contender] = {
     "exact": Descent(gradients.Exact()),
-    "frozen_geometry": Descent(gradients.FrozenGeometry()),
-    "damped": Descent(gradients.Damped(5.0)),
     "adjoint_viscosity": Descent(gradients.AdjointViscosity()),
     "long_updates": Descent(gradients.AdjointViscosity(), optimisers.Adam(0.25)),
     "line_search": LINE_SEARCH,

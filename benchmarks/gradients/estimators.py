@@ -9,7 +9,6 @@ from cortado.gradients import (
     AdjointViscosity,
     EnsembleMean,
     Exact,
-    FrozenGeometry,
     GradientEstimator,
     Guided,
     RandomizedSmoothing,
@@ -19,10 +18,8 @@ from .averages import MedianOfMeans, TrimmedMean
 
 ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "exact": lambda spread, seed: Exact(),
-    "frozen-geometry": lambda spread, seed: FrozenGeometry(),
     "adjoint-viscosity": lambda spread, seed: AdjointViscosity(),
     "mean-of-8": lambda spread, seed: EnsembleMean(spread, 8, seed=seed),
-    "mean-of-8-frozen": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=FrozenGeometry()),
     "mean-of-8-exact": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=Exact()),
     "mean-of-8-viscosity": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
     "trimmed-mean-of-8": lambda spread, seed: TrimmedMean(spread, 8, seed=seed, estimator=AdjointViscosity()),

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.errors import MissingDerivativeError
 from cortado.gradients import (
     AdjointViscosity,
     EnsembleMean,
     Exact,
-    FrozenGeometry,
     GradientEstimator,
     Guided,
     RandomizedSmoothing,
@@ -28,7 +26,7 @@ LEAST_COSINE = 0.5
 GOOD_COSINE = 0.95
 """Where no estimator of one run has this cosine, averages over an ensemble are tried, which cost some ten times as
 much."""
-ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
+ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
 """Of one run."""
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
@@ -99,10 +97,7 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
 
     if not length > 0.0:
         return None
-    found = []
-    for estimator in ESTIMATORS:
-        with suppress(MissingDerivativeError):  # of a solver from outside, which may have exact ones alone
-            found.append(judged(f"{type(estimator).__name__}()", estimator))
+    found = [judged(f"{type(estimator).__name__}()", estimator) for estimator in ESTIMATORS]
     if max(one.cosine for one in found) < GOOD_COSINE:
         with suppress(*NO_RUN):
             found += [judged(name, make(spread)) for name, make in AVERAGES.items()]

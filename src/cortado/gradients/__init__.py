@@ -2,8 +2,8 @@
 
 `Exact` is the derivative of the discrete map by its own adjoint, `Tape` the same by Warp's automatic differentiation.
 Beyond the predictability horizon, where neighbouring trajectories diverge, that derivative is of little use, and others
-take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, the mean of their gradients over an ensemble,
-`EnsembleMean`, or that mean with its sizes mended by differences, `Guided`. `RandomizedSmoothing`, which needs forward
+take its place: `AdjointViscosity`, the mean of its gradients over an ensemble, `EnsembleMean`, or that mean with its
+sizes mended by differences, `Guided`. `RandomizedSmoothing`, which needs forward
 runs alone, is the reference that they are compared with.
 """
 
@@ -21,8 +21,8 @@ from cortado.gradients.estimator import (
     checked_estimate,
     checked_estimator,
 )
-from cortado.gradients.exact import Exact, FrozenGeometry, Tape
-from cortado.gradients.filters import AdjointViscosity, Damped
+from cortado.gradients.exact import Exact, Tape
+from cortado.gradients.filters import AdjointViscosity
 from cortado.gradients.guided import Guided
 from cortado.gradients.implicit import ImplicitPressure
 from cortado.rollout.rollout import OBSERVED, Observer
@@ -32,14 +32,12 @@ __all__ = [
     "AdjointEstimator",
     "AdjointNorms",
     "AdjointViscosity",
-    "Damped",
     "Differentiable",
     "EnsembleMean",
     "Estimate",
     "Exact",
     "Filtered",
     "ForwardPass",
-    "FrozenGeometry",
     "GradientEstimator",
     "Guided",
     "ImplicitPressure",

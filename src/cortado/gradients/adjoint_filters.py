@@ -50,17 +50,6 @@ class Limit:
         self._launch(self._kernels.limit, **sums, **fields, times=self._times, particles=self._particles)
 
 
-class Drag:
-    """Multiplies the adjoint of velocities by exp(-rate dt)."""
-
-    def __init__(self, solver: Solver, rate: float):
-        self._solver, self._rate = solver, rate
-        self._kernel = adjoint_filter_kernels(solver.discretisation).drag
-
-    def __call__(self, bar: State, parameters: Parameters) -> None:
-        self._solver.context(parameters).launch(self._kernel, rate=self._rate, a=bar.velocities)
-
-
 class AdjointNorms:
     """An observer of the reverse pass that keeps the norms of adjoints, on the device until `numpy` is called."""
 

@@ -1,4 +1,4 @@
-"""Estimators that differentiate the discrete step: exactly, or with positions frozen within each step."""
+"""Estimators that differentiate the discrete step exactly."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -25,29 +25,6 @@ class Exact(AdjointEstimator):
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
-
-
-@dataclass(frozen=True)
-class FrozenGeometry(AdjointEstimator):
-    """The adjoint of a step in which no force depends on positions.
-
-    Formula: for a new state with adjoints x^ and v^,
-
-        v^ <- B^T (v^ + dt x^),   x^ <- x^,   B = dv' / dv at fixed positions:
-
-    pressure and viscosity respond to velocities, while neighbours and weights are constant. B hardly amplifies, as
-    viscosity damps velocities and pressure removes their divergence, so that the adjoint grows at most linearly with
-    the number of steps.
-
-    Bias: restoring forces are missing, such as those of gravity waves, so that the direction of the gradient is lost
-    over times in which the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel.
-    Prior art: the default of DiffFR (Li et al. 2023). Only for scenes with the solver ``"pcisph"``; others say so.
-    """
-
-    batches = True
-
-    def derivative(self, rollout: Rollout) -> BackwardStep:
-        return AdjointStep(rollout, rollout.solver.frozen_adjoint(rollout.steps))
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
-"""Filters of the adjoint of a state between two backward steps: an eddy viscosity, a limit, a drag.
+"""Filters of the adjoint of a state between two backward steps: an eddy viscosity, and a limit.
 
     viscosity:  a_i += sum_j max(s_i, s_j) w_ij (a_j - a_i),    s_i = min(C dt gamma_i, 0.6),
                 gamma_i^2 = sum_j w_ij |v_i - v_j|^2 / (|x_i - x_j|^2 + 0.01 h^2),
                 w_ij = W_ij / max(S_i, S_j, W(h / 2)),          S_i = sum_j W_ij
     limit:      a_i *= min(1, times r / |a_i|),                 r^2 = sum_j |a_j|^2 / particles
-    drag:       a_i *= exp(-rate dt)
 
 over fluid neighbours j of i, for each field a of the adjoint. x and v are those of the state that the adjoint belongs
 to: gamma is the strain rate of the forward flow.
@@ -40,7 +39,6 @@ class FilterKernels:
     sort: Any
     viscosity: Any
     limit: Any
-    drag: Any
     squares: Any
 
 
@@ -146,17 +144,6 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         b[order[i]] = b_sorted[i] - b_total
 
     @wp.kernel(module=module, enable_backward=False)
-    def drag(
-        rate: real,
-        particles: int,
-        time_step: wp.array(dtype=real),
-        # in and out
-        a: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        a[i] = wp.exp(-rate * time_step[i // particles]) * a[i]
-
-    @wp.kernel(module=module, enable_backward=False)
     def squares(
         a: wp.array(dtype=vector),
         b: wp.array(dtype=vector),
@@ -192,4 +179,4 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         if own[1] > most[1]:
             b[i] = real(wp.sqrt(most[1] / own[1])) * b[i]
 
-    return FilterKernels(crowd, strength, sort, viscosity, limit, drag, squares)
+    return FilterKernels(crowd, strength, sort, viscosity, limit, squares)

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.arrays import is_whole
 from cortado.errors import InputError, shown
-from cortado.gradients.adjoint_filters import Drag, EddyViscosity, Limit
+from cortado.gradients.adjoint_filters import EddyViscosity, Limit
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
 from cortado.gradients.exact import Exact
 from cortado.particles.state import State
@@ -102,40 +102,3 @@ class _ViscousStep(Filtered):
     def filter(self, bar: State) -> None:
         self._viscosity(bar, self._parameters)
         self._limit(bar, self._viscosity.strengths)
-
-
-@dataclass(frozen=True)
-class Damped(AdjointEstimator):
-    """The adjoint, with that of velocities damped after each backward step.
-
-    Formula: v^ <- exp(-rate dt) v^. Bias: the effect of earlier steps is reduced, by exp(-rate time), and that of long
-    waves as much as that of short ones. Cost: hardly more than that of its base.
-    """
-
-    rate: float
-    """[1 / s]"""
-    base: AdjointEstimator = EXACT
-    """The estimator whose adjoint is filtered."""
-
-    def __post_init__(self) -> None:
-        rate = as_number(self.rate)
-        if rate is None or rate < 0.0:
-            raise InputError(f"rate is {shown(self.rate)}, but must be a number of at least 0, in 1/s.")
-
-    @property
-    def batches(self) -> bool:
-        return self.base.batches
-
-    def derivative(self, rollout: Rollout) -> BackwardStep:
-        return _DampedStep(self.base.derivative(rollout), rollout, self.rate)
-
-
-class _DampedStep(Filtered):
-    only_launches = True
-
-    def __init__(self, base: BackwardStep, rollout: Rollout, rate: float):
-        super().__init__(base)
-        self._drag, self._parameters = Drag(base.solver, rate), rollout.parameters
-
-    def filter(self, bar: State) -> None:
-        self._drag(bar, self._parameters)

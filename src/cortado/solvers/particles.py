@@ -283,9 +283,6 @@ class ParticleSolver(Staying):
     def adjoint(self, steps: int) -> StepAdjoint:
         self._lacks("reverse mode", "try gradients.Tape, or gradients.RandomizedSmoothing, which only runs forward")
 
-    def frozen_adjoint(self, steps: int) -> StepAdjoint:
-        self._lacks("reverse mode with a frozen geometry", "try gradients.Exact")
-
     def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
         self._lacks("implicit adjoint of its pressure", "try gradients.Exact")
 

@@ -113,8 +113,8 @@ class PressureAdjoint(StepAdjoint, Protocol):
 
 class Solver(Protocol):
     """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
-    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `frozen_adjoint`, `implicit_adjoint`
-    and `differentiable` raise `InputError`, one sentence, where a solver has no such derivative.
+    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `implicit_adjoint` and
+    `differentiable` raise `InputError`, one sentence, where a solver has no such derivative.
     """
 
     discretisation: Discretisation
@@ -166,9 +166,6 @@ class Solver(Protocol):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         """Reverse mode of a run of so many steps."""
-
-    def frozen_adjoint(self, steps: int) -> StepAdjoint:
-        """The same with a frozen geometry, in which no force depends on positions: for `FrozenGeometry`."""
 
     def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
         """The same with the pressure as the fixed point of its iterations, whose adjoint is solved for until the

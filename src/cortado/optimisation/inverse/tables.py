@@ -20,7 +20,6 @@ from cortado.gradients import (
     AdjointViscosity,
     EnsembleMean,
     Exact,
-    FrozenGeometry,
     GradientEstimator,
     ImplicitPressure,
 )
@@ -44,7 +43,6 @@ search the longest one)."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
 ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
-    "frozen_geometry": FrozenGeometry(),
     "adjoint_viscosity": AdjointViscosity(),
     "implicit_pressure": ImplicitPressure(),
 }

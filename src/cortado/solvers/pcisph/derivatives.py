@@ -11,7 +11,6 @@ from cortado.device.binding import Named
 from cortado.device.launching import add
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
-from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts, WithinBar
@@ -25,7 +24,7 @@ class PcisphAdjoint(ParticleAdjoint):
 
     def __init__(self, solver: PcisphSteps, steps: int):
         super().__init__(solver, steps)
-        self._solver, self._force = solver, solver.kernels.force.adjoint
+        self._solver = solver
         self._scaled_bar, self._slope_bar = solver.vectors(), solver.vectors()
         self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
 
@@ -72,7 +71,7 @@ class PcisphAdjoint(ParticleAdjoint):
         for k in reversed(range(iterations)):
             going = {"k": k, "rounds": solver.pressure_loop.rounds}
             context.launch(
-                self._force,
+                kernels.force.adjoint,
                 going,
                 *known,
                 stiffness=solver.lattice.stiffness,
@@ -109,36 +108,6 @@ class PcisphAdjoint(ParticleAdjoint):
         context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
         slopes = wall_slope_term(solver.discretisation).solid_kernel
         self.bar.solids.add(context.launch, slopes, *self.bar.named, slope_bar=self._slope_bar)
-
-
-class FrozenPcisphAdjoint(PcisphAdjoint):
-    """The same with a frozen geometry: accelerations do not depend on x(t), v' does on v alone, x' = x + dt v' on
-    both."""
-
-    def __init__(self, solver: PcisphSteps, steps: int):
-        super().__init__(solver, steps)
-        self._force = frozen_force_adjoint(solver.discretisation)
-
-    def unsort(self, context: StepContext, state_bar: State) -> State:
-        self._free_bar = super().unsort(context, state_bar)
-        return self._free_bar
-
-    def relax_beside_walls(self, context: StepContext) -> None:
-        pass
-
-    def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
-        pass
-
-    def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """The adjoint of x' = x + dt v' goes to x as it is, and not with ``x_bar``, to which others have added."""
-        b = self.bar.fields
-        self.begin_parts(context, state_bar)
-        unsorted = {"x_scene": self._scaled_bar, "v_scene": state_bar.velocities}
-        context.launch(self._solver.integration.unsort, x=b["x"], v=b["v"], **unsorted)
-        self.carried_bar.unsort(context, carried_bar, state_bar)
-        context.join()
-        if self._free_bar is not state_bar:
-            wp.copy(state_bar.positions, self._free_bar.positions)
 
 
 class PcisphTangent(ParticleTangent):

@@ -1,6 +1,5 @@
 """The pressure force of an iteration, and the prediction that follows it: see `cortado.solvers.pcisph.pressure`."""
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -9,54 +8,10 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.precision import Precision
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import pair_sum
 from cortado.particles.solid_shares import solid_kernel
-
-
-@dataclass(frozen=True)
-class PressureShare:
-    """What the adjoints of the pressure force have in common."""
-
-    values: Any
-    """The bundle of what the pressure of an iteration is computed from."""
-    adjoints: Any
-    """The bundle of their adjoints."""
-    adjoint: Any
-    """The Warp function ``adjoint(i, stiffness, dt, volume, divergence, work, at, bar)``: adds to the adjoints, and
-    returns r, the adjoint of n*."""
-
-
-@cache
-def pressure_share(precision: Precision) -> PressureShare:
-    """For a precision."""
-    real = precision.real
-    values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
-    adjoints = bundle(m=real, rho_0=real, y=real, p=real, time_step=real)
-
-    @wp.func
-    def adjoint(
-        i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
-    ) -> real:
-        n_i = at.n[i]
-        m_i = at.m[i]
-        p_i = at.p_out[i]
-        delta = at.y[i] * stiffness / (dt * dt)
-        p_bar_i = real(0.0)
-        if p_i > real(0.0):
-            p_bar_i = bar.p[i] - volume * divergence / (n_i * n_i)
-        excess_bar = delta * p_bar_i
-        excess = (p_i - at.p_in[i]) / delta
-        bar.m[i] = bar.m[i] + (volume * work + excess_bar * (excess + at.rho_0[i])) / m_i
-        bar.rho_0[i] = bar.rho_0[i] - excess_bar
-        bar.y[i] = bar.y[i] + excess_bar * excess / at.y[i]
-        bar.p[i] = p_bar_i
-        bar.time_step[i] = bar.time_step[i] - real(2.0) * excess_bar * excess / dt
-        return m_i * excess_bar
-
-    return PressureShare(values, adjoints, adjoint)
 
 
 def pressure_solid_kernel(discretisation: Discretisation) -> Any:
@@ -85,8 +40,29 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
     moved = bundle(m=real, x=vector, v=vector, acceleration=vector, c=real)
-    share = pressure_share(discretisation.precision)
-    values, adjoints, adjoin_pressure = share.values, share.adjoints, share.adjoint
+    values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
+    adjoints = bundle(m=real, rho_0=real, y=real, p=real, time_step=real)
+
+    @wp.func
+    def adjoin_pressure(
+        i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
+    ) -> real:
+        """Add to the adjoints of a pressure's inputs, and return r, the adjoint of n*."""
+        n_i = at.n[i]
+        m_i = at.m[i]
+        p_i = at.p_out[i]
+        delta = at.y[i] * stiffness / (dt * dt)
+        p_bar_i = real(0.0)
+        if p_i > real(0.0):
+            p_bar_i = bar.p[i] - volume * divergence / (n_i * n_i)
+        excess_bar = delta * p_bar_i
+        excess = (p_i - at.p_in[i]) / delta
+        bar.m[i] = bar.m[i] + (volume * work + excess_bar * (excess + at.rho_0[i])) / m_i
+        bar.rho_0[i] = bar.rho_0[i] - excess_bar
+        bar.y[i] = bar.y[i] + excess_bar * excess / at.y[i]
+        bar.p[i] = p_bar_i
+        bar.time_step[i] = bar.time_step[i] - real(2.0) * excess_bar * excess / dt
+        return m_i * excess_bar
 
     @pair_sum(discretisation)
     def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:

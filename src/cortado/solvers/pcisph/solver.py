@@ -3,7 +3,7 @@
 from typing import Self
 
 from cortado.particles.state import Parameters
-from cortado.solvers.pcisph.derivatives import FrozenPcisphAdjoint, PcisphAdjoint, PcisphTangent
+from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import StepAdjoint, StepTangent
 
@@ -20,9 +20,3 @@ class Pcisph(PcisphSteps):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         return PcisphAdjoint(self, steps)
-
-    def frozen_adjoint(self, steps: int) -> StepAdjoint:
-        """Not of a solver that is made of this one and has an adjoint of its own."""
-        if type(self).adjoint is not Pcisph.adjoint:
-            return super().frozen_adjoint(steps)
-        return FrozenPcisphAdjoint(self, steps)
