@@ -15,12 +15,12 @@ from cortado import DivergedError, InputError, Problem, Simulation, gradients, l
 from cortado.certificate import Consistency, certify
 from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.consistency import balanced
-from cortado.certificate.figure import gradient_check
 from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.loss_history import LossHistory
 from cortado.certificate.twin import in_float64
 from cortado.forward_pass import ProblemForwardPass
+from cortado.pictures.run_plots import gradient_check
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.scene import load_scene
 from cortado.sph.free_energy import FREE_ENERGIES

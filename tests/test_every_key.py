@@ -12,8 +12,8 @@ import pytest
 import trimesh
 
 from cortado import CortadoError, Scene, Simulation
-from cortado.pictures.pace import Pace
 from cortado.pictures.painter import colours_of, painter
+from cortado.runs.film import Pace
 from cortado.scene.camera_paths import Moment, View
 from cortado.scene.model import SceneTables
 from every_key import given, key_at, keys_of, places, put, same, told

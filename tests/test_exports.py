@@ -12,14 +12,14 @@ import trimesh
 import cortado
 from cortado import ComputationError, InputError, Trajectory
 from cortado.pictures import held_volume
+from cortado.pictures.exports import by_vtk
+from cortado.pictures.exports.export import FORMATS
+from cortado.pictures.exports.exported import Exported
+from cortado.pictures.exports.whole_frames import WholeFrames
 from cortado.pictures.scale import Scale
-from cortado.runs.exports import by_vtk
-from cortado.runs.exports.export import FORMATS
-from cortado.runs.exports.exported import Exported
-from cortado.runs.exports.whole_frames import WholeFrames
+from cortado.pictures.shown_run import ShownRun
 from cortado.runs.marks import Marks
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.shown_run import ShownRun
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
 from full_disk import largest_file

@@ -7,7 +7,7 @@ from PIL import Image
 from cortado.errors import InputError
 from cortado.files.srgb import to_srgb
 from cortado.pictures import plots
-from cortado.runs.run_figures import density_errors
+from cortado.pictures.run_plots import density_errors
 from cortado.runs.trajectory import Trajectory
 
 

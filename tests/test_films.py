@@ -14,13 +14,11 @@ from cortado.pictures import Dolly, Follow, Keyframes, Orbit
 from cortado.pictures.painter import painter
 from cortado.pictures.particles import Particles
 from cortado.pictures.plan import MOVING, plan
+from cortado.pictures.run_pictures import _with_scale, run_page
 from cortado.pictures.scale import Scale
 from cortado.pictures.shadow import FloorShadow
+from cortado.pictures.shown_run import ShownRun, ages, is_out, vorticity
 from cortado.pictures.stage import Stage, screen_axes
-from cortado.runs.curl import vorticity
-from cortado.runs.emitted import ages, is_out
-from cortado.runs.run_pictures import _with_scale, run_page
-from cortado.runs.shown_run import ShownRun
 from cortado.scene.camera_paths import Moment, View
 from cortado.scene.lights import LIGHTS
 from cortado.scene.picture import Picture

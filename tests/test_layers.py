@@ -1,6 +1,7 @@
 """Packages form a tree: none imports one that imports it. And who may launch, and what stays light."""
 
 import ast
+import os
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import cortado
+from cortado.on_top import FUNCTIONS, on_top
 from module_graph import all_before, loaded_before, sources
 
 ROOT = Path(cortado.__file__).parent
@@ -47,6 +49,15 @@ def imports(source: str, module: str, known: set[str]) -> set[str]:
 MODULES = modules()
 MOST_PACKAGES = 17
 MOST_LINES = 450
+ON_TOP = (
+    "pictures",
+    "environments",
+    "cli",
+    "__main__",
+    "measured",
+    *(f"optimisation.{name}" for name in ("datasets", "fitting", "inverse", "sweep")),
+)
+"""Packages, and modules, that lie on top of the core; `cortado` itself has the names of all."""
 
 
 def above(sources: dict[str, str]) -> dict[str, set[str]]:
@@ -71,6 +82,70 @@ def test_a_circle_of_packages_is_found(source):
     sources = {"upper.a": "from cortado.lower import b", "lower.b": source}
     with pytest.raises(CycleError, match="lower"):
         list(TopologicalSorter(above(sources)).static_order())
+
+
+def is_on_top(module: str) -> bool:
+    return any(module == name or module.startswith(f"{name}.") for name in ON_TOP)
+
+
+def on_top_of_the_core(sources: dict[str, str]) -> list[tuple[str, str]]:
+    """Imports, within functions and for types too, of what is on top of the core by a module of the core."""
+    known = set(sources)
+    found = (
+        (module, name) for module in known if not is_on_top(module) for name in imports(sources[module], module, known)
+    )
+    return [(module, name) for module, name in found if is_on_top(name)]
+
+
+def test_the_core_imports_nothing_that_lies_on_top_of_it():
+    assert not on_top_of_the_core({module: path.read_text() for module, path in MODULES.items()})
+    late = {"problem": "def f():\n    from cortado.pictures.film import film", "pictures.film": ""}
+    assert on_top_of_the_core(late) == [("problem", "pictures.film")]
+
+
+def test_what_the_core_asks_of_packages_on_top_is_there():
+    for name, home in FUNCTIONS.items():
+        assert is_on_top(home) and callable(on_top(name)), f"{home}.{name}"
+
+
+STANDING_ALONE = """
+import importlib, sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        inner = name.removeprefix("cortado.")
+        if any(inner == one or inner.startswith(one + ".") for one in {on_top}):
+            raise AssertionError(f"{name} is imported")
+
+sys.meta_path.insert(0, Refuse())
+for module in {core}:
+    try:
+        importlib.import_module(f"cortado.{module}")
+    except ModuleNotFoundError as missing:  # of a package that Cortado can do without, such as JAX
+        assert not missing.name.startswith("cortado."), missing
+import cortado
+from scenes import plane
+simulation = cortado.Simulation(plane(), precision="float64")
+problem = cortado.Problem(simulation, 4, cortado.losses.FinalPositions(simulation.positions + 0.01))
+assert cortado.certify(problem, ["gravity"]).right
+assert cortado.optimise(problem, {"gravity": [0.1, -9.0]}, cortado.optimisers.GradientDescent(1.0), 2).evaluations
+"""
+
+
+def test_the_core_stands_alone():
+    """All of it is imported, and used, where nothing that lies on top of it can be."""
+    core = [name for name in MODULES if not is_on_top(name) and name != "reference"]
+    program = STANDING_ALONE.replace("{on_top}", repr(ON_TOP)).replace("{core}", repr(core))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT.parent), str(Path(__file__).parent)])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+
+
+def test_no_file_imports_one_that_imports_it():
+    """On no way, within functions and for types too."""
+    sources = {module: path.read_text() for module, path in MODULES.items()}
+    files = {module: imports(source, module, set(sources)) - {module} for module, source in sources.items()}
+    list(TopologicalSorter(files).static_order())
 
 
 def test_any_module_can_be_the_first_to_be_imported():

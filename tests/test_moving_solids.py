@@ -7,7 +7,7 @@ import cortado
 from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
 from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
-from cortado.runs.run_pictures import run_page
+from cortado.pictures.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import greatest_speed

@@ -22,7 +22,7 @@ from cortado.errors import InputError
 from cortado.files.atomic import unfinished
 from cortado.files.progress import track
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
-from cortado.runs.report import Section, write_report, written
+from cortado.pictures.report import Section, write_report, written
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
 

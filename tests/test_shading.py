@@ -23,7 +23,6 @@ from cortado.pictures import framing
 from cortado.pictures.environment import environment_of
 from cortado.pictures.film import film, lacking
 from cortado.pictures.labels import labelled, side_by_side
-from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scenery import State, scenery
@@ -32,6 +31,7 @@ from cortado.pictures.stage import Stage, screen_axes, upright
 from cortado.pictures.surface import spheres
 from cortado.pictures.trace import find_contrast
 from cortado.pictures.wetting import particles_of, wetting
+from cortado.runs.film import Pace, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
 

@@ -13,13 +13,10 @@ from cortado.pictures import Orbit
 from cortado.pictures.grid import framed_together, in_a_row
 from cortado.pictures.labels import labelled
 from cortado.pictures.page import ALONE, Page
+from cortado.pictures.run_pictures import shown_as
+from cortado.pictures.shown_run import ShownRun, coloured_by
+from cortado.pictures.side_by_side import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
-from cortado.runs.colouring import coloured_by
-from cortado.runs.common_clock import ShownFrames, common_times
-from cortado.runs.differences import labels
-from cortado.runs.picture_settings import shown_as
-from cortado.runs.shown_run import ShownRun
-from cortado.runs.side_by_side import runs_page
 from cortado.scene.picture import Picture
 from cortado.scene.units import unit_of
 from scenes import plane, scene

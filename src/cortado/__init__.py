@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from cortado.optimisation.fitting.fitted import Fit as Fit
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
+    from cortado.pictures.side_by_side import film_side_by_side as film_side_by_side
     from cortado.problem import Problem as Problem
-    from cortado.runs.side_by_side import film_side_by_side as film_side_by_side
     from cortado.runs.trajectory import Trajectory as Trajectory
     from cortado.scene.scene import Scene as Scene
     from cortado.scene.scene import load_scene as load_scene
@@ -66,7 +66,7 @@ _HOMES = {
     "Trajectory": "runs.trajectory",
     "certify": "certificate",
     "evaluate": "optimisation.evaluate",
-    "film_side_by_side": "runs.side_by_side",
+    "film_side_by_side": "pictures.side_by_side",
     "fit": "optimisation.fitting.fit",
     "load_scene": "scene.scene",
     "optimise": "optimisation.optimise",

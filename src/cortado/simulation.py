@@ -5,6 +5,7 @@ from dataclasses import replace
 from hashlib import sha256
 from math import isqrt, prod
 from os import PathLike
+from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
@@ -20,12 +21,14 @@ from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.threads import WARP, Turn, in_turn
+from cortado.discretise.calibration import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
+from cortado.files.srgb import ShadedPicture
 from cortado.fixed import fixed
+from cortado.on_top import on_top
 from cortado.particles.state import State
-from cortado.pictures.notebook import with_picture
-from cortado.pictures.plots import particles
-from cortado.pictures.solid_lines import solid_outline
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
 from cortado.rollout.durations import end_after, expected_frames, steps_of_run
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_checks import check_sizes
@@ -34,14 +37,17 @@ from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.stepping import Stepping
-from cortado.runs.measuring import Measuring
-from cortado.runs.picturing import Picturing
+from cortado.runs.film import Film
+from cortado.runs.frame import Frame
+from cortado.runs.quantities.evaluator import QuantityEvaluator
+from cortado.runs.quantities.moment import Moment
 from cortado.runs.recorded import recorded
 from cortado.runs.sensors.sensor import Sensor
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.distance import check_distance
-from cortado.scene.parameters.values import scene_values
+from cortado.scene.parameters.values import OVER_TIME, scene_values
+from cortado.scene.quantities import check_readable
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
@@ -61,7 +67,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 
 @public
 @fixed
-class Simulation(Stepping, Measuring, Picturing):
+class Simulation(Stepping):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
@@ -161,10 +167,9 @@ class Simulation(Stepping, Measuring, Picturing):
         return f"Simulation({batch}{sizes}, {self.device.alias}, {self.precision.name})"
 
     def _repr_html_(self) -> str:
-        """With a picture of its first particles."""
-        shown, held = self.positions[: self.free_particles or None], self.scene.container.extent()
-        solids = solid_outline(self.scene)
-        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=held, lines=[solids]))
+        """The repr, and a picture of the first particles."""
+        page: str = on_top("simulation_page")(self)
+        return page
 
     @property
     def _points(self) -> str:
@@ -268,6 +273,87 @@ class Simulation(Stepping, Measuring, Picturing):
         end_after(rollout, time)
         return rollout
 
+    def quantity(
+        self,
+        name: str,
+        of: RestartState | Sequence[RestartState] | Trajectory | None = None,
+        controls: Mapping[str, Any] | None = None,
+    ) -> np.ndarray:
+        """A quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 / s],
+        "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own keeps, or
+        the load on a solid, such as "rotor.load".
+
+        Args:
+            name: of the quantity.
+            of: a state of this simulation, of a batch one for each scene; or a trajectory, of which it is found for
+                every frame; the scene's first state if left out.
+            controls: as of `run`; the pressure is that of the step that begins at the state, which they act in. Of a
+                trajectory they are those of its run.
+
+        Returns:
+            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order, of a field its shape, of a
+            load (k,).
+
+        Raises:
+            InputError: another name, or a state that is none of this simulation's.
+        """
+        check_readable(name, "quantity", self.initial.names)
+        if not isinstance(of, Trajectory):
+            return self._quantity(name, of, controls)
+        given = {key: value for key, value in (controls or {}).items() if key not in self.known.state}
+        return np.array(
+            [self._quantity(name, of[: k + 1].last_state, _controls_at(given, of, k)) for k in range(len(of))]
+        )
+
+    @in_turn
+    def _quantity(self, name: str, state: Any, controls: Mapping[str, Any] | None) -> np.ndarray:
+        rollout = self.rollout(1, controls, state)
+        if name in rollout.initial.names:
+            return rollout.initial.numpy(self.dimension, only=[name])[name].astype(np.float64)
+        return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
+
+    @in_turn
+    def evaluator(self) -> QuantityEvaluator:
+        """The evaluator of quantities of states on the device, made once."""
+        made: QuantityEvaluator | None = self.__dict__.get("_evaluator")
+        if made is None:
+            spacing, support = self.scene.discretisation.spacing, self.lattice.support
+            factor = circulation_factor(self.smoothing, spacing, support, self.dimension)
+            made = self.__dict__["_evaluator"] = QuantityEvaluator(self.solver, self.scene, factor)
+        return made
+
+    def renderer(self, **settings: Any) -> Renderer:
+        """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
+        table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+
+        ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
+        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
+        """
+        return scene_renderer(self, **settings)
+
+    def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
+        """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
+        says; ``settings`` replace keys of it: ``width=640, height=360``, as those of `film` do.
+
+        Raises:
+            SceneError: settings that do not fit.
+            InputError: what ``colour`` names was not recorded in the frame, or is the age, which one frame does not
+                tell.
+        """
+        image: ShadedPicture = on_top("simulation_picture")(self, frame, settings)
+        return image
+
+    def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
+        """Write a film of a run of this simulation; as `Trajectory.film`, on the device of the simulation, which also
+        computes what ``colour`` names where it was not recorded, such as the pressure."""
+        film: Film = on_top("simulation_film")(self, trajectory, path, settings)
+        return film
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.scene.dimension
+
     @unwarned()
     def batch_of(self, size: int) -> "Simulation":
         """The same scene so many times in one launch."""
@@ -306,6 +392,13 @@ class Simulation(Stepping, Measuring, Picturing):
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
         return stable_substeps(self.scene, self.free_energy, *numbers)
+
+
+def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
+    """The controls of the step after a frame of the run that they were given to."""
+    step = int(trajectory.steps[frame] - trajectory.steps[0])
+    rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
+    return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}
 
 
 @unwarned()

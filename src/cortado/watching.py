@@ -2,15 +2,17 @@
 
 from collections.abc import Iterable, Mapping
 from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.arrays import require_table
 from cortado.errors import InputError
 from cortado.losses.loss import Snapshot
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
-from cortado.runs.measuring import Measured
+from cortado.rollout.stepper import Steppable
 from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.quantities.recorder import Recorder
@@ -19,6 +21,23 @@ from cortado.runs.sensors.of_scene import sensors_of
 from cortado.runs.sensors.places import warn_of_places
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameters.values import Arrays
+
+
+class Measured(Steppable, Protocol):
+    """A simulation as its quantities see it."""
+
+    @property
+    def walls(self) -> NDArray:
+        """(b, d) wall particles [m]"""
+
+    def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
+        """A rollout that is ready to go forward."""
+
+    def in_precision(self, precision: str) -> Any:
+        """A single one of the same scene in a precision."""
+
+    def batch_of(self, size: int) -> Any:
+        """The same scene so many times in one launch."""
 
 
 class Watch:

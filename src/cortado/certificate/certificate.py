@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from html import escape
 from os import PathLike
 from typing import Any
 
@@ -29,7 +30,6 @@ from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointNorms
 from cortado.gradients.points import NO_RUN
 from cortado.losses import FinalPositions
-from cortado.pictures.notebook import as_text
 from cortado.problem import Problem
 from cortado.scene.parameters.parameter import Range, Role
 from cortado.scene.parameters.values import Arrays, Values
@@ -98,7 +98,7 @@ class Certificate:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return as_text(self)
+        return f"<pre>{escape(str(self))}</pre>"
 
     @property
     def right(self) -> bool:

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterable
 from functools import cache
-from typing import Any
+from io import BytesIO
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,3 +77,27 @@ def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Linear light from 0 to 1, of values in 0..255 of any shape."""
     curved = values / 255.0
     return np.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)
+
+
+def png(image: ArrayLike) -> bytes:
+    """The bytes of a PNG file with 8 bits of sRGB, of a linear image (rows, columns, 3), clipped to 0..1; errors as of
+    `to_srgb` and `check_light`."""
+    from PIL import Image
+
+    pixels, content = to_srgb(image), BytesIO()
+    check_light("The image", image)
+    Image.fromarray(pixels).save(content, format="PNG")
+    return content.getvalue()
+
+
+class ShadedPicture(np.ndarray):
+    """A picture (rows, columns, 3), linear from 0 to 1: an array that a notebook shows as a picture."""
+
+    @classmethod
+    def of(cls, image: ArrayLike) -> Self:
+        """A view of the same numbers."""
+        return np.asarray(image).view(cls)
+
+    def _repr_png_(self) -> bytes | None:
+        """The PNG of it; None for a part of another shape, such as one row."""
+        return png(self) if self.ndim == 3 and self.shape[2] == 3 else None

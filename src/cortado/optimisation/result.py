@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Any
 
+from cortado.on_top import on_top
 from cortado.words import counted, sized
 
 Parameters = dict[str, Any]
@@ -79,7 +80,6 @@ class Result:
 
     def _repr_html_(self) -> str:
         """With the ends of runs, first and found, beside the target; the parameters; the losses of all evaluations."""
-        from cortado.optimisation.result_page import result_page
-
-        losses = [record.loss for record in self.history]
-        return result_page(self, self.message, self.problem, self.history[0].parameters, self.parameters, losses)
+        losses, start = [record.loss for record in self.history], self.history[0].parameters
+        page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
+        return page

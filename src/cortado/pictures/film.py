@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,42 +11,15 @@ from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.files.animation import moving_picture
 from cortado.files.progress import track
-from cortado.pictures.notebook import with_video
-from cortado.pictures.pace import Pace
 from cortado.pictures.page import Page
 from cortado.pictures.steady import WINDOW
+from cortado.runs.film import Film, Pace
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 
 SLOW = 0.1
 """Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
 seen."""
-
-
-@dataclass(frozen=True)
-class Film:
-    """A film that is written."""
-
-    path: Path
-    pace: Pace
-    """Which frames it shows, and how fast."""
-    notes: str = ""
-    """As those of a page."""
-
-    @property
-    def in_words(self) -> str:
-        """What it shows."""
-        return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
-
-    def __str__(self) -> str:
-        return f"{self.path.name}: {self.in_words}"
-
-    def __repr__(self) -> str:
-        return f"Film({self.path}, {self.pace})"
-
-    def _repr_html_(self) -> str:
-        """To be played."""
-        return with_video(self, self.path)
 
 
 def lacking(scene: Scene) -> str | None:

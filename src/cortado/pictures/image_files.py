@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from cortado.device.memory import require
 from cortado.errors import InputError, warn
 from cortado.files.atomic import write_atomically
 from cortado.files.input_files import as_path, reason, regular_file
-from cortado.files.srgb import check_light, from_srgb, to_srgb
+from cortado.files.srgb import from_srgb, png
 from cortado.render.cameras import check_resolution, positive, vector
 
 Picture = NDArray[np.float64]
@@ -179,16 +178,6 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
     write_atomically(Path(path), png(image))
     return Path(path)
-
-
-def png(image: ArrayLike) -> bytes:
-    """What `write_picture` writes."""
-    from PIL import Image
-
-    pixels, content = to_srgb(image), BytesIO()
-    check_light("The image", image)
-    Image.fromarray(pixels).save(content, format="PNG")
-    return content.getvalue()
 
 
 def _drawn(

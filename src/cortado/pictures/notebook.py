@@ -1,45 +1,124 @@
-"""What a notebook shows of a result: its words, and a picture, a view or a table below."""
+"""HTML that notebooks show of objects: the repr, and a picture, a film, a view in motion or a table below it."""
 
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cortado.pictures.particle_view import STYLE, script
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.domain import WITHOUT_PERIODS
+from cortado.errors import CortadoError
+from cortado.losses import FinalPositions, Frames, Image, Snapshot
+from cortado.pictures.particle_view import STYLE, Cloud, particle_view, script, thinned
+from cortado.pictures.plots import images, loss_curve, particles
+from cortado.pictures.solid_lines import solid_outline
+from cortado.problem import Problem
+from cortado.runs.film import Film
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.parameters.values import UNITS
+from cortado.simulation import Simulation
+
+IN_MOTION = 1_000_000
+"""Bytes of the view of a trajectory."""
+MANY = 2000
+"""Particles of which the nearest others are looked for."""
+MOST_NUMBERS = 6
+"""Of a parameter that the table shows; of more the smallest and the greatest."""
+HEAD = ("parameter", "unit", "first guess", "found")
 
 
-def with_picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """HTML of an object: its repr, and the PNG that ``draw`` writes to a path."""
-    return as_words(found) + picture(found, draw)
+def simulation_page(simulation: Simulation) -> str:
+    """HTML of a simulation: its repr, and a picture of its first particles."""
+    first, held = simulation.positions[: simulation.free_particles or None], simulation.scene.container.extent()
+    solids = [solid_outline(simulation.scene)]
+    drawn = picture(simulation, lambda path: particles([first], ["t = 0 s"], path, container=held, lines=solids))
+    return as_words(simulation) + drawn
 
 
-def with_view(found: object, view: str, draw: Callable[[Path], Any]) -> str:
-    """HTML of an object: its repr, a `particle_view` in a frame of its own, where scripts run, and the PNG below."""
+def trajectory_page(run: Trajectory) -> str:
+    """HTML of a trajectory: its repr, a `particle_view` in a frame of its own, where scripts run, with y up, and below
+    it a picture of the first, the middle and the last frame, coloured by speed."""
+    if not len(run):
+        return f"<pre>{escape(repr(run))}</pre>"
+    domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
+    shown = [run[k] for k in sorted({0, len(run) // 2, len(run) - 1})]
+    titles = [f"t = {frame.time:.4g} s" for frame in shown]
+    speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
+    sets, label = [domain.wrapped(frame.positions) for frame in shown], "speed [m/s]"
+    chosen, stride = thinned(len(run), run.particles, 2 * run.dimension + 1, IN_MOTION)
+    thin = [array[chosen, ::stride] for array in (run.positions, run.velocities)]
+    cloud = Cloud("run", domain.wrapped(thin[0]), np.linalg.norm(thin[1], axis=2))
+    view = particle_view([cloud], run.times[chosen], _spacing(run.positions[0]), stride=stride)
+    drawn = picture(run, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
     page = f"<!DOCTYPE html><meta charset='utf-8'><style>{STYLE}</style>{view}{script()}"
     frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 600px; border: 0"></iframe>'
-    still = f"<details><summary>As a picture</summary>{picture(found, draw)}</details>"
-    return as_words(found) + frame + still
+    return as_words(run) + frame + f"<details><summary>As a picture</summary>{drawn}</details>"
 
 
-def with_video(found: object, path: Path) -> str:
-    """HTML of an object: its repr, and a video, or an animation, in a file, which is part of the page."""
-    content = b64encode(path.read_bytes()).decode()
-    if path.suffix.lower() == ".webp":
-        return f'{as_words(found)}<img src="data:image/webp;base64,{content}" style="width: 100%">'
+def film_page(film: Film) -> str:
+    """HTML of a film: its repr, and the video, or the animation, which is part of the page."""
+    content, words = b64encode(film.path.read_bytes()).decode(), as_words(film)
+    if film.path.suffix.lower() == ".webp":
+        return f'{words}<img src="data:image/webp;base64,{content}" style="width: 100%">'
     source = f"data:video/mp4;base64,{content}"
-    return f'{as_words(found)}<video controls loop muted playsinline src="{source}" style="width: 100%"></video>'
+    return f'{words}<video controls loop muted playsinline src="{source}" style="width: 100%"></video>'
+
+
+def result_page(
+    found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
+) -> str:
+    """HTML of the result of a search from a start to the best parameters, with how it ended and all its losses. Of a
+    `Problem`, or of one in other coordinates, two runs are made to see their ends; there is no picture of runs that
+    diverge."""
+    if hasattr(problem, "coordinates"):
+        problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
+    is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
+    rows = [_row(name, UNITS.get(name, "") if is_ours else "", start[name], value) for name, value in best.items()]
+    parts = [table(HEAD, rows), picture(found, lambda path: loss_curve(losses, path))]
+    if is_ours:
+        with suppress(CortadoError):  # the first guess may be a run that diverges
+            parts.insert(0, picture(found, lambda path: _draw_ends(problem, [start, best], path)))
+    return as_words(found) + f"<p>{escape(message)}</p>" + "".join(parts)
+
+
+def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Where runs with the first guess and with what was found end, or how they look, and the target if it is known."""
+    own = Problem(
+        problem.simulation, problem.steps, problem.loss, state=problem.state
+    )  # the user's keeps its last evaluation
+    step, loss = max(own.loss.losses.items()) if isinstance(own.loss, Frames) else (own.steps, own.loss)
+    ends: list[Snapshot] = [own.states(point, [step])[step] for point in points]
+    titles = [f"first guess, after {step} steps", "found"]
+    if isinstance(loss, Image):
+        images([*map(loss.image, ends), loss.target], [*titles, "target"], path)
+        return
+    sets = [end.positions for end in ends]
+    if isinstance(loss, FinalPositions):
+        sets, titles = [*sets, loss.target], [*titles, "target"]
+    scene = problem.simulation.scene
+    particles(sets, titles, path, container=scene.container.extent(), lines=[solid_outline(scene)] * len(sets))
+
+
+def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:
+    return name.replace("_", " "), unit or "-", _written(first), _written(found)
+
+
+def _written(value: Any) -> str:
+    """A number, a few of them, or how many there are and how large."""
+    numbers = np.ravel(value)
+    if len(numbers) > MOST_NUMBERS:
+        return f"{np.shape(value)} numbers, {numbers.min():.4g} to {numbers.max():.4g}"
+    return ", ".join(f"{number:.4g}" for number in numbers)
 
 
 def as_words(found: object) -> str:
     """HTML of the repr of an object."""
     return f"<p>{escape(repr(found))}</p>"
-
-
-def as_text(found: object) -> str:
-    """HTML of an object whose text is a table: as it is, letter by letter."""
-    return f"<pre>{escape(str(found))}</pre>"
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
@@ -62,3 +141,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         return f"<tr>{''.join(written)}</tr>"
 
     return f"<table>{line('th', head)}{''.join(line('td', row) for row in rows)}</table>"
+
+
+def _spacing(positions: NDArray[Any]) -> float:
+    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return 1.0
+    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0

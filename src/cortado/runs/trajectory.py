@@ -16,11 +16,13 @@ from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
+from cortado.files.srgb import ShadedPicture
+from cortado.on_top import on_top
+from cortado.runs.film import Film
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.marks import Marks
 from cortado.runs.sensors.log import Readings
-from cortado.runs.showing import Showing
 from cortado.runs.solid_motion import SolidMotions, motions_in
 from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
@@ -33,7 +35,7 @@ SUFFIXES = (".vtkhdf", ".hdf")
 
 @public
 @dataclass(frozen=True, eq=False)
-class Trajectory(Showing):
+class Trajectory:
     """What a run leaves: recorded frames, and what the solver noted of every step.
 
     ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
@@ -252,14 +254,13 @@ class Trajectory(Showing):
                 ``picture.colour`` of the scene that was not recorded.
             ComputationError: the disk is full.
         """
-        from cortado.runs.exports.export import export
-
         of = self.scene if scene is None else scene
         if of is None:
             raise InputError(
                 "scene is missing, but must be given, as a trajectory from a file does not hold its scene."
             )
-        return export(self, folder, to, of)
+        path: Path = on_top("export")(self, folder, to, of)
+        return path
 
     def to_xarray(self) -> Any:
         """An ``xarray.Dataset`` of the dimensions time, particle and space, with units: position, velocity, with
@@ -268,9 +269,40 @@ class Trajectory(Showing):
         Raises:
             InputError: xarray is missing.
         """
-        from cortado.runs.exports.labelled import labelled
+        return on_top("labelled")(self)
 
-        return labelled(self)
+    def picture(
+        self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
+    ) -> ShadedPicture:
+        """A shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera is
+        where it sees the fluid in every frame. Arguments and errors as of `film`."""
+        image: ShadedPicture = on_top("trajectory_picture")(self, k, scene, device, settings)
+        return image
+
+    def film(
+        self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
+    ) -> Film:
+        """Write a film of the run, an mp4, and return it; a notebook plays it. One that is stopped (Ctrl-C) keeps its
+        frames, and the same call goes on after them. See `docs/pictures.md`.
+
+        Args:
+            path: ends in .mp4, or in .webp, an animation that pages of text show, and which does not go on.
+            scene: that of the run, or the path of its file; needed of a trajectory that was loaded from a file.
+            device: of the rays, "cpu" or "cuda:0".
+            settings: keys of the scene's table [picture], such as ``colour="speed"``, ``film_speed=0.25`` or
+                ``film_frames=100``; ``lines=1080`` sets width and height; ``camera=pictures.Orbit()`` moves the camera.
+
+        Raises:
+            SceneError: settings that do not fit.
+            InputError: a package is missing, or what ``colour`` names was not recorded and cannot be computed.
+        """
+        film: Film = on_top("trajectory_film")(self, path, scene, device, settings)
+        return film
+
+    def _repr_html_(self) -> str:
+        """The run in motion, with y up; and its first, middle and last frame, coloured by speed."""
+        page: str = on_top("trajectory_page")(self)
+        return page
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -10,7 +10,7 @@ import numpy as np
 from cortado.errors import InputError, shown
 from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
-from cortado.runs.differences import differences
+from cortado.pictures.side_by_side import differences
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 

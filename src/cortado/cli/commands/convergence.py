@@ -14,7 +14,7 @@ from cortado.cli.commands.named_runs import named_runs
 from cortado.cli.commands.own_quantity import OwnQuantity
 from cortado.errors import InputError, warn
 from cortado.optimisation.sweep.richardson import Extrapolation
-from cortado.runs.differences import differences
+from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensors.summary import summary

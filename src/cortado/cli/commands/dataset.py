@@ -18,7 +18,7 @@ from cortado.optimisation.datasets.layout import METADATA, Parts, assemble, meta
 from cortado.optimisation.datasets.one_run import one_run
 from cortado.optimisation.datasets.sample import Sample
 from cortado.optimisation.datasets.table import DatasetTable, DatasetTables
-from cortado.runs.differences import differences
+from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene

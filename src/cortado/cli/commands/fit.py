@@ -10,7 +10,7 @@ from cortado.files.progress import announce, track
 from cortado.optimisation.fitting.fit import fit
 from cortado.optimisation.fitting.fitted import Fit, Profile
 from cortado.optimisation.inverse.fit_task import FitTask, load_fit
-from cortado.runs.report import write_report
+from cortado.pictures.report import write_report
 from cortado.runs.run_folder import RunFolder
 
 

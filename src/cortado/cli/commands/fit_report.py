@@ -9,7 +9,7 @@ import numpy as np
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
 from cortado.optimisation.fitting.fitted import NOISE_ALONE, Fit, Profile, unit_of
 from cortado.optimisation.inverse.fit_task import FitTask
-from cortado.runs.report import Section
+from cortado.pictures.report import Section
 from cortado.scene.in_words import scene_in_words
 from cortado.words import counted
 

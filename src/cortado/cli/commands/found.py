@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from cortado.optimisation.inverse.figures import component_names
 from cortado.optimisation.inverse.knots import KnotValues
 from cortado.optimisation.inverse.setup import Setup
-from cortado.runs.report import MOST_NUMBERS, written
+from cortado.pictures.report import MOST_NUMBERS, written
 
 Rows = list[tuple[object, ...]]
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from cortado.errors import InputError
-from cortado.runs.run_figures import beside_measured
+from cortado.pictures.run_plots import beside_measured
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensors.measured import Measured, measured_beside
 

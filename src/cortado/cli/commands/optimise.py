@@ -26,7 +26,7 @@ from cortado.optimisation.inverse.task import Task, load_task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
-from cortado.runs.report import Section, write_report
+from cortado.pictures.report import Section, write_report
 from cortado.runs.run_folder import TO_RESUME, RunFolder
 from cortado.words import counted
 

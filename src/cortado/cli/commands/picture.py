@@ -12,15 +12,12 @@ from cortado.errors import InputError
 from cortado.files.interruption import keeping
 from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.pace import pace_of
-from cortado.runs.colouring import coloured_by
-from cortado.runs.differences import labels
+from cortado.pictures.run_pictures import device_of, run_page
+from cortado.pictures.shown_run import ShownRun, coloured_by
+from cortado.pictures.side_by_side import labels, runs_page, shown_alike
+from cortado.runs.film import pace_of
 from cortado.runs.marks import common_rate
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.run_pictures import run_page
-from cortado.runs.showing import device_of
-from cortado.runs.shown_run import ShownRun
-from cortado.runs.side_by_side import runs_page, shown_alike
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene

@@ -18,10 +18,10 @@ from cortado.errors import DivergedError, InputError, warn
 from cortado.files.folder_lock import locked
 from cortado.files.interruption import keeping
 from cortado.files.progress import announce
+from cortado.pictures.report import Section
 from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_choice import EverySteps, FrameChoice
-from cortado.runs.report import Section
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.restart import RestartState

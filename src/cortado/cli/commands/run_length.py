@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import frame_parts
-from cortado.pictures.pace import Pace
 from cortado.rollout.durations import ROOM, steps_of_run
+from cortado.runs.film import Pace
 from cortado.runs.frame_choice import FrameChoice
 from cortado.scene.picture import Picture
 from cortado.simulation import Simulation

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
+from cortado.pictures.shown_run import is_out
 from cortado.rollout.rollout import Rollout
-from cortado.runs.emitted import is_out
 from cortado.runs.sensors.log import Readings
 from cortado.runs.sensors.summary import summary
 from cortado.scene.fluid_masses import FluidMasses

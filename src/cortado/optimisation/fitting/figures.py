@@ -8,7 +8,7 @@ import numpy as np
 from cortado.optimisation.fitting.fitted import Fit, FittedPart, Profile, unit_of
 from cortado.optimisation.fitting.video import Video
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
-from cortado.runs.report import Figures
+from cortado.pictures.report import Figures
 
 GREATEST_SERIES = 4
 """Numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""

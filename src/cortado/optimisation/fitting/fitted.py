@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_one_number
+from cortado.arrays import as_numbers, as_one_number
 from cortado.calls import public
-from cortado.errors import InputError, shown
+from cortado.errors import DivergedError, InputError, shown
+from cortado.on_top import on_top
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
 from cortado.optimisation.fitting.search import TINY, search
@@ -223,10 +224,31 @@ class Fit:
         The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
         where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
         `Fit.coordinates.values` makes parameters of coordinates. Raises `InputError`.
-        """
-        from cortado.optimisation.fitting.posterior import log_posterior
 
-        return log_posterior(self, u)
+        It is minus half of the weighted sum of squares, beyond its least. Correlated noise makes bars longer than the
+        curvature N of the sum of squares has them. Distances from the estimate are therefore shortened by the matrix W
+        with W^T N W = V^-1, the inverse of the covariance of the bars: the curvature adjustment of Ribatet, Cooley and
+        Davison (2012).
+        """
+        point = as_numbers("u", u)
+        if point.shape != self.u.shape:
+            raise InputError(f"u has shape {point.shape}, but must be {self.u.shape}, one for each fitted number.")
+        if self.problem is None:
+            raise InputError(
+                "The fit was pickled, but must have its experiments to say how likely other parameters are."
+            )
+        lower, upper = self.coordinates.bounds
+        root = np.linalg.cholesky(self.hessian)
+        wanted = np.linalg.cholesky(np.linalg.inv(self.coordinate_covariance))
+        shortened = self.u + np.linalg.solve(root.T, wanted.T @ (point - self.u))
+        if not (np.isfinite(point) & (lower <= point) & (point <= upper)).all():
+            return -np.inf
+        try:
+            residuals = self.problem.residuals(np.clip(shortened, lower, upper))
+        except DivergedError:
+            return -np.inf
+        squares = self.problem.sum_of_squares(residuals, [part.weighting for part in self.parts])
+        return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
         """Those that were searched, with the intervals of `intervals`."""
@@ -255,9 +277,8 @@ class Fit:
 
     def _repr_html_(self) -> str:
         """With a table of the numbers, what is doubted, and residuals over time."""
-        from cortado.optimisation.fitting.fit_page import fit_page
-
-        return fit_page(self)
+        page: str = on_top("fit_page")(self)
+        return page
 
     def __str__(self) -> str:
         return "\n".join([*self.lines(), *self.cautions, NOISE_ALONE])

@@ -19,12 +19,12 @@ from cortado.pictures.film import film
 from cortado.pictures.filmed import FilmedRun
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
-from cortado.pictures.pace import Pace, pace_of
 from cortado.pictures.page import Page, Panel
 from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.report import Figures
 from cortado.pictures.scenery import State
-from cortado.runs.emitted import is_out, those
-from cortado.runs.report import Figures
+from cortado.pictures.shown_run import is_out, those
+from cortado.runs.film import Pace, pace_of
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 

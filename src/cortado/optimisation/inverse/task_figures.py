@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from cortado.runs.report import Figures
+from cortado.pictures.report import Figures
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from cortado.errors import InputError, shown
 from cortado.files.atomic import sentences
 from cortado.files.input_files import as_path
 from cortado.files.progress import announce, track
-from cortado.runs.exports.by_trimesh import Advance, write_glb, write_obj, write_ply
-from cortado.runs.exports.by_usd import write_usd
-from cortado.runs.exports.by_vtk import write_vtp
-from cortado.runs.exports.exported import Exported
-from cortado.runs.measuring import Measuring
+from cortado.pictures.exports.by_trimesh import Advance, write_glb, write_obj, write_ply
+from cortado.pictures.exports.by_usd import write_usd
+from cortado.pictures.exports.by_vtk import write_vtp
+from cortado.pictures.exports.exported import Exported
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene, as_scene
+from cortado.simulation import Simulation
 
 FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
     "ply": write_ply,
@@ -30,7 +30,7 @@ def export(
     folder: str | PathLike[str],
     to: str,
     scene: Scene | str | PathLike[str],
-    simulation: Callable[[], Measuring] | None = None,
+    simulation: Callable[[], Simulation] | None = None,
 ) -> Path:
     """See `Trajectory.export`, and `Exported`; returns the file to open, or the folder of a series."""
     if to not in FORMATS:

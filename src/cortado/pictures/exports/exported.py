@@ -10,23 +10,22 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.pictures.contained_liquid import contained_liquid
+from cortado.pictures.exports.whole_frames import WholeFrames
 from cortado.pictures.held_volume import enclosed
 from cortado.pictures.painter import colours_of
 from cortado.pictures.scale import Scale
+from cortado.pictures.shown_run import coloured_by, is_out, shown_places, those
 from cortado.pictures.shown_solids import ShownSolid, shown_solids
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.surface import nearest_colours, spheres
-from cortado.runs.colouring import coloured_by
-from cortado.runs.emitted import is_out, shown_places, those
-from cortado.runs.exports.whole_frames import WholeFrames
 from cortado.runs.frame import Frame
 from cortado.runs.frame_file import fraction_names
-from cortado.runs.measuring import Measuring
 from cortado.runs.solid_motion import SolidMotions, posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
+from cortado.simulation import Simulation
 
 UNLIKE = 0.05
 """Of the volume of the fluid: by how much that of a surface differs before it is said."""
@@ -105,7 +104,7 @@ class Exported:
     """A run and its scene as other programs are given it; ``simulation`` computes what ``picture.colour`` names and was
     not recorded. Raises `InputError` where nothing does."""
 
-    def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Measuring] | None = None):
+    def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Simulation] | None = None):
         self.times, self.scene = trajectory.times, scene
         self._values = coloured_by(scene, trajectory, simulation)
         self._scale = None if self._values is None else Scale.of((scene.picture or Picture()).colour, self._values, "")

@@ -8,8 +8,8 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError, ExtraMissingError
 from cortado.files.atomic import sentences, unfinished
-from cortado.runs.exports.by_trimesh import Advance
-from cortado.runs.exports.exported import Exported, ExportedFrame, Mesh, Pose
+from cortado.pictures.exports.by_trimesh import Advance
+from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pose
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:

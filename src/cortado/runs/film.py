@@ -1,13 +1,15 @@
-"""How fast a film goes through the times of a run, and which of its frames it shows."""
+"""A film of a run: its file, which frames it shows, and how fast time goes in it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor, log10
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import warn
+from cortado.on_top import on_top
 from cortado.scene.picture import Picture
 from cortado.words import counted
 
@@ -120,6 +122,33 @@ class Pace:
     def _lacks(self) -> bool:
         """Whether the film is seen frame by frame, or is much shorter than one of a run with frames enough."""
         return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film that is written."""
+
+    path: Path
+    pace: Pace
+    """Which frames it shows, and how fast."""
+    notes: str = ""
+    """What somebody who sees it should know, in a sentence; empty if there is nothing to say."""
+
+    @property
+    def in_words(self) -> str:
+        """Its pace and its notes, in words."""
+        return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
+
+    def __str__(self) -> str:
+        return f"{self.path.name}: {self.in_words}"
+
+    def __repr__(self) -> str:
+        return f"Film({self.path}, {self.pace})"
+
+    def _repr_html_(self) -> str:
+        """The repr, and a player with the film in it."""
+        page: str = on_top("film_page")(self)
+        return page
 
 
 def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | None = None) -> Pace:

@@ -11,8 +11,8 @@ import numpy as np
 from cortado.errors import ExtraMissingError
 from cortado.files.atomic import write_atomically
 from cortado.files.srgb import to_srgb
-from cortado.runs.exports.by_trimesh import Advance, numbered
-from cortado.runs.exports.exported import Exported, ExportedFrame, Mesh, in_space
+from cortado.pictures.exports.by_trimesh import Advance, numbered
+from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, in_space
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
+from math import ceil, log10
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +17,20 @@ from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
 from cortado.files.input_files import as_path
-from cortado.pictures.film import Film, film, lacking
+from cortado.pictures.film import film, lacking
 from cortado.pictures.grid import MOST, framed_together
 from cortado.pictures.labels import labelled, side_by_side
-from cortado.pictures.pace import pace_of
 from cortado.pictures.page import Around, Page, Panel
+from cortado.pictures.run_pictures import device_of, shown_as
 from cortado.pictures.scale import Scale
-from cortado.runs.colouring import coloured_by
-from cortado.runs.common_clock import SAME, ShownFrames, common_times, interval_of
-from cortado.runs.differences import labels
+from cortado.pictures.shown_run import ShownRun, coloured_by
+from cortado.runs.film import Film, pace_of
 from cortado.runs.marks import common_rate
-from cortado.runs.picture_settings import shown_as
-from cortado.runs.showing import device_of
-from cortado.runs.shown_run import ShownRun
+from cortado.runs.run_files import computed
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
+from cortado.scene.units import unit_of
 
 
 @public
@@ -148,3 +149,120 @@ def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
     """The page, with the scale beside it."""
     page = side_by_side(images, across)
     return page if scale is None else scale.beside(page)
+
+
+SAME = 0.01
+"""Of the time between two frames: those that are apart by less are at the same time."""
+
+
+def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """(frames,) [s] of a film of runs whose frames are at times (own frames,): those of the run with most frames in a
+    second, and before and after it those of others."""
+    found = np.zeros(0)
+    for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
+        if not len(found):
+            found = np.asarray(times, dtype=np.float64)
+            continue
+        apart = 0.5 * interval_of(times)
+        outside = (times < found[0] - apart) | (times > found[-1] + apart)
+        found = np.sort(np.concatenate([found, times[outside]]))
+    return found
+
+
+def interval_of(times: NDArray[Any]) -> float:
+    """The usual time between two frames [s]; infinite with a single one."""
+    return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class ShownFrames:
+    """Which frames of one run a film shows: at each of its times the nearest one that was recorded."""
+
+    own: NDArray[Any]
+    """(own frames,) when they were recorded [s]"""
+    times: NDArray[Any]
+    """(frames,) of the film, in the time of the run [s]"""
+
+    @cached_property
+    def nearest(self) -> NDArray[np.int64]:
+        """(frames,) the number of the run's frame."""
+        return np.rint(np.interp(self.times, self.own, np.arange(len(self.own)))).astype(np.int64)
+
+    @cached_property
+    def during(self) -> NDArray[np.bool_]:
+        """(frames,) whether the run has begun, and has not ended yet."""
+        near = SAME * interval_of(self.times)
+        return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
+
+    @property
+    def off(self) -> float:
+        """How far a frame is from the time at which it is shown, at most, while the run goes on [s]."""
+        return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
+
+    def time_in_words(self, k: int) -> str:
+        """When the frame was recorded that is shown as frame k, with as many digits as tell frames apart."""
+        interval = interval_of(self.times)
+        digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
+        time = f"{self.own[self.nearest[k]]:.{digits}f} s"
+        return time if self.during[k] else f"stands still at {time}"
+
+    def notes(self, name: str) -> list[str]:
+        """What is to be said of a run of that name."""
+        ends = f'"{name}" ends at {self.own[-1]:.4g} s and stands still from then on'
+        begins = f'"{name}" begins at {self.own[0]:.4g} s'
+        return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
+
+
+_MISSING = "missing"
+MOST_KEYS, LONGEST = 3, 64
+"""Values and characters of a label; where it has more, it is another one."""
+
+
+def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
+    """Both values of whatever differs, by dotted names."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        pairs = {key: (one.get(key, _MISSING), other.get(key, _MISSING)) for key in {**one, **other}}
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _has_tables(one):
+        pairs = {str(k): pair for k, pair in enumerate(zip(one, other, strict=True))}
+    else:
+        return {} if one == other else {name: [one, other]}
+    before = f"{name}." if name else ""
+    return {
+        key: pair for part, values in pairs.items() for key, pair in differences(*values, f"{before}{part}").items()
+    }
+
+
+def _has_tables(values: list[Any]) -> bool:
+    return any(isinstance(value, Mapping) for value in values)
+
+
+def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
+    """What each of several scenes is called beside the others: its name if all names differ, or else the values in
+    which the scenes differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values
+    differ, or too many."""
+    tables = [computed(json.loads(scene.to_json())) for scene in scenes]
+    keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table)))
+    short = [key.rpartition(".")[2] for key in keys]
+    names = short if len(set(short)) == len(keys) else keys
+    by_value = [
+        ", ".join(f"{name.replace('_', ' ')} = {_value(table, key)}" for name, key in zip(names, keys, strict=True))
+        for table in tables
+    ]
+    few = len(keys) <= MOST_KEYS and max(map(len, by_value)) <= LONGEST
+    for found in ([scene.name for scene in scenes], by_value if few else []):
+        if len(set(found)) == len(scenes):
+            return found
+    return list(otherwise)
+
+
+def _value(table: Any, key: str) -> str:
+    """What a table of a scene has under a dotted name, in words."""
+    for part in key.split("."):
+        try:
+            table = table[int(part)] if isinstance(table, list) else table[part]
+        except (LookupError, TypeError, ValueError):
+            return "none"
+    if table is None or isinstance(table, str):
+        return table or "none"
+    text = f"{table:g}" if isinstance(table, float) else shown(table)
+    return f"{text} {unit_of(key)}".rstrip()

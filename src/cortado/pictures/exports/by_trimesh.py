@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.files.atomic import write_atomically
 from cortado.files.srgb import to_srgb
-from cortado.runs.exports.exported import Exported, ExportedFrame, Mesh, Pose
+from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pose
 
 Advance = Callable[[], None]
 """Called after each frame."""
