@@ -13,13 +13,11 @@ import numpy as np
 
 from cortado.arrays import whole_number
 from cortado.calls import public
-from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
 from cortado.device.lanes import checked_lanes
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
-from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.calibration import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
@@ -110,7 +108,6 @@ class Simulation(Stepping):
         """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
-        begin_headers(sum_and_maximum_kernel(self.precision, self.device.is_cpu).kernel, self.device)
         discrete = discretise(scene)
         room = first_capacity(scene.discretisation.support, scene.dimension)
         counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)

@@ -2,7 +2,6 @@
 turn, as Warp launches in one thread there."""
 
 from collections.abc import Callable
-from concurrent.futures import wait
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,7 @@ import warp as wp
 
 from cortado.device.cores import usable_cores
 from cortado.device.launching import launch, recorded
-from cortado.device.threads import MOST_CORES, helpers
+from cortado.device.threads import MOST_CORES, in_parallel
 
 BANDS = 8
 """Bands for each core: one may take longer than another."""
@@ -38,7 +37,7 @@ class BandLauncher:
             work(0)
             self._compiled.add(kernel)
             begin = 1
-        _shared(partial(map, work), range(begin, bands), cores)
+        in_parallel(work, range(begin, bands), cores)
 
     def to_and_fro(
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
@@ -53,21 +52,3 @@ class BandLauncher:
         for k in range(rounds):
             ways[k % 2]()
         return other if rounds % 2 else values
-
-
-def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:
-    """Do work for each item, on so many cores."""
-    waiting = iter(items)
-
-    def take() -> None:
-        for _ in work(waiting):
-            pass
-
-    called = [helpers().submit(take) for _ in range(cores - 1)]
-    try:
-        take()
-    finally:
-        begun = [helper for helper in called if not helper.cancel()]
-        wait(begun)
-    for helper in begun:
-        helper.result()

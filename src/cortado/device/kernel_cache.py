@@ -15,7 +15,6 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from cortado.device.compiling import watch_compilation
 from cortado.device.silence import silenced
 from cortado.errors import ComputationError
 from cortado.files.terminal import say
@@ -34,7 +33,6 @@ def start_warp() -> None:
     there is none either."""
     import warp as wp
 
-    watch_compilation()
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)

@@ -1,7 +1,6 @@
 """Launches of kernels with arguments by name, and sums over particles in a fixed order."""
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import wait
 from contextlib import contextmanager, nullcontext
 from functools import cache, partial
 from typing import Any
@@ -10,11 +9,12 @@ import warp as wp
 
 from cortado.device.binding import Named, bound
 from cortado.device.bundles import Bundles
+from cortado.device.compiling import announce
 from cortado.device.cores import usable_cores
 from cortado.device.lanes import check_lanes, lanes_of
 from cortado.device.precision import Precision
 from cortado.device.reduction import ReductionKernel, add_kernel, sum_and_maximum_kernel, sum_kernel
-from cortado.device.threads import MOST_CORES, WARP, helpers
+from cortado.device.threads import MOST_CORES, WARP, in_parallel
 
 MOST_PARTS = 32
 """Ranges of particles at most that a launch on a CPU is cut into."""
@@ -60,6 +60,7 @@ def launch(
 ) -> None:
     """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: how many
     threads of a GPU share memory, if it matters."""
+    announce(kernel, device)
     inputs, sizes = bound(kernel, groups, arguments, Bundles()), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
     _perform(kernel.key, threads, inputs, work)
@@ -67,6 +68,7 @@ def launch(
 
 def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> Callable[[], None]:
     """What launches a kernel as `launch` does, again and again with the same arguments, which are packed once."""
+    announce(kernel, device)
     inputs = bound(kernel, (), arguments, Bundles())
     command = wp.launch(kernel, threads, inputs=inputs, device=device, record_tape=False, record_cmd=True)
     return partial(_perform, kernel.key, threads, inputs, command.launch)
@@ -133,6 +135,7 @@ class KernelLauncher:
         if sums and not self.capturable and kernel in self._compiled:
             _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
             return
+        announce(kernel, self.device)
         options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
         _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
@@ -162,26 +165,11 @@ class KernelLauncher:
         if self._whole is not inputs[0]:
             self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(self.parts)]
 
-        waiting = iter(range(self.parts))
+        def launch_part(part: int) -> None:
+            threads, inputs_of_part = self._bounds[part + 1] - self._bounds[part], [self._parts[part], *inputs[1:]]
+            wp.launch(kernel, threads, inputs=inputs_of_part, device=self.device, record_tape=False)
 
-        def take() -> None:
-            for part in waiting:
-                wp.launch(
-                    kernel,
-                    self._bounds[part + 1] - self._bounds[part],
-                    inputs=[self._parts[part], *inputs[1:]],
-                    device=self.device,
-                    record_tape=False,
-                )
-
-        called = [helpers().submit(take) for _ in range(min(self._cores, self.parts) - 1)]
-        try:
-            take()
-        finally:
-            begun = [helper for helper in called if not helper.cancel()]
-            wait(begun)  # also after an interruption: nothing may go on writing behind the back of what comes next
-        for helper in begun:
-            helper.result()
+        in_parallel(launch_part, range(self.parts), min(self._cores, self.parts))
 
     def _part(self, neighbourhood: Any, number: int) -> Any:
         """The neighbourhood as one range sees them."""

@@ -6,8 +6,8 @@ that are loaded. Two threads in there at a time spoil each other's results, so t
 
 import os
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ContextDecorator, contextmanager, suppress
 from functools import cache, wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
@@ -24,6 +24,30 @@ MOST_CORES = 16
 def helpers() -> ThreadPoolExecutor:
     """The threads that help the one that launches."""
     return ThreadPoolExecutor(MOST_CORES - 1, thread_name_prefix="cortado")
+
+
+def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
+    """Do work for each item, on so many cores: this thread, and those that help it, take one item after the other.
+
+    Returns once all of them have ended, also after an interruption: nothing may go on behind the back of what comes
+    next. After that, and after a failure, which is raised, nobody takes another item.
+    """
+    waiting = iter(items)
+
+    def take() -> None:
+        for item in waiting:
+            work(item)
+
+    called = [helpers().submit(take) for _ in range(cores - 1)]
+    try:
+        take()
+    finally:
+        for _ in waiting:
+            pass
+        begun = [helper for helper in called if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
 
 
 class _Entries(threading.local):
