@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from cortado import losses, reference
 from cortado.errors import InputError
 from cortado.losses import Snapshot
-from cortado.losses.checked import as_loss
 from cortado.losses.loss import by_field
+from cortado.losses.run_losses import as_loss
 from cortado.problem import Problem
 from cortado_reference.digits import Digits
 

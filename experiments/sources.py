@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cortado import reference
 from cortado.gradients import AdjointEstimator, AdjointNorms, GradientEstimator
 from cortado.losses import Frames
-from cortado.losses.checked import as_loss
+from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays, Values

@@ -56,7 +56,7 @@ SHARED = {
     "particles.neighbourhood": {"pair_functions.factor_gradient", "pair_functions.hessian_product"},
     "discretise.smoothing_functions": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
     "losses.image_losses": {"adjoint", "reduce_transposed"},
-    "losses.matching": {"matching_kernels.difference"},
+    "losses.distances": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
     "solvers.contact_strength": {"strength_kernels.part"},

@@ -15,9 +15,8 @@ from cortado.forward_pass import ProblemForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotBatch
-from cortado.losses.along_tangents import derivative_along
-from cortado.losses.by_step import LossesByStep
 from cortado.losses.loss import moment_of
+from cortado.losses.run_losses import LossesByStep, derivative_along
 from cortado.particles.state import State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.parameter_space import ParameterSpace

@@ -11,8 +11,8 @@ from cortado.certificate.twin import Rounded
 from cortado.errors import DivergedError
 from cortado.gradients.points import NO_RUN
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
-from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field
+from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays

@@ -14,8 +14,8 @@ from cortado.losses import (
     Snapshot,
     SnapshotAdjoint,
 )
-from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field
+from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer

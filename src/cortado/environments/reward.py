@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from cortado.device.threads import WARP
 from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.environments.terms import StepEnd, Term
-from cortado.losses.batch import SnapshotBatch
-from cortado.losses.loss import Snapshot
+from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
-from cortado.losses.batch import SnapshotBatch
+from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.moment import Moment, row_of

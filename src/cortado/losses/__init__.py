@@ -1,14 +1,10 @@
 """What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
 
 from cortado.calls import face
-from cortado.losses.batch import SnapshotBatch
-from cortado.losses.centre_of_mass import CentreOfMass, CentreOfMassAlong
-from cortado.losses.image import Image
-from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
-from cortado.losses.positions import FinalPositions
-from cortado.losses.recorded import Recorded
+from cortado.losses.distances import CentreOfMass, CentreOfMassAlong, FinalPositions, Image, SolidPose
+from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, fingerprint
+from cortado.losses.run_losses import Recorded
 from cortado.losses.series import SensorMatch, Series
-from cortado.losses.solid_pose import SolidPose
 
 __all__ = [
     "CentreOfMass",

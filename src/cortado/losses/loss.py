@@ -1,9 +1,9 @@
-"""What a loss is, what it is given, and the sum of several at several steps."""
+"""Losses: what they are given and return, of one scene and of a batch, and the sum of several at several steps."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, overload, runtime_checkable
 
 import numpy as np
 
@@ -52,17 +52,17 @@ class Snapshot:
     @cached_property
     def positions(self) -> np.ndarray:
         """(n, d) [m], float64, read-only"""
-        return _read_only(self.state.positions.numpy()[:, : self.dimension])
+        return self._field("positions")
 
     @cached_property
     def velocities(self) -> np.ndarray:
         """(n, d) [m / s], float64, read-only"""
-        return _read_only(self.state.velocities.numpy()[:, : self.dimension])
+        return self._field("velocities")
 
     @cached_property
     def mass_fractions(self) -> np.ndarray:
         """(n, phases) [-], float64, read-only"""
-        return _read_only(self.state.mass_fractions.numpy())
+        return self._field("mass_fractions")
 
     def __getitem__(self, name: str) -> np.ndarray:
         """A field of the state by its name, such as "velocities", or a quantity of its particles, such as "density" or
@@ -71,7 +71,7 @@ class Snapshot:
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
         if isinstance(name, str) and name in self.state.names:
-            return _read_only(self.state.numpy(self.dimension, only=[name])[name])
+            return self._field(name)
         check_readable(name, "a field of a state", self.state.names)
         return self._quantity(name)
 
@@ -90,6 +90,9 @@ class Snapshot:
         """That of the scene."""
         return moment_of(self).container
 
+    def _field(self, name: str) -> np.ndarray:
+        return _read_only(self.state.numpy(self.dimension, only=[name])[name])
+
     def _quantity(self, name: str) -> np.ndarray:
         return moment_of(self).value(name)
 
@@ -101,15 +104,7 @@ def _read_only(values: np.ndarray) -> np.ndarray:
     return found
 
 
-class HasMoment(Protocol):
-    """A state of one scene or of a batch, as its quantities see it."""
-
-    @property
-    def moment(self) -> Moment | None:
-        """See `Snapshot`."""
-
-
-def moment_of(end: HasMoment) -> Moment:
+def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
     """What quantities of a state follow from; raises `InputError` where it is not known."""
     if end.moment is None:
         raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
@@ -140,7 +135,7 @@ class SnapshotAdjoint:
     step: StepBar | None = None
     """With respect to the parameters of the step after the state, once that of quantities is in it."""
 
-    def through_quantities(self, end: HasMoment) -> "SnapshotAdjoint":
+    def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
         """With respect to the state and the parameters alone: quantities follow from these."""
         if not self.quantities:
             return self
@@ -212,3 +207,128 @@ class Frames:
 def fingerprint(loss: Any) -> str:
     """A text that tells one loss from another: its own ``fingerprint``, the code of a function, or else the type."""
     return getattr(loss, "fingerprint", code_words(loss) if callable(loss) else type(loss).__qualname__)
+
+
+@dataclass(frozen=True, eq=False)
+class SnapshotBatch(Sequence[Snapshot]):
+    """A state of a rollout of a batch: ``end[b]`` is the `Snapshot` of scene b."""
+
+    state: State
+    """Warp arrays (batch n,), in the scenes' order; `State.numbers` shows them as (batch, n, ...)."""
+    dimension: int
+    colours: np.ndarray
+    """(batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    moment: Moment | None = None
+    """As that of `Snapshot`."""
+
+    def __repr__(self) -> str:
+        particles = counted(len(self.state.positions) // len(self), "particle")
+        return f"SnapshotBatch({counted(len(self), 'scene')} of {particles})"
+
+    def __len__(self) -> int:
+        """Number of scenes."""
+        return len(self.colours)
+
+    @overload
+    def __getitem__(self, b: int) -> Snapshot: ...
+
+    @overload
+    def __getitem__(self, b: slice) -> Sequence[Snapshot]: ...
+
+    def __getitem__(self, b: int | slice) -> Snapshot | Sequence[Snapshot]:
+        if isinstance(b, slice):
+            return [self[k] for k in range(len(self))[b]]
+        number = range(len(self))[b]
+        own = self.state.member(number), self.dimension, self.colours[number], self.moment
+        return _Member(*own, batch=self, number=number)
+
+    @property
+    def precision(self) -> Precision:
+        """Of the Warp arrays."""
+        return precision_of(self.state)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(batch, n, d) [m], float64, read-only"""
+        return self.on_host["positions"]
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """(batch, n, d) [m / s], float64, read-only"""
+        return self.on_host["velocities"]
+
+    @property
+    def mass_fractions(self) -> np.ndarray:
+        """(batch, n, phases) [-], float64, read-only"""
+        return self.on_host["mass_fractions"]
+
+    @cached_property
+    def on_host(self) -> dict[str, np.ndarray]:
+        """All fields of all scenes by name, read from the device at once; float64, read-only."""
+        return {name: _read_only(array) for name, array in self.state.numpy(self.dimension).items()}
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class _Member(Snapshot):
+    """One scene of a batch, whose arrays come to the host with those of the others."""
+
+    batch: SnapshotBatch
+    number: int
+
+    def _quantity(self, name: str) -> np.ndarray:
+        return super()._quantity(name)[self.number]
+
+    def _field(self, name: str) -> np.ndarray:
+        return self.batch.on_host[name][self.number]
+
+
+@runtime_checkable
+class BatchedLoss(Protocol):
+    """A loss that looks at all scenes of a batch at once, which saves a launch and a look of the host for each. Scene b
+    gets the bits that it would get alone."""
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        """(batch,) the losses; of scenes that were lost they mean nothing."""
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        """The same, and the derivatives with respect to the states, as Warp arrays: ``end.state.like()`` makes them,
+        all 0, and ``set({"positions": array})`` of it writes an array (batch, n, d)."""
+
+
+def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
+    """(batch,) the losses of some scenes; NaN for others."""
+    found = np.full(len(end), np.nan)
+    if isinstance(loss, BatchedLoss):
+        found[members] = loss.values(end)[members]
+    else:
+        found[members] = [loss.value(end[b]) for b in members]
+    return found
+
+
+def batch_values_and_adjoints(
+    loss: Loss, end: SnapshotBatch, members: Sequence[int]
+) -> tuple[np.ndarray, SnapshotAdjoint]:
+    """(batch,) the losses of some scenes, NaN for others, and the adjoints of their states, 0 for others."""
+    found = np.full(len(end), np.nan)
+    if isinstance(loss, BatchedLoss):
+        all_found, state = loss.values_and_adjoint(end)
+        found[members] = all_found[members]
+        for b in set(range(len(end))).difference(members):
+            state.member(b).clear()
+        return found, SnapshotAdjoint(state, np.zeros_like(end.colours))
+    adjoint = SnapshotAdjoint(end.state.like(), np.zeros_like(end.colours))
+    arrays: dict[str, np.ndarray] = {}
+    for b in members:
+        found[b], bar = loss.value_and_adjoint(end[b])
+        more: Mapping[str, np.ndarray] = {}
+        if isinstance(bar, SnapshotAdjoint):
+            adjoint.colours[b], more, bar = bar.colours, bar.quantities, bar.state
+        if isinstance(bar, State):
+            adjoint.state.member(b).assign(bar)
+        else:
+            more = by_field(bar, end.dimension)
+        for name, array in more.items():
+            arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
+    adjoint.state.set(arrays)
+    of_quantities = {name: array for name, array in arrays.items() if name not in end.state.names}
+    return found, replace(adjoint, quantities=of_quantities)

@@ -1,0 +1,302 @@
+"""Losses that are distances from targets: of particles, of the centre of mass, of a solid, of a picture."""
+
+from functools import cache
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import read_only, require_methods
+from cortado.device.launching import TreeReduction, launch, sum_of
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.device.threads import WARP
+from cortado.errors import InputError, shown
+from cortado.files.srgb import LIGHT, check_light
+from cortado.fixed import fixed
+from cortado.losses.image_losses import ImageLoss, SquaredDifference
+from cortado.losses.loss import Adjoint, Snapshot, SnapshotAdjoint, SnapshotBatch
+from cortado.particles.arrays import to_device
+from cortado.particles.state import State
+from cortado.scene.motions import AXES, position_name, solids_in
+from cortado.scene.poses import Pose, matrix
+
+
+@cache
+def matching_kernels(precision: Precision) -> tuple[Any, Any]:
+    """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets, which
+    are the same for every scene of a batch."""
+    real, vector = precision.real, precision.vector
+    module = kernel_module(f"matching_{precision.name}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def squared_distance(
+        x: wp.array(dtype=vector),
+        target: wp.array(dtype=vector),
+        # out
+        squares: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        miss = wp.vec3d(x[i] - target[i % target.shape[0]])
+        squares[i] = wp.dot(miss, miss)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def difference(
+        factor: real,
+        x: wp.array(dtype=vector),
+        target: wp.array(dtype=vector),
+        # out
+        bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        bar[i] = factor * (x[i] - target[i % target.shape[0]])
+
+    return squared_distance, difference
+
+
+@fixed
+class FinalPositions:
+    """Mean over particles of the squared distance to their targets [m2]."""
+
+    def __init__(self, target: np.ndarray):
+        """``target`` (n, d) [m], in the scene's order."""
+        self.target = read_only("target", target)
+        if self.target.ndim != 2 or not np.isfinite(self.target).all():
+            raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
+        self.fingerprint = _checksum(self.target)
+        """Tells one target from another, for checkpoints."""
+        self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
+        """The target and the sum over particles, by device, precision and number of scenes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return FinalPositions, (self.target,)
+
+    def value(self, end: Snapshot) -> float:
+        return float(self._mean_squares(end)[0])
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, State]:
+        return self.value(end), self._adjoint(end)
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        """See `losses.loss.BatchedLoss`."""
+        return self._mean_squares(end)
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        """See `losses.loss.BatchedLoss`."""
+        return self.values(end), self._adjoint(end)
+
+    @WARP
+    def _mean_squares(self, end: Snapshot | SnapshotBatch) -> np.ndarray:
+        x, (target, total) = end.state.positions, self._made(end)
+        squares = wp.empty(len(x), dtype=wp.float64, device=x.device)
+        kernel, _ = matching_kernels(end.precision)
+        launch(kernel, len(x), x.device, x=x, target=target, squares=squares)
+        return total(squares).numpy() / len(target)
+
+    @WARP
+    def _adjoint(self, end: Snapshot | SnapshotBatch) -> State:
+        x, bar, (target, _) = end.state.positions, end.state.like(), self._made(end)
+        _, kernel = matching_kernels(end.precision)
+        launch(kernel, len(x), x.device, factor=2.0 / len(target), x=x, target=target, bar=bar.positions)
+        return bar
+
+    def _made(self, end: Snapshot | SnapshotBatch) -> tuple[wp.array, TreeReduction]:
+        x, members = end.state.positions, end.state.batch or 1
+        shape = (len(x) // members, end.dimension)
+        if shape != self.target.shape:
+            raise InputError(f"target has shape {self.target.shape}, but must be {shape}.")
+        key = (str(x.device), end.precision, members)
+        if key not in self._on_device:
+            total = sum_of(wp.float64, len(self.target), x.device, members)
+            self._on_device[key] = to_device(self.target, end.precision, x.device), total
+        return self._on_device[key]
+
+
+@fixed
+class CentreOfMass:
+    """Squared distance of the centre of mass to a target [m2]."""
+
+    def __init__(self, target: Any, masses: np.ndarray | None = None):
+        """``target`` (d,) [m]; ``masses`` (n,) of the particles in any unit, None where they are all the same."""
+        self.target, self._weights = _finite("target", target), _weights(masses)
+        self.fingerprint = _checksum(self.target, self._weights)
+        """Tells one target from another, for checkpoints."""
+
+    def value(self, end: Snapshot) -> float:
+        return float((self._miss(end) ** 2).sum())
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        bar = 2.0 * _shares(self._weights, end)[:, None] * self._miss(end)
+        return self.value(end), (bar, np.zeros_like(end.velocities))
+
+    def _miss(self, end: Snapshot) -> np.ndarray:
+        if self.target.shape != (end.dimension,):
+            raise InputError(f"target has shape {self.target.shape}, but must be {(end.dimension,)}.")
+        return _shares(self._weights, end) @ end.positions - self.target
+
+
+@fixed
+class CentreOfMassAlong:
+    """Component of the centre of mass along a direction [m]: its gradient is that of the centre of mass itself."""
+
+    def __init__(self, direction: Any, masses: np.ndarray | None = None):
+        """``direction`` (d,) [-]; ``masses`` as those of `CentreOfMass`."""
+        self.direction, self._weights = _finite("direction", direction), _weights(masses)
+        self.fingerprint = _checksum(self.direction, self._weights)
+        """Tells one direction from another, for checkpoints."""
+
+    def value(self, end: Snapshot) -> float:
+        return float((self._slopes(end) * end.positions).sum())
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        return self.value(end), (self._slopes(end), np.zeros_like(end.velocities))
+
+    def _slopes(self, end: Snapshot) -> np.ndarray:
+        if self.direction.shape != (end.dimension,):
+            raise InputError(f"direction has shape {self.direction.shape}, but must be {(end.dimension,)}.")
+        return _shares(self._weights, end)[:, None] * self.direction
+
+
+def _finite(what: str, value: Any) -> np.ndarray:
+    """A read-only copy in float64, or an `InputError`."""
+    array = read_only(what, value)
+    if array.ndim != 1 or not np.isfinite(array).all():
+        raise InputError(f"{what} has shape {array.shape}, but must have 1 dimension and be finite.")
+    return array
+
+
+def _weights(masses: np.ndarray | None) -> np.ndarray | None:
+    if masses is None:
+        return None
+    array = _finite("masses", masses)
+    if not (array >= 0.0).all() or not array.any():
+        raise InputError("masses has a number below 0, or only zeros, but must be the masses of particles.")
+    return array
+
+
+def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
+    """(n,) of the particles in the mass of all."""
+    n = len(end.positions)
+    if weights is None:
+        return np.full(n, 1.0 / n)
+    if weights.shape != (n,):
+        raise InputError(f"masses has shape {weights.shape}, but must be {(n,)}.")
+    return weights / weights.sum()
+
+
+def _checksum(*parts: Any) -> str:
+    """Of arrays and bytes, None for those that are left out."""
+    return sha256(b" ".join(b"" if one is None else bytes(memoryview(one)) for one in parts)).hexdigest()
+
+
+@fixed
+class SolidPose:
+    """Of a solid that moves, |x - x*|^2 + l^2 (3 - tr R*^T R) [m2]: the squared distance of its middle to where it
+    should be, and, for a rotation that is off by a small angle, the squared angle times that of a length l."""
+
+    def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
+        """``name`` of the solid; ``position`` (d,) of its middle [m] and ``rotation``, in 3-D a rotation vector (3,),
+        in 2-D a number, [rad], either or both; ``length`` l [m], greater than 0."""
+        if not isinstance(name, str):
+            raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
+        if position is None and rotation is None:
+            raise InputError("position and rotation are left out, but one of them must be given.")
+        if not np.isfinite(length) or length <= 0.0:
+            raise InputError(f"length is {shown(length)}, but must be greater than 0.")
+        self.name, self.length = name, float(length)
+        self.position = None if position is None else read_only("position", position)
+        self.rotation = None if rotation is None else read_only("rotation", np.atleast_1d(rotation))
+        self.fingerprint = _checksum(name.encode(), self.position, self.rotation, np.float64(length))
+        """Tells one target from another, for checkpoints."""
+
+    def value(self, end: Snapshot) -> float:
+        return self.value_and_adjoint(end)[0]
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        name, names = self.name, end.state.names
+        if position_name(name) not in names:
+            moving = ", ".join(solids_in(names)) or "none does"
+            raise InputError(f"name is {name!r}, but must be that of a solid that moves: {moving}.")
+        value, bars = 0.0, {}
+        if self.position is not None:
+            position = end[position_name(name)]
+            if self.position.shape != position.shape[1:]:
+                raise InputError(f"position has shape {self.position.shape}, but must be {position.shape[1:]}.")
+            value += float(((position - self.position) ** 2).sum())
+            bars[position_name(name)] = 2.0 * (position - self.position)
+        if self.rotation is not None:
+            if self.rotation.shape != (2 * end.dimension - 3,):
+                raise InputError(f"rotation has shape {self.rotation.shape}, but must be {(2 * end.dimension - 3,)}.")
+            more, of_fields = self._turned(end)
+            value, bars = value + more, {**bars, **of_fields}
+        return value, bars
+
+    def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
+        """The part of the rotation, and its adjoint; t is that of a further turn of R."""
+        assert self.rotation is not None
+        pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
+        R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
+        t = -weight * np.cross(R, wanted, axis=0).sum(axis=1)
+        return weight * float(3.0 - np.trace(wanted.T @ R)), pose.turning_bars(t)
+
+
+class Pictures(Protocol):
+    """What makes pictures, such as `cortado.render.renderer.Renderer`."""
+
+    def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
+        """The picture (rows, columns, 3)."""
+
+    def adjoint(self, image_bar: np.ndarray) -> Any:
+        """``positions``, ``fractions`` and ``colours``: derivatives of a function of the last picture."""
+
+
+@fixed
+class Image:
+    """How far the picture of a state is from a target picture."""
+
+    def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
+        """``target`` (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
+        `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
+        that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
+        require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
+        self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
+        wanted = "an object such as cortado.image_losses.Pyramid()"
+        require_methods("distance", self.distance, ("value", "adjoint"), wanted)
+        self.target = _target_image(target, getattr(renderer, "shape", None))
+        parts = (self.distance.fingerprint, _checksum(self.target))
+        self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
+        """Tells one target, or one view of it, from another, for checkpoints."""
+
+    def image(self, end: Snapshot) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+    @WARP
+    def value(self, end: Snapshot) -> float:
+        return self.distance.value(self.image(end), self.target)
+
+    @WARP
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, SnapshotAdjoint]:
+        image = self.image(end)
+        found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
+        bar = end.state.like()
+        wp.copy(bar.positions, found.positions)
+        wp.copy(bar.mass_fractions, found.fractions)
+        return self.distance.value(image, self.target), SnapshotAdjoint(bar, found.colours)
+
+
+def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
+    """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
+    image = read_only("target", target)
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
+    if shape is not None and image.shape != shape:
+        raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
+    if not np.isfinite(image).all():
+        raise InputError("target has a value that is not finite, but must be made of finite numbers.")
+    check_light("target", target)
+    if image.min() < 0.0:
+        raise InputError(f"target has a value of {image.min():g}, but must be {LIGHT}; clip noise at 0.")
+    return image

@@ -1,0 +1,262 @@
+"""The losses of a run, in whatever form users give them: checked, and each of the state after its number of steps."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import as_numbers, as_one_number, require_arguments
+from cortado.code_words import code_words
+from cortado.device.threads import WARP
+from cortado.errors import InputError
+from cortado.fixed import fixed
+from cortado.losses.loss import (
+    ADJOINT_FIELDS,
+    Adjoint,
+    BatchedLoss,
+    Frames,
+    Loss,
+    Snapshot,
+    SnapshotAdjoint,
+    SnapshotBatch,
+    batch_values,
+    batch_values_and_adjoints,
+    by_field,
+    moment_of,
+)
+from cortado.particles.state import State
+from cortado.scene.parameters.values import Arrays
+from cortado.scene.quantities import check_readable
+
+WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
+LAUNCHED = "positions", "velocities", "an array for the loss"
+"""Its arguments, in words."""
+
+
+@fixed
+class Recorded:
+    """A loss that is any function of Warp arrays, differentiated by Warp's tape.
+
+    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
+    the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
+    into a function of its own.
+    """
+
+    def __init__(self, function: WarpFunction):
+        require_arguments("function", function, LAUNCHED)
+        self.function = function
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells the loss from one of another function, or of other numbers, for searches that go on."""
+        return f"{type(self).__qualname__} {code_words(self.function)}"
+
+    @WARP
+    def value(self, end: Snapshot) -> float:
+        loss, _, _ = self._run(end)
+        return float(loss.numpy()[0])
+
+    @WARP
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        with wp.Tape() as tape:
+            loss, positions, velocities = self._run(end)
+        tape.backward(loss)
+        bars = tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
+        return float(loss.numpy()[0]), bars
+
+    def _run(self, end: Snapshot) -> tuple[wp.array, wp.array, wp.array]:
+        copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]
+        loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
+        self.function(copies[0], copies[1], loss)
+        return loss, copies[0], copies[1]
+
+
+FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
+"""What the arrays of an adjoint are derivatives with respect to, in words."""
+
+
+class CheckedLoss:
+    """A loss whose value is a number, and whose adjoint fits the state."""
+
+    def __init__(self, loss: Any):
+        """A `Loss`; an ``adjoint`` of its own takes the place of ``value_and_adjoint``."""
+        self._loss = loss
+
+    def value(self, end: Snapshot) -> float:
+        return as_one_number("the loss's value", self._loss.value(end))
+
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
+        """As that of `Loss`; arrays come in float64."""
+        if hasattr(self._loss, "adjoint"):
+            return self.value(end), self._checked(self._loss.adjoint(end), end)
+        value, bar = self._loss.value_and_adjoint(end)
+        return as_one_number("the loss's value", value), self._checked(bar, end)
+
+    def _checked(self, bar: Any, end: Snapshot) -> Adjoint:
+        if isinstance(bar, State):
+            return _checked_state(bar, end)
+        if isinstance(bar, SnapshotAdjoint):
+            colours = _checked_adjoint("adjoint of colours", bar.colours, end.colours.shape)
+            return SnapshotAdjoint(_checked_state(bar.state, end), colours, _checked_table(bar.quantities, end))
+        if isinstance(bar, Mapping):
+            return _checked_table(bar, end)
+        if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
+            count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
+            raise InputError(
+                f"the loss's adjoint is a {type(bar).__name__}{count}, but must be a tuple of two or three arrays, the "
+                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or a SnapshotAdjoint."
+            )
+        wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
+        forms = (f"adjoint of {form}" for form in FORMS)
+        return tuple(_checked_adjoint(*entry) for entry in zip(forms, bar, wanted, strict=False))
+
+
+class CheckedBatchedLoss(CheckedLoss):
+    """The same of a loss that looks at all scenes of a batch at once."""
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        return _checked_array("values", self._loss.values(end), (len(end),))
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        values, bar = self._loss.values_and_adjoint(end)
+        return _checked_array("values", values, (len(end),)), _checked_state(bar, end)
+
+
+def as_loss(loss: Any) -> Loss:
+    """A loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
+    if isinstance(loss, type):
+        raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
+    derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
+    if derivative is not None and hasattr(loss, "value"):
+        for name in ("value", derivative):
+            require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
+        return CheckedBatchedLoss(loss) if isinstance(loss, BatchedLoss) else CheckedLoss(loss)
+    if not callable(loss):
+        raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
+    other = ", of Warp arrays; a loss of the end of a trajectory is an object with value(end) and adjoint(end)"
+    require_arguments("loss", loss, LAUNCHED, other)
+    return CheckedLoss(Recorded(loss))
+
+
+def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
+    if not isinstance(bar, State):
+        raise InputError(f"the loss's adjoint has a {type(bar).__name__} as its state, but must have a State.")
+    if bar.names != end.state.names:
+        raise InputError(f"the loss's adjoint has {', '.join(bar.names)}, but must have {', '.join(end.state.names)}.")
+    for name in bar.names:
+        form, found, wanted = name.replace("_", " "), bar[name], end.state[name]
+        if not isinstance(found, wp.array) or _layout(found) != _layout(wanted):
+            text = _layout(found) if isinstance(found, wp.array) else f"a {type(found).__name__}"
+            raise InputError(f"the loss's adjoint of {form} is {text}, but must be {_layout(wanted)}.")
+    return bar
+
+
+def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
+    """Adjoints by the names of fields of a state and of quantities."""
+    for name in bar:
+        check_readable(name, "a name in the loss's adjoint", end.state.names)
+    return {name: _checked_adjoint(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
+
+
+def _checked_array(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = as_numbers(f"the loss's {what}", values)
+    if array.shape != shape:
+        raise InputError(f"the loss's {what} has shape {array.shape}, but must be {shape}.")
+    return array
+
+
+def _checked_adjoint(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = _checked_array(what, values, shape)
+    if not np.isfinite(array).all():
+        row = np.argwhere(~np.isfinite(array))[0][0]
+        raise InputError(f"the loss's {what} has a value in row {row} that is not finite, but must be made of numbers.")
+    return array
+
+
+def _layout(array: wp.array) -> str:
+    """What has to be the same for one array to be copied onto another."""
+    return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"
+
+
+class LossesByStep(dict[int, Loss]):
+    """The losses of a run by the number of steps before the states that they judge."""
+
+    def __init__(self, loss: Any, steps: int, chosen: bool = False):
+        """``loss`` of the state after all ``steps``, or `Frames` of several. Raises `InputError` for what is no loss,
+        for frames that a run of so many steps does not have, and where the steps are ``chosen`` for frames at times of
+        their own."""
+        if chosen and getattr(loss, "time_step", None) is not None:
+            raise InputError(
+                f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
+                'steps, as solver.time_step is "auto".'
+            )
+        by_step = loss.losses if isinstance(loss, Frames) else {steps: loss}
+        for step in by_step:
+            if step not in range(steps + 1):
+                raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {steps}.")
+        super().__init__({step: as_loss(one) for step, one in by_step.items()})
+        self.sensors = {repr(one.sensor): one.sensor for one in by_step.values() if hasattr(one, "sensor")}
+        """Those that losses read, by what they are."""
+        self._frames = loss if isinstance(loss, Frames) else None
+
+    def _check(self, ends: Mapping[int, Any]) -> None:
+        """Raises `InputError` for states of a run that the losses do not fit."""
+        if self._frames is not None:
+            end = next(iter(ends.values()))
+            self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
+
+    def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
+        """Their sum, given states by the number of steps before them; of a batch (batch,), NaN but for the scenes that
+        are ``going``, which is None of a single scene."""
+        self._check(ends)
+        if going is None:
+            return sum(loss.value(ends[step]) for step, loss in self.items())
+        return sum(batch_values(loss, ends[step], going) for step, loss in self.items())
+
+    def total_and_adjoints(
+        self, ends: Mapping[int, Any], going: Sequence[int] | None
+    ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
+        """The same, and the adjoints of the states by the number of steps before them."""
+        self._check(ends)
+        if going is None:
+            one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}
+            bars = {step: _on_device(bar, ends[step]) for step, (_, bar) in one.items()}
+            return sum(value for value, _ in one.values()), bars
+        each = {step: batch_values_and_adjoints(loss, ends[step], going) for step, loss in self.items()}
+        return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}
+
+
+def _on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
+    if isinstance(bar, SnapshotAdjoint):
+        return bar
+    no_colours = np.zeros_like(end.colours)
+    if isinstance(bar, State):
+        return SnapshotAdjoint(bar, no_colours)
+    state, arrays = end.state.like(), by_field(bar, end.dimension)
+    state.set(arrays)
+    of_quantities = {name: array for name, array in arrays.items() if name not in state.names}
+    return SnapshotAdjoint(state, no_colours, of_quantities)
+
+
+def derivative_along(
+    bars: Mapping[int, SnapshotAdjoint],
+    dots: Mapping[int, Arrays],
+    colours_dot: Any,
+    leading: tuple[int, ...],
+) -> np.ndarray:
+    """The sum of all products of adjoints and tangents, in the shape ``leading``: (batch,), or () of a single scene.
+
+    ``bars`` are the adjoints of the states by the number of steps before them, ``dots`` their tangents by the names of
+    fields and quantities, vectors (n, 3), ``colours_dot`` (phases, 3) the tangent of the colours, None where they stay.
+    """
+
+    def product(bar: np.ndarray, dot: Any) -> np.ndarray:
+        each = bar.astype(np.float64) * np.asarray(dot, dtype=np.float64)
+        return np.asarray(each.reshape(*leading, -1).sum(axis=-1))
+
+    terms = [] if colours_dot is None else [product(bar.colours, colours_dot) for bar in bars.values()]
+    for step in sorted(dots):
+        bar = by_field(bars[step], 3)
+        terms += [product(bar[name], dot) for name, dot in dots[step].items()]
+    return sum(terms, np.zeros(leading))
