@@ -246,6 +246,8 @@ class Projection:
             return found
 
         share = between(H + 2 * nu, 0.7, 0.95)
+        if (share > 0).all():
+            tension = np.ones(n)
         correct = (
             self.coarse(x, m, from_fluid(share) + share[:, None] * walled, L, g, share, yielding)
             if self.nodes

@@ -250,9 +250,10 @@ def test_a_box_that_is_laid_into_water_at_its_draft_stays(density):
 
 @pytest.mark.parametrize("density", [50.0, 200.0, 3000.0])
 def test_a_disc_gets_faster_as_its_added_mass_says(density, tmp_path):
-    """From the second step on; a light one is thrown about by a coarse grid that does not know its mass."""
-    faster = disc_in_a_round_tank(density, str(tmp_path / "rings.npy"), 0.03, 6, iterations=10)
-    assert np.abs(faster[1:] - 1.0).max() < 0.15
+    """From the second step on. The tank is full, so that its walls must let tension through, and a light disc is thrown
+    about by a coarse grid that does not know its mass."""
+    faster = disc_in_a_round_tank(density, str(tmp_path / "rings.npy"), 0.03, 6)
+    assert np.abs(faster[1:] - 1.0).max() < 0.1
 
 
 def test_a_body_lies_on_the_floor():

@@ -74,7 +74,8 @@ def test_a_step_is_that_of_the_twin(case):
 
 
 def test_water_that_is_shut_in_stays():
-    """Without a coarse grid the pressure has come half way in ten steps."""
+    """Without a coarse grid the pressure has come half way in ten steps; where walls let no tension through, the level
+    of the pressure is found late, and 0.17 of the fall is left in four."""
     box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
     shut = plane(
         discretisation={"spacing": 0.05, "jitter": 0.05},
@@ -83,8 +84,8 @@ def test_water_that_is_shut_in_stays():
         forces={"gravity": [9.81, 0.0]},
         solver=SOLVER,
     )
-    run = Simulation(shut, precision="float64").run(10)
-    assert abs(run.velocities[-1][:, 0].mean()) < 0.05 * 9.81 * 10 * 0.002
+    run = Simulation(shut, precision="float64").run(4)
+    assert abs(run.velocities[-1][:, 0].mean()) < 0.05 * 9.81 * 4 * 0.002
 
 
 def test_water_that_is_shaken_pushes_the_floor_as_it_should():

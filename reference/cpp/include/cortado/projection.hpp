@@ -43,6 +43,7 @@ struct Projection {
     std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
     std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
     std::vector<Values<Scalar>> held;         // [i]: the part of its way that a particle goes in repair i
+    bool shut = true;                         // whether every particle has a share of the coarse pressure
     bool cold = true;                         // whether no particle begins with a pressure
     double error = 0;                         // average compression as the last repair found it
 
@@ -150,6 +151,10 @@ private:
             effects[i] = Surroundings<Scalar, D>(model, of).found;
             n[i] = without[i] + effects[i].image * (of.images - of.behind);
         });
+        shut = std::all_of(effects.begin(), effects.end(),
+                           [](const Effects<Scalar, D>& of) { return real_part(of.shared) > Real(0); });
+        if (!shut) return;
+        for (Effects<Scalar, D>& of : effects) of.tension = Scalar(Real(1));  // also beside walls
     }
 
     // What pressures y of walls and images add to D^T y.

@@ -297,6 +297,7 @@ private:
         each([&](std::size_t i) {
             const Real with = at_.effects[i].image * n_bar[i];
             effects_bar_[i].image += n_bar[i] * (at_.moments[i].images - at_.moments[i].behind);
+            if (at_.shut) effects_bar_[i].tension = Real(0);
             const Moments<Real, D> more =
                 SurroundingsSlope<Real, D>(model_, at_.moments[i]).adjoint(effects_bar_[i]);
             Moments<Real, D>& bar = moments_bar_[i];

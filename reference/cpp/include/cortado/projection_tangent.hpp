@@ -127,6 +127,7 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
     Vectors<Real, D> dv(count), du(count), dkick;  // du: before the last iteration
     each_particle(count, model.threads, [&](std::size_t i) {
         effects_dot[i] = SurroundingsSlope<Real, D>(model, at.moments[i]).tangent(moments_dot[i]);
+        if (at.shut) effects_dot[i].tension = Real(0);
         const Moments<Real, D>&of = at.moments[i], &change = moments_dot[i];
         dn[i] = without_dot[i] + effects_dot[i].image * (of.images - of.behind) +
                 at.effects[i].image * (change.images - change.behind);

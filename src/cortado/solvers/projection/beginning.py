@@ -6,6 +6,9 @@ step. Between walls that are nearer to one another than a spacing it has come fr
 off the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure;
 of that choice there is no derivative.
 
+In a shut scene, where every particle has a share c of the coarse pressure, tension is let through beside walls too,
+sigma = 1: fluid that fills a container cannot leave its walls. Of that choice there is no derivative either.
+
 A scene is warm in which a particle begins with a pressure. In a cold one, as in the first step of a run, the coarse
 correction comes before the first iteration too (`cortado.solvers.projection.steps`).
 """
@@ -48,9 +51,11 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         time_step: wp.array(dtype=real),
         k_before: wp.array(dtype=real),
         kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
         beside: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
+        surfaced: wp.array(dtype=int),
+        # in and out
+        weights: wp.array(dtype=weights4),
         # out
         k: wp.array(dtype=real),
         y: wp.array(dtype=real),
@@ -59,6 +64,8 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     ):
         """``warm`` is 0 for each scene before."""
         i = wp.tid()
+        if surfaced[i // particles] == 0:
+            weights[i][0] = real(1.0)
         full = weights[i][1] * taken(kick_before[i], beside[i], time_step[i // particles], spacing)
         first = full * k_before[i]
         k[i] = first
@@ -76,15 +83,20 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
         beside: wp.array(dtype=vector),
-        dot: bundle(k_before=real, kick_before=vector, weights=weights4, v_star=vector),
+        surfaced: wp.array(dtype=int),
+        dot: bundle(k_before=real, kick_before=vector, v_star=vector),
+        # in and out
+        weights_dot: wp.array(dtype=weights4),
         # out
         k_dot: wp.array(dtype=real),
         y_dot: wp.array(dtype=real),
         u_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
+        if surfaced[i // particles] == 0:
+            weights_dot[i][0] = real(0.0)
         part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
-        full, full_dot = part * weights[i][1], part * dot.weights[i][1]
+        full, full_dot = part * weights[i][1], part * weights_dot[i][1]
         first = full_dot * k_before[i] + full * dot.k_before[i]
         k_dot[i] = first
         y_dot[i] = first
@@ -102,6 +114,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         k_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         u_bar: wp.array(dtype=vector),
+        surfaced: wp.array(dtype=int),
         # in and out
         weights_bar: wp.array(dtype=weights4),
         v_bar: wp.array(dtype=vector),
@@ -117,6 +130,8 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         kick_before_bar[i] = full * u_bar[i]
         full_bar = part * (k_before[i] * bar + wp.dot(kick_before[i], u_bar[i]))
         weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
+        if surfaced[i // particles] == 0:
+            weights_bar[i][0] = no
         v_bar[i] = v_bar[i] + u_bar[i]
 
     return Kernels(begin, begin_tangent, begin_adjoint)

@@ -96,6 +96,7 @@ class ProjectionTangent(ParticleTangent):
         beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
         before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
+        before["surfaced"] = solver.density.surfaced
         change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
         context.launch(beginning.tangent, *known, solver.spaced, before, change, v_star_dot=self._v_star_dot)
         self._coarse.begin(context, known)
@@ -221,6 +222,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._project(context, known, counts[0])
         before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         before |= {"kick_before": solver.carried[KICK], "kick_before_bar": self._kick_before_bar}
+        before["surfaced"] = solver.density.surfaced
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar}
         context.launch(kernels.beginning.adjoint, *known, solver.spaced, before, steps)
         if self._bodies is not None:

@@ -3,6 +3,8 @@
 
 from functools import partial
 
+import warp as wp
+
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
@@ -26,9 +28,12 @@ class Surroundings(Density):
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
         """As kernels call them."""
+        self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
+        """Whether scenes have a free surface: a particle without a share of the coarse pressure."""
 
     def measure(self, context: StepContext) -> None:
-        context.launch(self.kernels.forward, self.around, self.constants)
+        self.surfaced.zero_()
+        context.launch(self.kernels.forward, self.around, self.constants, surfaced=self.surfaced)
 
     def new_tangent(self) -> "SurroundingsTangent":
         return SurroundingsTangent(self)

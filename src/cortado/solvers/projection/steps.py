@@ -212,7 +212,8 @@ class ProjectionSteps(ParticleSolver):
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
         self.coarse.warm.zero_()
-        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first, warm=self.coarse.warm)
+        flags = {"surfaced": self.density.surfaced, "warm": self.coarse.warm}
+        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first, flags)
         self.coarse.begin(context, self.around)
         return context
 

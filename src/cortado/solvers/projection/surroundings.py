@@ -79,7 +79,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         # out
         n: wp.array(dtype=real),
         of: around,
+        surfaced: wp.array(dtype=int),
     ):
+        """``surfaced`` is 0 for each scene before."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
@@ -113,7 +115,10 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.apart[i] = apart
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu, behind)
-        of.coarse[i] = share_of(M, nu)
+        shared = share_of(M, nu)
+        of.coarse[i] = shared
+        if not (shared > real(0.0)) and surfaced[i // s.particles] == 0:
+            surfaced[i // s.particles] = 1
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def surroundings_tangent(
