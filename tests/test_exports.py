@@ -11,12 +11,10 @@ import trimesh
 
 import cortado
 from cortado import ComputationError, InputError, Trajectory
-from cortado.pictures import held_volume
-from cortado.pictures.exports import by_vtk
-from cortado.pictures.exports.export import FORMATS
-from cortado.pictures.exports.exported import Exported
-from cortado.pictures.exports.whole_frames import WholeFrames
-from cortado.pictures.scale import Scale
+from cortado.pictures.exports import formats, held_volume
+from cortado.pictures.exports.exported import Exported, WholeFrames
+from cortado.pictures.exports.formats import FORMATS
+from cortado.pictures.labels import Scale
 from cortado.pictures.shown_run import ShownRun
 from cortado.runs.marks import Marks
 from cortado.runs.run_folder import RunFolder
@@ -502,7 +500,7 @@ def test_wrong_calls_are_sentences(tmp_path):
 
 @pytest.mark.parametrize(("module", "to"), [("vtkmodules", "vtp"), ("pxr", "usd"), ("xarray", None)])
 def test_a_missing_library_is_named(module, to, tmp_path, monkeypatch):
-    by_vtk._vtk.cache_clear()
+    formats._vtk.cache_clear()
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=r"is not installed: pip install [a-z-]+\.$"):
         trajectory().to_xarray() if to is None else trajectory().export(tmp_path, to)

@@ -11,14 +11,13 @@ from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
 from cortado.files.srgb import to_srgb
 from cortado.pictures import Dolly, Follow, Keyframes, Orbit
-from cortado.pictures.painter import painter
-from cortado.pictures.particles import Particles
-from cortado.pictures.plan import MOVING, plan
+from cortado.pictures.labels import Scale
+from cortado.pictures.painter import MOVING, painter, plan
 from cortado.pictures.run_pictures import _with_scale, run_page
-from cortado.pictures.scale import Scale
-from cortado.pictures.shadow import FloorShadow
 from cortado.pictures.shown_run import ShownRun, ages, is_out, vorticity
 from cortado.pictures.stage import Stage, screen_axes
+from cortado.pictures.tracing.near_particles import Particles
+from cortado.pictures.tracing.shadow import FloorShadow
 from cortado.scene.camera_paths import Moment, View
 from cortado.scene.lights import LIGHTS
 from cortado.scene.picture import Picture

@@ -15,8 +15,7 @@ from cortado.files.csv_columns import read_columns
 from cortado.files.video import write_video
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.optimisation.inverse.task import load_task
-from cortado.pictures.image_files import write_picture
-from cortado.pictures.video_frames import read_frames
+from cortado.pictures.image_files import read_frames, write_picture
 
 RED, GREEN, BLUE, WHITE = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -10,14 +10,12 @@ import cortado
 from cortado.device import bands
 from cortado.device.bands import BandLauncher
 from cortado.errors import ComputationError
-from cortado.pictures import liquid as liquid_module
-from cortado.pictures.contained_liquid import contained_liquid
-from cortado.pictures.held_volume import enclosed, with_volume
-from cortado.pictures.liquid import liquid_surface
+from cortado.pictures.exports.held_volume import contained_liquid, enclosed, with_volume
 from cortado.pictures.painter import stage_of
-from cortado.pictures.particles import Particles
-from cortado.pictures.surface import Surface
-from cortado.pictures.surface_net import Neighbours, smoothed
+from cortado.pictures.tracing import liquid_surface as liquid_module
+from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface
+from cortado.pictures.tracing.near_particles import Particles
+from cortado.pictures.tracing.surface_net import Neighbours, smoothed
 from scenes import scene
 
 SPACING = 0.1

@@ -7,13 +7,12 @@ import warp as wp
 import cortado
 from cortado.device.bands import BandLauncher
 from cortado.errors import SceneError
-from cortado.pictures.environment import environment_of
-from cortado.pictures.liquid import liquid_surface
-from cortado.pictures.media import TINT, media_of
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.particles import Particles
-from cortado.pictures.scenery import State
-from cortado.pictures.wetting import particles_of
+from cortado.pictures.stage import TINT, media_of
+from cortado.pictures.tracing.liquid_surface import liquid_surface
+from cortado.pictures.tracing.near_particles import Particles
+from cortado.pictures.tracing.space import State, environment_of
+from cortado.pictures.tracing.wetting import particles_of
 from cortado.scene.materials import FINISHES, LIQUIDS
 
 DARK = (0.06, 0.06, 0.06)

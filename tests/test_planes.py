@@ -5,7 +5,7 @@ import pytest
 
 from cortado import InputError, Scene, SceneError, Simulation
 from cortado.discretise.solids.faces import cut_box_faces
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import discretise
 from test_packing import densities
 from test_solids import volume_and_middle, winding

@@ -19,19 +19,17 @@ from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.srgb import to_srgb
 from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
-from cortado.pictures import framing
-from cortado.pictures.environment import environment_of
-from cortado.pictures.film import film, lacking
+from cortado.pictures import stage as stage_module
+from cortado.pictures.film import Page, film, lacking
 from cortado.pictures.labels import labelled, side_by_side
-from cortado.pictures.page import Page
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.scenery import State, scenery
-from cortado.pictures.shadow import NODES, FloorShadow
 from cortado.pictures.stage import Stage, screen_axes, upright
-from cortado.pictures.surface import spheres
-from cortado.pictures.trace import find_contrast
-from cortado.pictures.wetting import particles_of, wetting
-from cortado.runs.film import Pace, pace_of
+from cortado.pictures.tracing.liquid_surface import spheres
+from cortado.pictures.tracing.shadow import NODES, FloorShadow
+from cortado.pictures.tracing.space import State, environment_of, scenery
+from cortado.pictures.tracing.trace import find_contrast
+from cortado.pictures.tracing.wetting import particles_of, wetting
+from cortado.runs.pace import Pace, pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
 
@@ -442,9 +440,9 @@ def test_a_package_that_is_missing_is_named(monkeypatch):
 
 @pytest.mark.parametrize("enough", [1, 40, 90, 1000])
 def test_a_painter_looks_at_every_so_many_positions_of_all_states(enough, monkeypatch):
-    monkeypatch.setattr(framing, "ENOUGH", enough)
+    monkeypatch.setattr(stage_module, "ENOUGH", enough)
     states = np.random.default_rng(0).random((9, 13, 3))
-    found = framing.thinned(states)
+    found = stage_module.thinned(states)
     assert len(found) == 9 and sum(map(len, found)) <= max(2 * enough, 9)
     for own, state in zip(found, states, strict=True):
         assert len(own) and all((place == state).all(axis=1).any() for place in own)

@@ -7,16 +7,14 @@ import warp as wp
 import cortado
 from cortado.device.bands import BandLauncher
 from cortado.discretise.shapes import corners
-from cortado.pictures.mirrored import mirrored
 from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.particle_view import container_outline, outline, scene_view
 from cortado.pictures.plots import particles
-from cortado.pictures.scene_view import container_outline, outline, scene_view
-from cortado.pictures.shadow import NODES, REACH, FloorShadow
-from cortado.pictures.shown_solids import shown_solids
-from cortado.pictures.solid_lines import solid_outline
-from cortado.pictures.solid_mesh import FAR, SolidMesh
-from cortado.pictures.solid_surfaces import SolidSurfaces
+from cortado.pictures.shown_solids import FAR, SolidMesh, shown_solids, solid_outline
 from cortado.pictures.stage import Stage, screen_axes
+from cortado.pictures.tracing.shadow import NODES, REACH, FloorShadow
+from cortado.pictures.tracing.solid_surfaces import SolidSurfaces
+from cortado.pictures.tracing.wetting import mirrored
 
 BLUE, ORANGE = (0.05, 0.1, 0.8), (0.7, 0.3, 0.05)
 PILLAR = {"name": "pillar", "shape": "box", "lower": [0.35, 0.0, 0.15], "upper": [0.45, 0.4, 0.25], "colour": ORANGE}
@@ -148,7 +146,7 @@ def test_light_goes_no_further_than_to_a_solid(monkeypatch, tank):
     if tank:
         before = lattice([0.0] * 3, [0.6, 0.3, 0.1])
     for depth in (1.0, 0.1):
-        monkeypatch.setattr("cortado.pictures.mirrored.DEPTHS", (depth,))
+        monkeypatch.setattr("cortado.pictures.tracing.wetting.DEPTHS", (depth,))
         solid, held = (CAVITY, {"container": {"shape": "none"}}) if tank else (PILLAR, {})
         light.append(seen(scene_of(3, solid, picture=FRONT, **held), before, (0.4, 0.15, 0.1 if tank else 0.25)))
     # the layer in the tank, two particles thick, is thinner with images far behind it

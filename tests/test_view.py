@@ -18,8 +18,8 @@ from cortado.cli.viewer.recorded import RecordedView
 from cortado.cli.viewer.task import TaskView
 from cortado.cli.viewer.window import LONGEST_ARROW, PULL
 from cortado.files.srgb import to_srgb
-from cortado.pictures.scene_view import outline
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.particle_view import outline
+from cortado.pictures.shown_solids import solid_outline
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 from remembering_force import Memory, U

@@ -9,12 +9,13 @@ if TYPE_CHECKING:
 
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
-    """The ``__getattr__`` of a package, which finds its modules, and the names that ``homes`` have by the module within
-    the package that each is in."""
+    """The ``__getattr__`` of a package, which finds its modules, and the names in ``homes``, each with the module that
+    has it: one within the package, or anywhere in Cortado if it begins with ``cortado.``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:
-            return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+            home = homes[name]
+            return getattr(importlib.import_module(home if home.startswith("cortado.") else f"{package}.{home}"), name)
         module = f"{package}.{name}"
         if not name.startswith("__"):
             try:

@@ -8,10 +8,10 @@ from importlib import import_module
 from typing import Any
 
 FUNCTIONS = {
-    "export": "pictures.exports.export",
+    "export": "pictures.exports.formats",
     "film_page": "pictures.notebook",
     "fit_page": "optimisation.fitting.fit_page",
-    "labelled": "pictures.exports.labelled",
+    "labelled": "pictures.exports.formats",
     "result_page": "pictures.notebook",
     "simulation_film": "pictures.run_pictures",
     "simulation_page": "pictures.notebook",

@@ -35,8 +35,8 @@ from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.stepping import Stepping
-from cortado.runs.film import Film
 from cortado.runs.frame import Frame
+from cortado.runs.pace import Film
 from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.recorded import recorded

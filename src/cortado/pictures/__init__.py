@@ -1,13 +1,10 @@
-"""Pictures to aim at, in files, shaded ones to show, films, figures. `cortado.render` has those with derivatives."""
+"""Pictures to aim at, in files; shaded pictures, films, plots and exports of runs. `cortado.render` has pictures with
+derivatives."""
 
 from cortado.lazy import getter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from cortado.pictures.camera_paths import Dolly as Dolly
-    from cortado.pictures.camera_paths import Follow as Follow
-    from cortado.pictures.camera_paths import Keyframes as Keyframes
-    from cortado.pictures.camera_paths import Orbit as Orbit
     from cortado.pictures.image_files import COFFEE as COFFEE
     from cortado.pictures.image_files import MILK as MILK
     from cortado.pictures.image_files import WHITE as WHITE
@@ -15,13 +12,19 @@ if TYPE_CHECKING:
     from cortado.pictures.image_files import read_picture as read_picture
     from cortado.pictures.image_files import rosetta as rosetta
     from cortado.pictures.image_files import write_picture as write_picture
+    from cortado.scene.camera_paths import Dolly as Dolly
+    from cortado.scene.camera_paths import Follow as Follow
+    from cortado.scene.camera_paths import Keyframes as Keyframes
+    from cortado.scene.camera_paths import Orbit as Orbit
 
 _PATHS = ("Dolly", "Follow", "Keyframes", "Orbit")
 _FILES = ("COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture")
 __all__ = [*_PATHS, *_FILES]
 
 if not TYPE_CHECKING:
-    __getattr__ = getter(__name__, dict.fromkeys(_FILES, "image_files") | dict.fromkeys(_PATHS, "camera_paths"))
+    __getattr__ = getter(
+        __name__, dict.fromkeys(_FILES, "image_files") | dict.fromkeys(_PATHS, "cortado.scene.camera_paths")
+    )
 
 
 def __dir__() -> list[str]:

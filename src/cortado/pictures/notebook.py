@@ -16,9 +16,9 @@ from cortado.errors import CortadoError
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
 from cortado.pictures.particle_view import STYLE, Cloud, particle_view, script, thinned
 from cortado.pictures.plots import images, loss_curve, particles
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.shown_solids import solid_outline
 from cortado.problem import Problem
-from cortado.runs.film import Film
+from cortado.runs.pace import Film
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.values import UNITS
 from cortado.simulation import Simulation

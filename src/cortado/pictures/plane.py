@@ -1,18 +1,291 @@
 """Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.device.cores import usable_cores
 from cortado.discretise.pairs import wrapped
 from cortado.discretise.shapes import Points
-from cortado.pictures.gloss import glossy
-from cortado.pictures.mirrored import mirrored
-from cortado.pictures.plane_stage import PlaneStage
-from cortado.pictures.scenery import State
-from cortado.pictures.shown_solids import shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
+from cortado.pictures.stage import fluid_extent, thinned
+from cortado.pictures.tracing.space import State
+from cortado.pictures.tracing.wetting import mirrored
+from cortado.scene.containers import BoxContainer
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+
+LIGHT = (-0.45, 0.70, 0.55)
+"""Towards the lamp: to the right, up, towards the viewer."""
+
+
+def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
+    """(rows, columns, 3) the light of a body that covers a part of each pixel (rows, columns).
+
+    The body looks as if it were thicker in the middle than at its edge.
+
+    Args:
+        cover: (rows, columns), from 0 to 1.
+        colour: linear, (rows, columns, 3) or (3,).
+        width: of the edge, in pixels.
+        gleaming: how bright the image of the lamp is in it.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    height = gaussian_filter(cover, width)
+    height = height * height * (3.0 - 2.0 * height)
+    down, right = np.gradient(height)
+    steep = 1.9 * width
+    normal = np.stack([-steep * right, steep * down, np.ones_like(right)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    lamp = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
+    half = lamp + (0.0, 0.0, 1.0)
+    half /= np.linalg.norm(half)
+    diffuse = 0.62 + 0.38 * np.clip(normal @ lamp, 0.0, 1.0) / lamp[2]
+    gleam = np.clip(normal @ half, 0.0, 1.0) ** 60 - half[2] ** 60
+    deep = 0.80 + 0.20 * height
+    return colour * (np.minimum(diffuse, 1.12) * deep)[..., None] + gleaming * np.clip(gleam, 0.0, 1.0)[..., None]
+
+
+FILLED = 0.80
+"""The part of the picture's width or height that the container takes."""
+GLASS = (0.40, 0.50, 0.55)
+"""Linear, of the walls of a container."""
+GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
+"""Of the lamp in solids, in those that are dull and in mirrors."""
+SOLID_SHADOW = 0.25
+"""How much darker paper is behind a solid."""
+BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
+"""Of shadows: how soft and how far down they are, and beyond which distance from a body there is none; in sizes."""
+Layer = tuple[Points, Points]
+"""How much something hides of what is behind it (rows, columns, 1), and what light it adds (rows, columns, 3)."""
+
+
+@dataclass(frozen=True)
+class PlaneStage:
+    """What is around the fluid, on the pixels of a picture; what is there at rest is drawn once."""
+
+    picture: Picture
+    container: BoxContainer | None
+    lower: Points
+    """(2,) of what is shown [m]"""
+    upper: Points
+    """(2,) [m]"""
+    spacing: float
+    """[m]"""
+    solids: tuple[ShownSolid, ...] = ()
+    seen: tuple[Points, Points] | None = None
+    """Lower and upper ends (2,) [m] of what the picture has in its middle; those of what is shown if left out."""
+
+    @classmethod
+    def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
+        """The stage of a scene in 2-D, the fluid of which is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` as of
+        `painter`."""
+        container = scene.container if isinstance(scene.container, BoxContainer) else None
+        spacing, solids = scene.discretisation.spacing, shown_solids(scene)
+        if container is not None:
+            lower, upper = (np.asarray(end) for end in container.extent())
+        else:
+            paper, scenes = 0.0 if any(one.is_tank for one in solids) else spacing, [scene, *poses]
+            lower, upper = fluid_extent(thinned(positions), extents_of_solids(scenes))
+            lower, upper = extent_with((lower - paper, upper + paper), scenes)
+        return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
+
+    @property
+    def ends(self) -> tuple[Points, Points]:
+        """Lower and upper ends (2,) [m] of what is shown, in the scene's axes."""
+        return self.lower, self.upper
+
+    @property
+    def seen_size(self) -> Points:
+        """(2,) how wide and high what the picture has in its middle is [m]."""
+        lower, upper = self.seen or self.ends
+        return upper - lower
+
+    def framed(self, ends: tuple[Points, Points], picture: Picture) -> "PlaneStage":
+        """The same in a picture of another size, with all that is between ``ends`` in its middle."""
+        return replace(self, picture=picture, seen=ends)
+
+    @cached_property
+    def pixel(self) -> float:
+        """The width of a pixel [m]."""
+        size = np.array([self.picture.width, self.picture.height])
+        return float((self.seen_size / (FILLED * size)).max())
+
+    @property
+    def _middle(self) -> Points:
+        """(2,) of the picture [m]."""
+        lower, upper = self.seen or self.ends
+        return 0.5 * (lower + upper)
+
+    @cached_property
+    def pixels(self) -> tuple[Points, Points]:
+        """(rows, columns) where the middle of each pixel is [m]: x, and y."""
+        columns, rows, middle = self.picture.width, self.picture.height, self._middle
+        x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
+        y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
+        return np.meshgrid(x, y)
+
+    def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
+        """(n,) which points (n, 2) [m] are in the picture, or no further from it than a margin [m]."""
+        half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
+        return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
+
+    def on_screen(self, points: Points) -> Points:
+        """As `Stage.on_screen`, of points (n, 2) [m]."""
+        off = (points - self._middle) / self.pixel
+        return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
+
+    @property
+    def up_axis(self) -> int:
+        """Which axis of the scene is upright in the picture."""
+        return 1
+
+    @property
+    def gloss_width(self) -> float:
+        """How wide the edges of bodies are drawn, in pixels."""
+        return max(0.55 * self.spacing / self.pixel, 1.5)
+
+    @cached_property
+    def behind(self) -> Points:
+        """(rows, columns, 3) what is behind the fluid: the paper, the shadows on it, and the inside of a container."""
+        paper = self._paper()
+        if self.container is not None or self._tanks:
+            outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
+            paper = outside + (1.0 - paper) * (0.40 * self._room)[..., None]
+        for shown, _ in self._bodies:
+            darker = SOLID_SHADOW * (1.0 - shown.transparency) * self._below(shown) * self._room
+            paper = paper * (1.0 - darker)[..., None]
+        return paper
+
+    @cached_property
+    def before(self) -> list[Layer]:
+        """What is drawn over the fluid, one over the other: solids, then the walls of a container and of tanks."""
+        layers = [self._body(shown, distance) for shown, distance in self._bodies]
+        if self.container is not None:
+            layers.append(self._container_walls(self.container))
+        return layers + [self._walls(distance, 1.0, shown.colour) for shown, distance in self._tanks]
+
+    @cached_property
+    def free(self) -> Points:
+        """(rows, columns) the part of each pixel that is within the container and in no solid."""
+        free = self._room
+        for _, distance in self._bodies:
+            free = free * (1.0 - self._covered(distance))
+        return free
+
+    @cached_property
+    def shown(self) -> Points:
+        """(rows, columns) the part of each pixel in which fluid is drawn, if it is there: in opaque solids, too, which
+        are drawn over it."""
+        return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
+
+    @cached_property
+    def _bodies(self) -> list[tuple[ShownSolid, Points]]:
+        """Solids that fluid flows around, and how far pixels are from each."""
+        return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
+
+    @cached_property
+    def _tanks(self) -> list[tuple[ShownSolid, Points]]:
+        """Solids that fluid is inside of, and how far pixels are outside of the cavity of each."""
+        return [(one, self._distance(one)) for one in self.solids if one.is_tank]
+
+    def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
+        """(rows, columns) how far a place ``drop`` [m] above each pixel is outside of a body, negative inside [m];
+        infinite where it is far."""
+        (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
+        columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
+        rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
+        found, near = np.full(x.shape, np.inf), np.ix_(rows, columns)
+        points = np.stack([x[near].ravel(), y[near].ravel() + drop], axis=1)
+        found[near] = shown.body.distance(points).reshape(len(rows), len(columns))
+        return found
+
+    def _covered(self, distance: Points) -> Points:
+        """(rows, columns) the part of each pixel that a body covers."""
+        return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
+
+    def _paper(self) -> Points:
+        """The background, a little brighter in the middle and darker in the corners."""
+        x, y = self.pixels
+        middle, half = self._middle, 0.5 * self.pixel * self.picture.width
+        away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
+        return np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
+
+    @cached_property
+    def _room(self) -> Points:
+        """(rows, columns) the part of each pixel that is within the container and tanks."""
+        room = np.ones(self.pixels[0].shape)
+        if self.container is not None:
+            x, y = self.pixels
+            off = np.minimum.reduce([x - self.lower[0], self.upper[0] - x, y - self.lower[1], self.upper[1] - y])
+            room = np.clip(off / self.pixel + 0.5, 0.0, 1.0)
+        for _, distance in self._tanks:
+            room = room * self._covered(distance)
+        return room
+
+    @property
+    def _size(self) -> float:
+        """The longer side of what is shown [m]."""
+        return float((self.upper - self.lower).max())
+
+    @property
+    def _wall(self) -> float:
+        """How thick the walls are drawn [m]."""
+        return 0.010 * self._size
+
+    def _shadow(self) -> Points:
+        """(rows, columns) how much darker the paper is behind the container and tanks."""
+        tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
+        if self.container is None:
+            return np.max(tanks, axis=0)
+        x, y = self.pixels
+        blur, drop = BLUR * self._size, DROPPED * self._size
+
+        def edge(distance: Points) -> Points:
+            return 0.5 * (1.0 + np.tanh(distance / blur))
+
+        across = edge(x - self.lower[0]) * edge(self.upper[0] - x)
+        return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
+
+    def _below(self, shown: ShownSolid) -> Points:
+        """(rows, columns) the part of the light that a body keeps off the paper."""
+        distance = self._distance(shown, DROPPED * self._size)
+        return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
+
+    def _body(self, shown: ShownSolid, distance: Points) -> Layer:
+        """A solid that fluid flows around, where it is within the container."""
+        cover = self._covered(distance)
+        gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
+        light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
+        opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
+        return opacity, opacity * light
+
+    def _container_walls(self, container: BoxContainer) -> Layer:
+        x, y = self.pixels
+        half = 0.5 * (self.upper - self.lower)
+        off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
+        beyond = np.abs(off) - half[:, None, None]
+        outside = np.hypot(*np.maximum(beyond, 0.0))
+        distance = np.where(outside > 0.0, outside, beyond.max(axis=0))  # from the inner side, outwards
+        part: Points | float = 1.0
+        for axis in range(2):
+            if container.periodic[axis]:
+                part = part * (beyond[axis] < 0.0)
+        return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
+
+    def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
+        """Walls, by the distance [m] of pixels from their inner side, outwards; ``part``: of them that is there."""
+        wall = self._wall
+        band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
+        shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
+        opacity = 0.85 * (band * part)[..., None]
+        return opacity, opacity * colour * shine[..., None]
+
 
 SUPPORT = 1.3
 """In spacings: how far a particle is felt."""

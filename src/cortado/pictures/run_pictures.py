@@ -17,19 +17,17 @@ from cortado.files.input_files import as_path
 from cortado.files.progress import announce
 from cortado.files.srgb import ShadedPicture
 from cortado.particles.fields import Entry
-from cortado.pictures.film import film, lacking
-from cortado.pictures.grid import LEAST
+from cortado.pictures.film import LEAST, Page, alone, film, lacking
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.page import Page, alone
-from cortado.pictures.plane_stage import PlaneStage
+from cortado.pictures.labels import Scale
+from cortado.pictures.particle_view import scene_view
+from cortado.pictures.plane import PlaneStage
 from cortado.pictures.report import Figures
-from cortado.pictures.scale import Scale
-from cortado.pictures.scene_view import scene_view
 from cortado.pictures.shown_run import ShownRun, coloured_by
 from cortado.pictures.stage import Stage
-from cortado.runs.film import Film, pace_of
 from cortado.runs.frame import Frame
 from cortado.runs.marks import common_rate
+from cortado.runs.pace import Film, pace_of
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.camera_paths import CameraPath
 from cortado.scene.parameters.parameter import Axis

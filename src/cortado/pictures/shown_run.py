@@ -14,13 +14,12 @@ from cortado.discretise.calibration import circulation_factor, rest_volume
 from cortado.discretise.pairs import pairs_among
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import InputError
-from cortado.pictures.filmed import FilmedRun
-from cortado.pictures.page import Panel
+from cortado.pictures.film import FilmedRun, Panel
+from cortado.pictures.labels import Scale
 from cortado.pictures.painter import colours_of, painter_on, stage_of
-from cortado.pictures.plane_stage import PlaneStage
-from cortado.pictures.scale import Scale
-from cortado.pictures.scenery import State
+from cortado.pictures.plane import PlaneStage
 from cortado.pictures.stage import Stage, upright
+from cortado.pictures.tracing.space import State
 from cortado.runs.solid_motion import SolidMotions, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.camera_paths import Moment, View

@@ -1,15 +1,64 @@
-"""The solids of a scene as pictures show them: shapes in poses, with colours."""
+"""The solids of a scene as pictures show them: shapes in poses with colours, edges as lines, and triangles."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
+from cortado.discretise.solids.faces import Faces
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.scene.materials import Finish
 from cortado.scene.scene import Scene
+
+Numbers = NDArray[np.int64]
+SAME = 1e-9
+"""Of the size of all: how near vertices are that are one."""
+SHARP = 0.8
+"""Cosine of the angle between the normals of two triangles below which the edge between them is sharp."""
+
+
+def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
+    """The same triangles with one vertex where there were several, and which are kept: those that have an area."""
+    whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
+    _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
+    found = number.reshape(-1)[corners]
+    has_area = (found[:, 0] != found[:, 1]) & (found[:, 1] != found[:, 2]) & (found[:, 2] != found[:, 0])
+    return vertices[first], found[has_area], has_area
+
+
+def sides_of(corners: Numbers) -> Numbers:
+    """(3 t, 2) the sides of triangles (t, 3), those across each corner in turn."""
+    return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
+
+
+def lengths_of(vertices: Points, sides: Numbers) -> Points:
+    """(s,) how long sides (s, 2) are [m]."""
+    return np.asarray(np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1))
+
+
+def across_of(vertices: Points, corners: Numbers) -> Points:
+    """(t, 3) normals of triangles, outwards, as long as twice the area of each [m2]."""
+    a, b, c = vertices[corners].transpose(1, 0, 2)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def unit(vectors: NDArray[Any]) -> Points:
+    """Vectors (..., 3), each 1 long, but for those of no length."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
+
+
+def cosines_of(vertices: Points, corners: Numbers) -> Points:
+    """(t, 3) of the angle between the normals of each triangle and the one beyond the side across each corner; -1 where
+    there is not one beyond it."""
+    flat = unit(across_of(vertices, corners))
+    _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
+    which = which.reshape(-1)
+    summed = np.stack([np.bincount(which, np.repeat(flat[:, k], 3)) for k in range(3)], axis=1)
+    return np.where(counts == 2, 0.5 * (summed**2).sum(axis=1) - 1.0, -1.0)[which].reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -92,3 +141,210 @@ def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
 def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:
     """Whether two boxes do."""
     return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())
+
+
+SIDES = 48
+"""Of the polygon that stands for a circle."""
+FLAT = 1.0 - 1e-9
+"""Cosine of the angle between triangles below which they are not of one plane."""
+
+
+def solid_outline(scene: Scene) -> Points:
+    """(k, 2, d) ends of the lines that draw the solids of a scene at rest [m]; none without solids."""
+    lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
+    return np.concatenate([np.zeros((0, 2, scene.dimension)), *lines])
+
+
+def own_faces(shown: ShownSolid) -> Faces:
+    """Faces of a solid about its middle, not turned, few enough for lines and for viewers."""
+    sizes = np.ptp(shown.shape.extent(), axis=0)
+    return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
+
+
+def own_lines(shown: ShownSolid) -> Points:
+    """(k, 2, d) ends of the lines that draw a solid about its middle, not turned [m]."""
+    faces = own_faces(shown)
+    if len(shown.turn) == 2:
+        return faces.vertices[faces.corners]
+    points, corners, _ = merged(faces.vertices, faces.corners)
+    cosines = cosines_of(points, corners)
+    edges = np.unique(np.sort(sides_of(corners)[cosines.ravel() < SHARP], axis=1), axis=0)
+    is_round = bool(((cosines >= SHARP) & (cosines < FLAT)).any())
+    return np.concatenate([points[edges], *(_cut_by_plane(points, corners, axis) for axis in range(3) if is_round)])
+
+
+def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
+    """(k, 2, 3) [m] lines where triangles cross the plane through the origin across an axis."""
+    above = points[:, axis] >= 0.0
+    crossing = corners[(above[corners] != above[corners[:, :1]]).any(axis=1)]
+    start, end = points[sides_of(crossing)].transpose(1, 0, 2)
+    crosses = (start[:, axis] >= 0.0) != (end[:, axis] >= 0.0)
+    start, end = start[crosses], end[crosses]
+    share = start[:, axis] / (start[:, axis] - end[:, axis])
+    return (start + share[:, None] * (end - start)).reshape(-1, 2, 3)
+
+
+def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
+    """Triangles (t, 3) of vertices (v, 3) [m] cut into smaller ones, and of which triangle each is a part, (p,).
+
+    Every side has a power of two of equal parts, as many as it needs to have none longer than ``longest`` [m], so that
+    triangles beside each other fit; other sides of the parts are at most the square root of 2 longer.
+    """
+    parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
+    thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
+    found = [_halved(vertices, corners[~thin], np.flatnonzero(~thin), longest)]
+    turned = (np.argmin(parts, axis=1)[:, None] + np.arange(3)) % 3  # so that the short side is across the first corner
+    corners, parts = (np.take_along_axis(one, turned, axis=1) for one in (corners, parts))
+    for second, first in np.unique(parts[thin, 1:], axis=0):
+        which = np.flatnonzero(thin & (parts[:, 1:] == (second, first)).all(axis=1))
+        found.append(_in_strips(vertices[corners[which]], which, first, second))
+    starts = np.cumsum([0, *(len(one) for one, _, _ in found)])
+    joined = [numbers + start for (_, numbers, _), start in zip(found, starts, strict=False)]
+    parents = np.concatenate([one for _, _, one in found])
+    vertices, corners, kept = merged(np.concatenate([one for one, _, _ in found]), np.concatenate(joined))
+    return vertices, corners, parents[kept]
+
+
+def _parts(lengths: Points, longest: float) -> Numbers:
+    """Into how many parts a side is cut."""
+    return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
+
+
+def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
+    """Triangles, each of whose long sides is cut in two again and again."""
+    while len(corners):
+        sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)
+        is_long = _parts(lengths_of(vertices, sides), longest) > 1
+        if not is_long.any():
+            break
+        middles = np.full(len(sides), -1)
+        middles[is_long] = len(vertices) + np.arange(is_long.sum())
+        vertices = np.concatenate([vertices, vertices[sides[is_long]].mean(axis=1)])
+        corners, parents = _cut(corners, middles[which.reshape(-1, 3)], parents)
+    return vertices, corners, parents
+
+
+def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
+    """Triangles (t, 3) in parts: ``middles`` (t, 3) is the new vertex of the side across each corner, or -1."""
+    count, found, own = (middles >= 0).sum(axis=1), [], []
+
+    def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
+        for part in parts:
+            found.append(np.stack(part, axis=1)[which])
+            own.append(parents[which])
+
+    for k in range(3):
+        (a, b, c), (x, y, z) = np.roll(corners, -k, axis=1).T, np.roll(middles, -k, axis=1).T
+        add((count == 1) & (x >= 0), (a, b, x), (a, x, c))
+        add((count == 2) & (x < 0), (a, z, y), (z, b, y), (b, c, y))
+        if k == 0:
+            add(count == 0, (a, b, c))
+            add(count == 3, (a, z, y), (z, b, x), (y, x, c), (x, y, z))
+    return np.concatenate(found), np.concatenate(own)
+
+
+def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> tuple[Points, Numbers, Numbers]:
+    """Thin triangles (t, 3, 3) [m], cut across their long sides: that from the first corner to the second into
+    ``first`` parts, that to the third into ``second`` parts."""
+    tip, *ends = triangles.transpose(1, 0, 2)
+    rows = [tip + (k / n) * (end - tip) for n, end in zip((first, second), ends, strict=True) for k in range(1, n + 1)]
+    vertices = np.stack([tip, *rows], axis=1)
+    own, i, j = list[tuple[int, int, int]](), 0, 0
+    while i < first or j < second:
+        here, there = i, first + j if j else 0
+        if j == second or (i < first and (i + 1) * second <= (j + 1) * first):
+            i += 1
+            own.append((here, i, there))
+        else:
+            j += 1
+            own.append((here, first + j, there))
+    starts = (1 + first + second) * np.arange(len(triangles))
+    corners = (starts[:, None, None] + np.array(own)).reshape(-1, 3)
+    return vertices.reshape(-1, 3), corners, np.repeat(parents, len(own))
+
+
+ROUNDS = 8
+"""Of smoothing, which takes away the steps that light from few directions has on what is round."""
+FAR = 1e9
+"""How far from a sharp edge a triangle is that has none [m]."""
+
+
+@dataclass(frozen=True)
+class SolidMesh:
+    """Triangles in space, outside on the side from which their corners run counterclockwise."""
+
+    points: Points
+    """(p, 3) [m]"""
+    normals: Points
+    """(p, 3) unit vectors outwards"""
+    triangles: Numbers
+    """(t, 3) numbers of points"""
+    from_edges: Points
+    """(t, 3, 3) how far each corner (a column) is from each side (a row) of the face that its triangle is part of [m];
+    `FAR` where the side is no sharp edge"""
+
+    @classmethod
+    def of(cls, faces: Faces, longest: float) -> "SolidMesh":
+        """Of the surface of a solid in 3-D, with sides no longer than about ``longest`` [m]."""
+        flat_points, flat_corners, _ = merged(faces.vertices, faces.corners)
+        points, corners, parents = refined(flat_points, flat_corners, longest)
+        across = across_of(points, corners)
+        normals = _normals(corners, across)
+        key = np.column_stack([corners.ravel(), np.rint(normals.reshape(-1, 3) * 1e4).astype(np.int64)])
+        _, chosen, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        from_edges = _from_edges(flat_points, flat_corners, points[corners], parents)
+        return cls(points[corners.ravel()[chosen]], normals.reshape(-1, 3)[chosen], number.reshape(-1, 3), from_edges)
+
+    def smoothed(self, values: Points) -> Points:
+        """Values (p, c) at points, smoothed along the surface but not across sharp edges."""
+        from scipy.sparse import csr_matrix
+
+        ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        first, second = np.concatenate([ends, ends[:, ::-1]]).T
+        count = len(self.points)
+        beside = csr_matrix((np.ones(len(first)), (first, second)), (count, count))
+        weights = np.maximum(np.asarray(beside.sum(axis=1)), 1.0)
+        for _ in range(ROUNDS):
+            values = 0.5 * values + 0.5 * (beside @ values) / weights
+        return values
+
+    def moved(self, turn: Points, position: Points) -> "SolidMesh":
+        """Turned by a matrix (3, 3) and then moved (3,) [m]."""
+        return SolidMesh(self.points @ turn.T + position, self.normals @ turn.T, self.triangles, self.from_edges)
+
+    @classmethod
+    def joined(cls, parts: Sequence["SolidMesh"]) -> "SolidMesh":
+        """Several as one."""
+        starts = np.cumsum([0, *(len(part.points) for part in parts)])
+        return cls(
+            points=np.concatenate([part.points for part in parts]),
+            normals=np.concatenate([part.normals for part in parts]),
+            triangles=np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
+            from_edges=np.concatenate([part.from_edges for part in parts]),
+        )
+
+
+def _normals(corners: Numbers, across: Points) -> Points:
+    """(t, 3, 3) at each corner the mean of the normals of triangles there, but for those beyond sharp edges."""
+    order = np.argsort(corners.ravel(), kind="stable")
+    counts = np.bincount(corners.ravel())
+    ends = np.cumsum(counts)
+    own = counts[corners.ravel()]  # how many triangles there are around each corner
+    corner = np.repeat(np.arange(corners.size), own)
+    within = np.arange(len(corner)) - np.repeat(np.cumsum(own) - own, own)
+    other = order[np.repeat((ends - counts)[corners.ravel()], own) + within] // 3
+    flat = unit(across)
+    smooth = np.einsum("pk,pk->p", flat[corner // 3], flat[other]) > SHARP
+    weighted = across[other] * smooth[:, None]
+    summed = np.stack([np.bincount(corner, weighted[:, k], corners.size) for k in range(3)], axis=1)
+    return unit(summed).reshape(-1, 3, 3)
+
+
+def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Numbers) -> Points:
+    """As `SolidMesh.from_edges`: triangles (p, 3, 3) [m] that are parts of triangles (t, 3), the parents (p,)."""
+    sides = points[sides_of(corners).reshape(-1, 3, 2)]
+    across = unit(across_of(points, corners))
+    inwards = unit(np.cross(across[:, None], sides[:, :, 1] - sides[:, :, 0]))
+    beyond = parts[:, None] - sides[parents][:, :, :1]
+    distances = np.einsum("pkjc,pkc->pkj", beyond, inwards[parents])
+    return np.where((cosines_of(points, corners) < SHARP)[parents][..., None], distances, FAR)

@@ -17,15 +17,12 @@ from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
 from cortado.files.input_files import as_path
-from cortado.pictures.film import film, lacking
-from cortado.pictures.grid import MOST, framed_together
-from cortado.pictures.labels import labelled, side_by_side
-from cortado.pictures.page import Around, Page, Panel
+from cortado.pictures.film import MOST, Around, Page, Panel, film, framed_together, lacking
+from cortado.pictures.labels import Scale, labelled, side_by_side
 from cortado.pictures.run_pictures import device_of, shown_as
-from cortado.pictures.scale import Scale
 from cortado.pictures.shown_run import ShownRun, coloured_by
-from cortado.runs.film import Film, pace_of
 from cortado.runs.marks import common_rate
+from cortado.runs.pace import Film, pace_of
 from cortado.runs.run_files import computed
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture

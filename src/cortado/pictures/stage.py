@@ -1,4 +1,4 @@
-"""Where a picture is taken: which way is up, the floor, the container of glass, the lamps, and a camera."""
+"""Where a picture of fluid in space is taken: which way is up, the floor, the container, the lamps, and a camera."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -6,15 +6,100 @@ from typing import Any
 
 import numpy as np
 
+from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points, corners
-from cortado.pictures.framing import fluid_extent, thinned
-from cortado.pictures.media import media_of
-from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids, union
 from cortado.scene.camera_paths import View
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
+from cortado.scene.materials import LIQUIDS
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
+
+DROPS = 0.002
+"""The share of particles at either end of an axis that may lie outside of a picture."""
+SPILT, BEYOND = 0.1, 0.15
+"""The share of particles at either end of an axis that does not widen the picture if it is far away; and how much wider
+than all others a picture is, in their widths."""
+NEAR = 0.25
+"""How far from the first state, solids and container fluid is near enough for every drop to count, in their size."""
+ENOUGH = 1_000_000
+"""Positions, of all particles in all frames, that tell where the fluid comes to."""
+
+
+def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
+    """The states (m, d) [m] that say where the fluid comes to, of positions (n, d) or (frames, n, d) [m]: all of them,
+    with `ENOUGH` positions together if there are more, as their images within the period of a domain."""
+    states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
+    stride = max(sum(map(len, states)) // ENOUGH, 1)
+    return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
+
+
+def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
+
+    ``around`` are the ends of everything else in the picture. All of the first state counts. Of a later state the bulk
+    counts, and drops that are near the first state and near everything else: drops that fall far away do not make the
+    rest of the picture small.
+    """
+    first, *later = states
+    found = [_ends(first, DROPS)]
+    lower, upper = union([*found, *around])
+    near = NEAR * float(np.max(upper - lower))
+    for state in later:
+        low, high = _ends(state, SPILT)
+        found.append(
+            (
+                np.maximum(low - BEYOND * (high - low), state.min(axis=0)),
+                np.minimum(high + BEYOND * (high - low), state.max(axis=0)),
+            )
+        )
+        close = state[((state > lower - near) & (state < upper + near)).all(axis=1)]
+        found += [_ends(close, DROPS)] if len(close) else []
+    return union(found)
+
+
+def _ends(positions: Points, share: float) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of positions (n, d) [m] without a share of them at either end of each axis."""
+    lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
+    return lower, upper
+
+
+TINT = 2.6
+"""How much sooner light takes the colour of a fluid without a material than it is scattered."""
+SPAN = 0.1
+"""How thick fluid is that transparency is said of, in sizes of what is shown."""
+LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
+"""How often light is scattered within a spacing of what is opaque."""
+
+
+def media_of(scene: Scene, size: float) -> tuple[Points, float]:
+    """(phases, 2) scattering and absorption [1/m] where what is shown has a size [m], and the part of the light that
+    goes through `SPAN` of it, the mean of all phases.
+
+    They are those of materials, unless the picture has a transparency of its own or particles have other colours than
+    those of phases. A layer of particles hides what is behind it where fluid without a material is opaque.
+    """
+    picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
+    by_phase, transparency = picture.colour == "phase", picture.transparency
+    own = by_phase and transparency is None and picture.surface == "liquid"
+    liquids = [LIQUIDS[phase.material] if own and phase.material else None for phase in scene.phase]
+    if transparency is None:
+        transparency = 0.0 if len(scene.phase) > 1 or not by_phase else 0.9
+    plain = LAYERS / spacing
+    if picture.surface == "spheres":
+        plain = LAYERS_OF_SPHERES / spacing
+    elif transparency > 0.0:
+        plain = min(-np.log(transparency) / (SPAN * size), plain)
+    media = [(one.scattering, one.absorption) if one else (plain, TINT * plain) for one in liquids]
+    through = [
+        float(np.exp(-SPAN * size * one.scattering) * np.mean(np.array(phase.colour) ** (SPAN * size * one.absorption)))
+        if one
+        else transparency
+        for one, phase in zip(liquids, scene.phase, strict=True)
+    ]
+    return np.array(media), float(np.mean(through))
+
 
 MARGIN = 1.10
 """How much wider a picture is than what it shows."""

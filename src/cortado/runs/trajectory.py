@@ -18,10 +18,10 @@ from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
 from cortado.files.srgb import ShadedPicture
 from cortado.on_top import on_top
-from cortado.runs.film import Film
 from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.marks import Marks
+from cortado.runs.pace import Film
 from cortado.runs.sensors.log import Readings
 from cortado.runs.solid_motion import SolidMotions, motions_in
 from cortado.scene.quantities import QUANTITIES

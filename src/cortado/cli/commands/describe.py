@@ -23,8 +23,7 @@ from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.painter import colours_of
-from cortado.pictures.plan import plan
+from cortado.pictures.painter import colours_of, plan
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.choosing import scheduled_bounds
 from cortado.rollout.rollout import Rollout

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cortado.cli.commands.picture import scene_of_run
 from cortado.errors import InputError
-from cortado.pictures.exports.export import export
+from cortado.pictures.exports.formats import export
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.simulation import Simulation

@@ -12,8 +12,8 @@ from cortado.optimisation.inverse.knots import KnotValues
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.result import Result
+from cortado.pictures.particle_view import scene_view
 from cortado.pictures.report import Section
-from cortado.pictures.scene_view import scene_view
 from cortado.scene.in_words import scene_in_words
 
 MOST_NUMBERS = 1000

@@ -15,12 +15,12 @@ from cortado.pictures.report import Figures, Section, write_report
 from cortado.pictures.run_pictures import run_pictures, trajectory_view
 from cortado.pictures.run_plots import density_errors, readings
 from cortado.pictures.shown_run import coloured_by
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.supply import dry_sentence
-from cortado.runs.film import Pace
 from cortado.runs.marks import common_rate
+from cortado.runs.pace import Pace
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensors.log import Readings
 from cortado.runs.solid_motion import posed, solid_motions

@@ -10,9 +10,8 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import CortadoError, InputError
 from cortado.files.srgb import to_srgb
-from cortado.pictures.scene_view import container_outline, outline
-from cortado.pictures.shown_solids import ShownSolid, shown_solids
-from cortado.pictures.solid_lines import own_faces, own_lines
+from cortado.pictures.particle_view import container_outline, outline
+from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
 from cortado.pictures.stage import upright
 from cortado.scene.scene import Scene
 

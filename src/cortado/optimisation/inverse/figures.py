@@ -14,7 +14,7 @@ from cortado.optimisation.optimise import Result
 from cortado.pictures.painter import colours_of
 from cortado.pictures.plots import images, loss_curve, panels, particles
 from cortado.pictures.report import Figures
-from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.picture import Picture

@@ -15,16 +15,14 @@ from cortado.losses import Snapshot
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
-from cortado.pictures.film import film
-from cortado.pictures.filmed import FilmedRun
+from cortado.pictures.film import FilmedRun, Page, Panel, film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.labels import side_by_side
-from cortado.pictures.page import Page, Panel
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.report import Figures
-from cortado.pictures.scenery import State
 from cortado.pictures.shown_run import is_out, those
-from cortado.runs.film import Pace, pace_of
+from cortado.pictures.tracing.space import State
+from cortado.runs.pace import Pace, pace_of
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 

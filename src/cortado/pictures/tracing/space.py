@@ -1,7 +1,9 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -12,16 +14,131 @@ from cortado.device.compiling import compile_ahead
 from cortado.device.precision import FLOAT32
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
-from cortado.pictures.device_surface import DeviceSurface
-from cortado.pictures.lighting import illuminate_kernel
-from cortado.pictures.marked import list_marked, marked
-from cortado.pictures.scenery import Scenery, State, scenery, still
-from cortado.pictures.shadow import cast
-from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
-from cortado.pictures.steady import steadied
-from cortado.pictures.trace import Eye, find_contrast, trace_kernel
-from cortado.pictures.wetting import turn
+from cortado.pictures.tracing.liquid_surface import Level, liquid_level, liquid_surface, spheres
+from cortado.pictures.tracing.near_particles import Particles, list_marked, marked
+from cortado.pictures.tracing.shadow import FloorShadow, cast
+from cortado.pictures.tracing.solid_surfaces import DeviceSurface, SolidSurfaces
+from cortado.pictures.tracing.steady import steadied, still_of
+from cortado.pictures.tracing.surroundings import EDGE, GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
+from cortado.pictures.tracing.trace import Eye, find_contrast, illuminate_kernel, trace_kernel
+from cortado.pictures.tracing.wetting import particles_of, turn, wetting
+from cortado.scene.camera_paths import View
+from cortado.scene.scene import Scene
+
+
+def environment_of(stage: Stage) -> Any:
+    """`Environment`; what it knows of solids is added by others."""
+    picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
+    horizon = np.asarray(light.background)
+    s.size, s.nearest = stage.size, 1e-4 * stage.size
+    s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
+    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * light.zenith))
+    s.lamp, s.strip, s.sunlight = wp.vec3(*light.lamp), wp.vec3(*light.strip), wp.vec3(*light.sunlight)
+    s.has_floor, s.floor_height = int(picture.floor), float(stage.lower[1])
+    s.floor_colour = wp.vec3(*(0.93 * horizon))
+    s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))
+    s.grid = _round_length(stage.size / 6.0)
+    s.glass = NO_GLASS
+    if stage.container.extent() is not None:
+        lower, upper = stage.glass_ends
+        s.glass = GLASS_BOX if stage.container.shape == "box" else GLASS_CYLINDER
+        s.glass_frame = wp.mat33(*stage.glass_frame.ravel())
+        s.glass_lower, s.glass_upper = wp.vec3(*lower), wp.vec3(*upper)
+        lower, upper = (np.clip(end, -1e8, 1e8) for end in stage.room)
+        s.room_lower, s.room_upper = wp.vec3(*lower), wp.vec3(*upper)
+        s.has_room = int(stage.cuts and picture.surface == "liquid")
+        finish = stage.container.finish
+        s.edge_colour = wp.vec3(*(EDGE if finish is None else finish.colour))
+        if finish is not None and not finish.transparency:
+            s.has_walls, s.wall_colour, s.wall_reflectivity = 1, wp.vec3(*finish.colour), finish.reflectivity
+        s.panes = wp.mat33(*(stage.panes * (1 - s.has_walls)).ravel(), 0.0, 0.0, 0.0)
+    return s
+
+
+def _round_length(length: float) -> float:
+    """The next of 1, 2 and 5 times a power of ten below a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
+
+
+class State(NamedTuple):
+    """What a picture shows."""
+
+    positions: Points
+    """(n, d) of particles [m], in the scene's axes"""
+    colours: Points
+    """(n, 3) of particles, linear from 0 to 1"""
+    pose: Scene | None = None
+    """The scene with its solids where they are; where it has them if left out."""
+    view: View | None = None
+    """Where the camera is; home if left out."""
+    fractions: Points | None = None
+    """(n, phases) by mass, what particles are made of; with one phase left out"""
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """The fluid of one state, in the frame of the picture."""
+
+    stage: Stage
+    """With solids and the camera where they are."""
+    environment: Any
+    """`Environment`"""
+    surface: DeviceSurface
+    shadow: FloorShadow
+
+
+def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
+    """That of a state in 3-D; ``steady``: `Still` of the state that is drawn in the place of its own."""
+    stage, s, particles, shadow = _placed(home, state, launch)
+    if steady is None:
+        shadow.of_fluid(particles)
+        return Scenery(stage, s, _surface(stage, s, particles, launch), shadow)
+    shadow.light = steady.light
+    return Scenery(stage, s, _surface(stage, s, particles, launch, (steady.b, steady.blocks)), shadow)
+
+
+def still(home: Stage, state: State, launch: BandLauncher) -> Any:
+    """`Still` of a state in 3-D; None where its fluid is not drawn with a surface around it."""
+    stage, s, particles, shadow = _placed(home, state, launch)
+    if stage.picture.surface != "liquid" or not len(particles):
+        return None
+    shadow.of_fluid(particles)
+    level, near = liquid_level(wetting(stage, s, particles, launch), stage.spacing, launch)
+    return still_of(level, near, shadow.light, launch)
+
+
+def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:
+    """The stage of a state, its `Environment`, its particles, and a floor without a shadow."""
+    stage = home.at(state.pose, state.view)
+    s, shadow = environment_of(stage), FloorShadow(stage, launch)
+    s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
+    return stage, s, particles_of(stage, state.positions, state.colours, launch, state.fractions), shadow
+
+
+def _surface(
+    stage: Stage, s: Any, particles: Particles, launch: BandLauncher, level: Level | None = None
+) -> DeviceSurface:
+    if not len(particles):
+        return _nothing(stage, launch.device)
+    if stage.picture.surface == "liquid":
+        found = liquid_surface(wetting(stage, s, particles, launch), stage.spacing, launch, level)
+        softened = partial(found.softened, launch=launch)
+        surface = DeviceSurface.of(found.points, found.triangles, found.normals, found.colours, softened)
+        surface.lit.media = found.media
+        return surface
+    balls = spheres(particles.places.numpy(), particles.looks.numpy()[:, :3], stage.spacing)
+    surface = DeviceSurface.on(launch.device, balls.points, balls.triangles, balls.normals, balls.colours)
+    surface.lit.media.fill_(wp.vec2(*stage.media[0]))
+    return surface
+
+
+def _nothing(stage: Stage, device: Any) -> DeviceSurface:
+    """A triangle that is too small and too far below the floor to be seen: meshes need one."""
+    places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
+    return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))
+
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""

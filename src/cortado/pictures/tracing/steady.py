@@ -13,9 +13,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.pictures.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
-from cortado.pictures.near_particles import NearParticles, count_near
-from cortado.pictures.particles import MODULE
+from cortado.pictures.tracing.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
+from cortado.pictures.tracing.near_particles import MODULE, NearParticles, count_near
 
 WINDOW, SHADOW_WINDOW = 30, 6
 """Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""

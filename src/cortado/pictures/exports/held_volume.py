@@ -1,12 +1,24 @@
-"""Surfaces that enclose the volume of their particles: around each body of fluid that is apart from others, all points
-are moved in or out by the same distance."""
+"""Surfaces for other programs: they end at the walls of the container, where pictures are cut, and enclose the volume
+of their particles. Around each body of fluid that is apart from others, all points are moved in or out by the same
+distance."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
+import warp as wp
 
+from cortado.device.bands import BandLauncher
 from cortado.device.cores import usable_cores
+from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
+from cortado.pictures.stage import Stage
+from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, sized_level
+from cortado.pictures.tracing.space import environment_of
+from cortado.pictures.tracing.wetting import particles_of, wetting
+from cortado.scene.containers import CylinderContainer
 
 LINKED = 1.25
 """In spacings: particles that are nearer to each other are of one body."""
@@ -94,3 +106,50 @@ def _volumes(
 def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
     """(t,) a sixth of the determinants of vectors (t, 3)."""
     return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
+
+
+SAME = 1e-6
+"""In spacings: points that a turn into the axes of the container and back moves by less are where they were."""
+
+
+def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
+    """The surface of what particles at positions (n, 3) [m] with colours (n, 3) fill, see `liquid_surface`, in the axes
+    of the scene. Where fluid touches walls it is extended behind them, and its points there are then moved to the wall.
+    The others are moved until the surface encloses the volume of the particles; see `with_volume`.
+
+    Raises:
+        ComputationError: there is no surface.
+    """
+    launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
+    with WARP:
+        own = particles_of(stage, positions, colours, launch)
+        fluid = wetting(stage, environment_of(stage), own, launch)
+        found = liquid_surface(fluid, stage.spacing, launch, sized_level(fluid, stage.spacing, launch))
+        places = own.places.numpy().astype(np.float64)
+        points, normals = (one.numpy().astype(np.float64) for one in (found.points, found.normals))
+        triangles, colours = found.triangles.numpy().reshape(-1, 3), found.colours.numpy()
+    kept = _in_room(stage, points)
+    beyond = np.linalg.norm(points - kept, axis=1)
+    is_free = beyond <= SAME * stage.spacing
+    normals[~is_free] = (points - kept)[~is_free] / beyond[~is_free, None]
+    ways, in_room = np.where(is_free[:, None], normals, 0.0), partial(_in_room, stage)
+    points = with_volume(kept, triangles, ways, places, stage.spacing, in_room)
+    return Surface(points @ stage.frame + stage.origin, triangles, normals @ stage.frame, colours)
+
+
+def _in_room(stage: Stage, points: Points) -> Points:
+    """(p, 3) the points of the container, where it cuts fluid, that are nearest to points (p, 3) [m], in the frame of
+    the picture."""
+    if not stage.cuts:
+        return points
+    lower, upper = stage.room
+    places = points @ stage.glass_frame.T
+    if isinstance(stage.container, CylinderContainer):
+        radius = 0.5 * (upper[0] - lower[0])
+        off = places[:, ::2] - 0.5 * (lower + upper)[::2]
+        places[:, ::2] -= off * np.maximum(1.0 - radius / np.linalg.norm(off, axis=1, keepdims=True), 0.0)
+        places[:, 1] = np.clip(places[:, 1], lower[1], upper[1])
+    else:
+        places = np.clip(places, lower, upper)
+    found: Points = places @ stage.glass_frame
+    return found

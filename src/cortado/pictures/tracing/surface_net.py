@@ -10,9 +10,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.pictures.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_of, level_at, node_of, place_of
-from cortado.pictures.marked import last_of
-from cortado.pictures.particles import MODULE
+from cortado.pictures.tracing.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_of, level_at, node_of, place_of
+from cortado.pictures.tracing.near_particles import MODULE, last_of
 
 ROUNDS_OF_NORMALS = 15
 """Of smoothing."""

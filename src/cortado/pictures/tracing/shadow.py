@@ -10,10 +10,9 @@ from cortado.device.bands import BandLauncher
 from cortado.device.launching import launch as launch_once
 from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
-from cortado.pictures.particles import Look, Particles
-from cortado.pictures.shown_solids import ShownSolid
-from cortado.pictures.solid_mesh import SolidMesh
+from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
+from cortado.pictures.tracing.near_particles import Look, Particles
 
 MODULE = kernel_module("shadow")
 NODES = 320

@@ -10,9 +10,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.bands import BandLauncher
-from cortado.pictures.marked import marked
-from cortado.pictures.near_particles import NearParticles, bump_at, sum_near
-from cortado.pictures.particles import MODULE
+from cortado.pictures.tracing.near_particles import MODULE, NearParticles, bump_at, marked, sum_near
 
 WIDTH = wp.constant(4)
 """Cubes along each axis of a block."""

@@ -1,0 +1,399 @@
+"""A trajectory as files of other programs, in one of several formats, and as a dataset of xarray."""
+
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from os import PathLike
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError, ExtraMissingError, InputError, shown
+from cortado.files.atomic import sentences, unfinished, write_atomically
+from cortado.files.input_files import as_path
+from cortado.files.progress import announce, track
+from cortado.files.srgb import to_srgb
+from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pose, in_space
+from cortado.runs.frame_file import FRACTION
+from cortado.runs.solid_motion import SolidMotion
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.quantities import QUANTITIES
+from cortado.scene.scene import Scene, as_scene
+from cortado.simulation import Simulation
+from cortado.version import __version__
+
+Advance = Callable[[], None]
+"""Called after each frame."""
+
+
+def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
+    """A glTF file for each frame, with all of it by name, y up as glTF wants it, and linear colours; returns the
+    folder."""
+    import trimesh
+
+    upright = Pose(run.up, np.zeros(3)).matrix
+    for number, frame in enumerate(run.frames(run.series)):
+        scene = trimesh.Scene()
+        if frame.surface is not None:
+            scene.add_geometry(_trimesh(frame.surface, _linear), "surface", "surface", transform=upright)
+        for solid in run.solids:
+            pose = upright @ frame.poses[solid.name].matrix
+            scene.add_geometry(_trimesh(solid.mesh, _linear), solid.part, solid.part, transform=pose)
+        scene.add_geometry(_trimesh(frame, _linear), "particles", "particles", transform=upright)
+        write_atomically(folder / _numbered("frame", number, "glb"), scene.export(file_type="glb"))
+        advance()
+    return folder
+
+
+def _write_series(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
+    """The files of each frame, which trimesh writes; colours are those of sRGB, which programs expect there. Returns
+    the folder."""
+    for number, frame in enumerate(run.frames(run.series)):
+        for name, what in _files(run, number, frame, ending).values():
+            if not (folder / name).exists():
+                write_atomically(folder / name, _trimesh(what, _srgb).export(file_type=ending))
+        advance()
+    return folder
+
+
+def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
+    """The files of each frame, which VTK writes, with all fields of the particles; returns ``run.pvd``, which has them
+    all at their times."""
+    entries = []
+    for number, frame in enumerate(run.frames(run.series)):
+        for part, (of, (name, what)) in enumerate(_files(run, number, frame, "vtp").items()):
+            if not (folder / name).exists():
+                write_atomically(folder / name, _vtp(what))
+            where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
+            entries.append(f"    <DataSet {where}/>")
+        advance()
+    lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
+    write_atomically(folder / "run.pvd", "\n".join([*lines, ""]))
+    return folder / "run.pvd"
+
+
+def _files(
+    run: Exported, number: int, frame: ExportedFrame, ending: str
+) -> dict[str, tuple[str, ExportedFrame | Mesh]]:
+    """The name and the contents of each file of a frame, by the part of the frame that is in it: the particles, the
+    surface, and each solid. A solid at rest has one file for all frames."""
+    found: dict[str, ExportedFrame | Mesh] = {"particles": frame}
+    if frame.surface is not None:
+        found["surface"] = frame.surface
+    found |= {solid.part: solid.mesh.moved(frame.poses[solid.name]) for solid in run.solids}
+    at_rest = {solid.part for solid in run.solids if not solid.moves}
+    return {
+        part: (f"{part}.{ending}" if part in at_rest else _numbered(part, number, ending), what)
+        for part, what in found.items()
+    }
+
+
+def _numbered(name: str, number: int, ending: str) -> str:
+    """The name of the file of a frame."""
+    return f"{name}_{number:05d}.{ending}"
+
+
+def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
+    """A mesh, or the particles of a frame, as trimesh has them, with opaque colours."""
+    import trimesh
+
+    own = np.pad(colours(np.clip(what.colours, 0.0, 1.0)), ((0, 0), (0, 1)), constant_values=255)
+    if isinstance(what, ExportedFrame):
+        return trimesh.PointCloud(what.positions, colors=own)
+    return trimesh.Trimesh(what.points, what.triangles, vertex_normals=what.normals, vertex_colors=own, process=False)
+
+
+def _srgb(colours: Any) -> Any:
+    """(p, 3) bytes of sRGB, of linear colours (p, 3) from 0 to 1."""
+    return to_srgb(colours[None])[0]
+
+
+def _linear(colours: Any) -> Any:
+    """(p, 3) bytes that are proportional to linear colours (p, 3) from 0 to 1."""
+    return np.rint(255.0 * colours).astype(np.uint8)
+
+
+def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
+    """``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a
+    transform ``/run/solid_NAME`` with a mesh; returns its path.
+
+    Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
+    these are. Lengths are metres, colours linear.
+    """
+    pxr = _pxr()
+    path = folder / "run.usdc"
+    temporary = unfinished(path).with_suffix(".usdc")
+    with sentences(path):
+        try:
+            stage = pxr.Usd.Stage.CreateNew(str(temporary))
+            writer = _Writer(pxr, stage, run, len(run.whole.times), run.whole.rate)
+            for code, frame in enumerate(run.frames(run.whole)):
+                writer.add(float(code), frame)
+                advance()
+            stage.GetRootLayer().Save()
+            temporary.replace(path)
+        except pxr.Tf.ErrorException as problem:
+            raise ComputationError(
+                f"{path} cannot be written: USD reports {' '.join(str(problem).split())}; free some space, or choose "
+                "another place."
+            ) from problem
+        finally:
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+class _Writer:
+    """Adds frames to a stage."""
+
+    def __init__(self, pxr: Any, stage: Any, run: Exported, frames: int, rate: float):
+        self._pxr, self._run, geometry = pxr, run, pxr.UsdGeom
+        geometry.SetStageMetersPerUnit(stage, 1.0)
+        gravity = np.abs(np.asarray(run.scene.forces.gravity))
+        geometry.SetStageUpAxis(stage, geometry.Tokens.z if gravity.argmax() == 2 else geometry.Tokens.y)
+        stage.SetTimeCodesPerSecond(rate)
+        stage.SetFramesPerSecond(rate)
+        stage.SetStartTimeCode(0.0)
+        stage.SetEndTimeCode(float(frames - 1))
+        stage.SetDefaultPrim(geometry.Xform.Define(stage, "/run").GetPrim())
+        self._particles = geometry.Points.Define(stage, "/run/particles")
+        self._particles.CreateWidthsAttr(self._floats(np.array([run.spacing])))
+        self._particles.SetWidthsInterpolation(geometry.Tokens.constant)
+        self._surface = geometry.Mesh.Define(stage, "/run/surface") if run.scene.dimension == 3 else None
+        if self._surface is not None:
+            self._begin_mesh(self._surface)
+        self._poses: dict[str, tuple[Any, Any]] = {}
+        for solid in run.solids:
+            form = geometry.Xform.Define(stage, f"/run/{solid.part}")
+            self._poses[solid.name] = form.AddTranslateOp(), form.AddOrientOp(geometry.XformOp.PrecisionDouble)
+            mesh = geometry.Mesh.Define(stage, f"/run/{solid.part}/mesh")
+            self._begin_mesh(mesh)
+            self._set_mesh(mesh, solid.mesh, pxr.Usd.TimeCode.Default())
+
+    def add(self, code: float, frame: ExportedFrame) -> None:
+        """Write a frame at a time code."""
+        if self._surface is not None:
+            empty = np.zeros((0, 3))
+            surface = frame.surface or Mesh(empty, empty, empty, empty, empty)
+            self._set_mesh(self._surface, surface, code)
+        self._set_points(self._particles, frame.positions, frame.velocities, frame.colours, code)
+        for name, values in frame.fields.items():
+            self._field(name, values).Set(self._floats(values), code)
+        for solid in self._run.solids:
+            if solid.moves or code == 0.0:
+                own = code if solid.moves else self._pxr.Usd.TimeCode.Default()
+                self._set_pose(solid.name, frame.poses[solid.name], own)
+
+    def _field(self, name: str, values: np.ndarray) -> Any:
+        kinds, geometry = self._pxr.Sdf.ValueTypeNames, self._pxr.UsdGeom
+        kind = kinds.FloatArray if values.ndim == 1 else {2: kinds.Float2Array, 3: kinds.Float3Array}[values.shape[1]]
+        return geometry.PrimvarsAPI(self._particles).CreatePrimvar(name, kind, geometry.Tokens.vertex)
+
+    def _begin_mesh(self, mesh: Any) -> None:
+        mesh.CreateSubdivisionSchemeAttr("none")
+        mesh.SetNormalsInterpolation(self._pxr.UsdGeom.Tokens.vertex)
+
+    def _set_mesh(self, prim: Any, mesh: Mesh, code: Any) -> None:
+        ints = self._pxr.Vt.IntArray.FromNumpy
+        self._set_points(prim, mesh.points, mesh.velocities, mesh.colours, code)
+        prim.GetFaceVertexCountsAttr().Set(ints(np.full(len(mesh.triangles), 3, dtype=np.int32)), code)
+        prim.GetFaceVertexIndicesAttr().Set(ints(mesh.triangles.astype(np.int32).ravel()), code)
+        prim.GetNormalsAttr().Set(self._floats(mesh.normals), code)
+
+    def _set_points(self, prim: Any, points: Points, velocities: Points | None, colours: Points, code: Any) -> None:
+        given = self._floats(points)
+        prim.GetPointsAttr().Set(given, code)
+        if len(points):
+            prim.GetExtentAttr().Set(self._pxr.UsdGeom.PointBased.ComputeExtent(given), code)
+        if velocities is not None:
+            prim.GetVelocitiesAttr().Set(self._floats(velocities), code)
+        colour = prim.CreateDisplayColorPrimvar(self._pxr.UsdGeom.Tokens.vertex)
+        colour.Set(self._floats(colours), code)
+
+    def _set_pose(self, name: str, pose: Pose, code: Any) -> None:
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_matrix(pose.turn).as_quat()
+        translate, orient = self._poses[name]
+        gf = self._pxr.Gf
+        translate.Set(gf.Vec3d(*pose.position), code)
+        orient.Set(gf.Quatd(float(turn[3]), gf.Vec3d(*turn[:3])), code)
+
+    def _floats(self, values: np.ndarray) -> Any:
+        """(n,) or (n, k) as an array of USD, in float32."""
+        vt, own = self._pxr.Vt, np.ascontiguousarray(values, dtype=np.float32)
+        kind = vt.FloatArray if own.ndim == 1 else {2: vt.Vec2fArray, 3: vt.Vec3fArray}[own.shape[1]]
+        return kind.FromNumpy(own)
+
+
+def _pxr() -> Any:
+    try:
+        import pxr
+        import pxr.Gf
+        import pxr.Sdf
+        import pxr.Tf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.Vt
+    except ImportError as error:
+        raise ExtraMissingError("USD", "usd-core") from error
+    return pxr
+
+
+def _vtp(what: ExportedFrame | Mesh) -> str:
+    """The text of a VTP file, with the numbers in base64: a vertex for each particle of a frame, with its velocity
+    [m/s] and all fields; or the triangles of a mesh, with normals, and of a surface with velocities [m/s]."""
+    colours = {"colour": _srgb(np.clip(what.colours, 0.0, 1.0))}
+    velocities = {} if what.velocities is None else {"velocity": what.velocities}
+    if isinstance(what, ExportedFrame):
+        own = {name: in_space(values) if values.ndim == 2 else values for name, values in what.fields.items()}
+        corners = np.arange(len(what.positions))[:, None]
+        data = _polydata(what.positions, corners, "Verts", velocities | colours | own)
+    else:
+        data = _polydata(what.points, what.triangles, "Polys", colours | velocities)
+        data.GetPointData().SetNormals(_array("normals", what.normals))
+    writer = _vtk().vtkXMLPolyDataWriter()
+    writer.SetInputData(data)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString())
+
+
+def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mapping[str, np.ndarray]) -> Any:
+    """VTK's data of points (p, 3) [m] and cells with k corners each, (c, k), with fields (p, ...) by name."""
+    vtk = _vtk()
+    data, places, topology = vtk.vtkPolyData(), vtk.vtkPoints(), vtk.vtkCellArray()
+    places.SetData(_array("points", points))
+    data.SetPoints(places)
+    starts = np.arange(0, corners.size + 1, corners.shape[1], dtype=np.int64)
+    flat = np.ascontiguousarray(corners.ravel(), dtype=np.int64)
+    topology.SetData(*(vtk.numpy_to_vtkIdTypeArray(one, deep=True) for one in (starts, flat)))
+    getattr(data, f"Set{cells}")(topology)
+    for name, values in fields.items():
+        data.GetPointData().AddArray(_array(name, values))
+    return data
+
+
+def _array(name: str, values: np.ndarray) -> Any:
+    """As an array of VTK, in float32 unless it is made of bytes."""
+    kept = values if values.dtype == np.uint8 else np.asarray(values, dtype=np.float32)
+    found = _vtk().numpy_to_vtk(np.ascontiguousarray(kept), deep=True)
+    found.SetName(name)
+    return found
+
+
+@cache
+def _vtk() -> Any:
+    """What is used of VTK, of which the whole takes seconds to import."""
+    try:
+        from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
+        from vtkmodules.util import numpy_support
+    except ImportError as error:
+        raise ExtraMissingError("VTK", "vtk") from error
+    modules = (vtkCommonCore, vtkCommonDataModel, vtkIOXML, numpy_support)
+    return SimpleNamespace(**{name: value for one in modules for name, value in vars(one).items()})
+
+
+FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
+    "ply": partial(_write_series, ending="ply"),
+    "obj": partial(_write_series, ending="obj"),
+    "glb": write_glb,
+    "usd": write_usd,
+    "vtp": write_vtp,
+}
+
+
+def export(
+    trajectory: Trajectory,
+    folder: str | PathLike[str],
+    to: str,
+    scene: Scene | str | PathLike[str],
+    simulation: Callable[[], Simulation] | None = None,
+) -> Path:
+    """See `Trajectory.export`, and `Exported`; returns the file to open, or the folder of a series."""
+    if to not in FORMATS:
+        raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
+    if not len(trajectory):
+        raise InputError("The trajectory has no frame, but must have one to be exported.")
+    of, into = as_scene(scene), Path(as_path("folder", folder))
+    if of.dimension != trajectory.dimension or len(of.phase) != _phases(trajectory):
+        raise InputError(
+            f"scene has {of.dimension} dimensions and {len(of.phase)} phases, but must be that of the trajectory, with "
+            f"{trajectory.dimension} and {_phases(trajectory)}."
+        )
+    run = Exported(trajectory, of, simulation)
+    with sentences(into):
+        into.mkdir(parents=True, exist_ok=True)
+        if any(into.iterdir()):
+            raise InputError(f"{into} is not empty; choose another folder, in which no other files get in between.")
+    whole = run.whole if to == "usd" else run.series
+    with track(len(trajectory if whole is None else whole.times), "export") as advance:
+        path = FORMATS[to](run, into, advance)
+    for said in ("" if whole is None else whole.in_words, run.in_words):
+        if said:
+            announce(f"{path.name}: {said}.")
+    return path
+
+
+def _phases(trajectory: Trajectory) -> int:
+    return 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
+
+
+AXES = ["x", "y", "z"]
+Variables = dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]
+
+
+def labelled(trajectory: Trajectory) -> Any:
+    """See `Trajectory.to_xarray`."""
+    try:
+        import xarray
+    except ImportError as error:
+        raise ExtraMissingError("xarray", "xarray") from error
+    axes, of_particles = AXES[: trajectory.dimension], ("time", "particle")
+    variables: Variables = {
+        "position": ((*of_particles, "space"), trajectory.positions, {"units": "m"}),
+        "velocity": ((*of_particles, "space"), trajectory.velocities, {"units": "m/s"}),
+    }
+    if trajectory.mass_fractions is not None:
+        variables[FRACTION.rstrip("_")] = ((*of_particles, "phase"), trajectory.mass_fractions, {"units": "1"})
+    if "reference_density" in trajectory.constants:
+        variables["reference_density"] = (("particle",), trajectory.constants["reference_density"], {"units": "kg/m3"})
+    for name, values in trajectory.quantities.items():
+        behind = {2: (), 3: ("space",)}[values.ndim]
+        variables[name] = ((*of_particles, *behind), values, {"units": QUANTITIES[name].unit})
+    coordinates: dict[str, Any] = {
+        "time": ("time", trajectory.times, {"units": "s"}),
+        "step": ("time", trajectory.steps, {"units": "1"}),
+        "space": ("space", axes),
+    }
+    if trajectory.solids:
+        coordinates |= {"solid": ("solid", list(trajectory.solids))}
+        coordinates |= {"rotation_axis": ("rotation_axis", axes)} if trajectory.dimension == 3 else {}
+        variables |= _of_solids(trajectory.solids, ("rotation_axis",) if trajectory.dimension == 3 else ())
+    attributes: dict[str, Any] = {"source": f"Cortado {__version__}"}
+    if trajectory.origin is not None:
+        attributes["spacing"] = trajectory.origin.spacing
+        attributes["spacing_units"] = "m"
+    return xarray.Dataset(variables, coordinates, attributes)
+
+
+def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
+    """Of solids that move, one behind the other; velocities of those that are told where to go are no numbers."""
+
+    def stacked(each: list[Any], alike: list[Any]) -> Any:
+        rows = [np.full_like(as_, np.nan) if one is None else one for one, as_ in zip(each, alike, strict=True)]
+        return np.stack(rows, axis=1)
+
+    every = list(solids.values())
+    places, turns = [one.positions for one in every], [one.rotations for one in every]
+    own, spins = [one.velocities for one in every], [one.angular_velocities for one in every]
+    at = ("time", "solid")
+    return {
+        "solid_position": ((*at, "space"), stacked(places, places), {"units": "m"}),
+        "solid_scale": (("solid",), [one.scale for one in every], {"units": "1"}),
+        "solid_rotation": ((*at, *turned), stacked(turns, turns), {"units": "rad"}),
+        "solid_velocity": ((*at, "space"), stacked(own, places), {"units": "m/s"}),
+        "solid_angular_velocity": ((*at, *turned), stacked(spins, turns), {"units": "rad/s"}),
+    }

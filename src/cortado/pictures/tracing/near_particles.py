@@ -1,0 +1,238 @@
+"""Particles on the device that draws them, which of them are marked, and sums over those near a place."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.bands import BandLauncher
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
+from cortado.device.modules import kernel_module
+from cortado.device.precision import FLOAT32
+from cortado.discretise.shapes import Points
+from cortado.errors import ComputationError
+from cortado.words import counted
+
+MODULE = kernel_module("liquid")
+MODULE.options["max_unroll"] = 2  # compiles in half the time
+Look = wp.types.vector(5, wp.float32)
+"""Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
+OPAQUE = (1e6, 0.0)
+"""The medium of what nothing is seen through."""
+PARTS = 4096
+"""Of particles, of each of which the ends are found."""
+AT_ONCE = 8000
+"""Particles whose values are mixed at a time: of more, BLAS waits longer for its threads than they save."""
+
+
+def mixed(fractions: Points, values: Points) -> Points:
+    """(n, c) what particles of mass fractions (n, phases) have of the values (phases, c) of phases."""
+    found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
+    for first in range(0, len(shares), AT_ONCE):
+        np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
+    return found
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Where they are, and what they look like."""
+
+    places: wp.array
+    """(n,) of vec3 [m]"""
+    looks: wp.array
+    """(n,) of `Look`"""
+
+    @classmethod
+    def on(
+        cls, device: Any, places: Points, colours: Points, media: Points | tuple[float, float] = OPAQUE
+    ) -> "Particles":
+        """Those of arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and absorption
+        [1/m]. Raises `ComputationError` for places that are not finite."""
+        finite = np.isfinite(places)
+        if not finite.all():
+            astray = len(places) - int(finite.all(axis=1).sum())
+            raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, whose positions are not finite.")
+        looks = np.empty((len(places), 5), dtype=np.float32)
+        looks[:, :3], looks[:, 3:] = colours, media
+        return cls(
+            wp.array(np.asarray(places, dtype=np.float32), dtype=wp.vec3, device=device),
+            wp.array(looks, dtype=Look, device=device),
+        )
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def and_images(self, places: Points, of: np.ndarray) -> "Particles":
+        """With others behind them, at places (m, 3) [m], each looking like one, (m,)."""
+        looks = np.concatenate([self.looks.numpy(), self.looks.numpy()[of]])
+        both = np.concatenate([self.places.numpy(), places])
+        return Particles.on(self.places.device, both, looks[:, :3], looks[:, 3:])
+
+    def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
+        """Lower and upper ends, (3,) each [m]."""
+        count, device = min(PARTS, len(self)), self.places.device
+        lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
+        launch(find_ends, count, places=self.places, lower=lower, upper=upper)
+        return lower.numpy().astype(np.float64).min(axis=0), upper.numpy().astype(np.float64).max(axis=0)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_ends(
+    first: wp.int32,
+    places: wp.array(dtype=wp.vec3),
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+):
+    """Those of every so many."""
+    part = first + wp.tid()
+    low = places[part]
+    high = places[part]
+    i = part
+    while i < places.shape[0]:
+        low = wp.min(low, places[i])
+        high = wp.max(high, places[i])
+        i += lower.shape[0]
+    lower[part] = low
+    upper[part] = high
+
+
+@wp.kernel(module=kernel_module("marked"), enable_backward=False)
+def list_marked(
+    first: wp.int32,
+    marks: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+    numbers: wp.array(dtype=wp.int32),
+):
+    i = first + wp.tid()
+    if marks[i] > 0:
+        numbers[counts[i] - 1] = i
+
+
+def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
+    """The numbers of those of (n,) marks that are 1 and not 0, and how many of them there are up to each, (n,)."""
+    counts = wp.empty_like(marks)
+    wp.utils.array_scan(marks, counts)
+    numbers = wp.empty(last_of(counts), dtype=wp.int32, device=marks.device)
+    launch(list_marked, len(marks), marks=marks, counts=counts, numbers=numbers)
+    return numbers, counts
+
+
+def last_of(numbers: wp.array) -> int:
+    """The last of whole numbers (n,) on a device."""
+    return int(numbers[len(numbers) - 1 :].numpy()[0])
+
+
+@wp.struct
+class NearParticles:
+    """Particles sorted by cells."""
+
+    lower: wp.vec3
+    """Corner of the first cell [m]."""
+    spacing: wp.float32
+    """[m] which is the width of a cell, too."""
+    shape: wp.vec3i
+    """Cells along each axis."""
+    starts: wp.array(dtype=wp.int32)
+    """(cells + 1,) the first particle of each"""
+    places: wp.array(dtype=wp.vec3)
+    """(n,) [m]"""
+    looks: wp.array(dtype=Look)
+    """(n,)"""
+    volumes: wp.array(dtype=wp.float32)
+    """(n,) of each, such that their bumps add up to about 1 within fluid; a particle alone has 1"""
+
+
+@wp.func
+def bump(q: wp.float32):
+    """The cubic spline, 1 in the middle, 0 from q = 1 on."""
+    if q < 0.5:
+        return 1.0 - 6.0 * q * q * (1.0 - q)
+    r = 1.0 - q
+    return 2.0 * r * r * r
+
+
+def bump_at(q: float) -> float:
+    """The same in Python."""
+    return 1.0 - 6.0 * q * q * (1.0 - q) if q < 0.5 else 2.0 * max(1.0 - q, 0.0) ** 3
+
+
+@cache
+def sum_near(term: Callable[..., Any], number: Any) -> Any:
+    """The Warp function ``(s, p, reach)`` that adds up ``term(s, j)``, a ``number`` of Warp's, over the particles j
+    around p, each times the bump of that reach [m]."""
+
+    @wp.func
+    def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):
+        total = number(0.0)
+        q = (p - s.lower) / s.spacing
+        r = reach / s.spacing
+        for z in range(wp.max(int(wp.floor(q[2] - r)), 0), wp.min(int(wp.floor(q[2] + r)) + 1, s.shape[2])):
+            off_z = wp.max(wp.max(float(z) - q[2], q[2] - float(z + 1)), 0.0)
+            disc = wp.max(r * r - off_z * off_z, 0.0)
+            half = wp.sqrt(disc)
+            for y in range(wp.max(int(wp.floor(q[1] - half)), 0), wp.min(int(wp.floor(q[1] + half)) + 1, s.shape[1])):
+                off_y = wp.max(wp.max(float(y) - q[1], q[1] - float(y + 1)), 0.0)
+                along = wp.sqrt(wp.max(disc - off_y * off_y, 0.0))
+                first = wp.max(int(wp.floor(q[0] - along)), 0)
+                last = wp.min(int(wp.floor(q[0] + along)), s.shape[0] - 1)
+                if first <= last:
+                    row = (z * s.shape[1] + y) * s.shape[0]
+                    for j in range(s.starts[row + first], s.starts[row + last + 1]):
+                        off = p - s.places[j]
+                        squared = wp.dot(off, off)
+                        if squared < reach * reach:
+                            total += term(s, j) * bump(wp.sqrt(squared) / reach)
+        return total
+
+    return summed
+
+
+@wp.func
+def one(s: NearParticles, j: wp.int32):
+    return 1.0
+
+
+count_near = sum_near(one, wp.float32)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def sort_particles(
+    first: wp.int32,
+    order: wp.array(dtype=wp.int32),
+    given: wp.array(dtype=wp.vec3),
+    given_looks: wp.array(dtype=Look),
+    places: wp.array(dtype=wp.vec3),
+    looks: wp.array(dtype=Look),
+):
+    i = first + wp.tid()
+    places[i] = given[order[i]]
+    looks[i] = given_looks[order[i]]
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: wp.array(dtype=wp.float32)):
+    i = first + wp.tid()
+    volumes[i] = 1.0 / count_near(s, s.places[i], reach)
+
+
+def near_particles(
+    given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
+) -> Any:
+    """`NearParticles` of particles, those of them that are between ``ends``, (3,) each [m]; bumps have a ``reach``
+    [m]."""
+    device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
+    x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
+    sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)
+    sorting(given.places)
+    s = NearParticles()
+    s.lower, s.spacing, s.shape, s.starts = wp.vec3(*lower), spacing, wp.vec3i(x, y, z), sorting.grid.starts
+    s.places, s.looks = wp.empty_like(given.places), wp.empty_like(given.looks)
+    s.volumes = wp.empty(len(given), dtype=wp.float32, device=device)
+    unsorted = {"given": given.places, "given_looks": given.looks}
+    launch(sort_particles, len(given), order=sorting.order, **unsorted, places=s.places, looks=s.looks)
+    launch(find_volumes, len(given), s=s, reach=reach, volumes=s.volumes)
+    return s

@@ -1,0 +1,402 @@
+"""What is around the fluid, as Warp functions: lit surfaces, the sky with its lamps, the floor, a container of glass.
+
+All is in the frame of the picture: y points upwards. Colours are linear.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from cortado.device.modules import kernel_module
+
+
+@wp.struct
+class LitSurface:
+    """Triangles with what is known at their corners."""
+
+    mesh: wp.uint64
+    corners: wp.array(dtype=wp.int32)
+    """(3 triangles,) indices of points"""
+    normals: wp.array(dtype=wp.vec3)
+    """(points,) outwards"""
+    colours: wp.array(dtype=wp.vec3)
+    """(points,)"""
+    light: wp.array(dtype=wp.vec3)
+    """(points,) light that falls on the surface, of which white reflects 1"""
+    media: wp.array(dtype=wp.vec2)
+    """(points,) of a fluid: scattering and absorption [1/m]"""
+    is_flat: wp.int32
+    """Whether its colours are shown as they are, without light and shadow."""
+    reach: wp.float32
+    """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
+    left: wp.array(dtype=wp.vec2)
+    """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
+    reflectivity: wp.array(dtype=wp.float32)
+    """(triangles,) of opaque solids: the part of the light that they reflect as a mirror in their colour does"""
+    from_edges: wp.array(dtype=wp.mat33)
+    """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
+
+
+@wp.func
+def at_corners(surface: LitSurface, values: wp.array(dtype=wp.vec3), face: wp.int32, u: wp.float32, v: wp.float32):
+    """Interpolated on a triangle."""
+    return (
+        u * values[surface.corners[3 * face]]
+        + v * values[surface.corners[3 * face + 1]]
+        + (1.0 - u - v) * values[surface.corners[3 * face + 2]]
+    )
+
+
+@wp.func
+def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
+    """An interpolated normal on the side of the triangle that the ray comes from."""
+    outside = face_normal
+    n = normal
+    if wp.dot(outside, d) > 0.0:
+        outside = -outside
+        n = -n
+    cosine = wp.dot(n, d)
+    if cosine > -0.02:
+        n = n - (cosine + 0.02) * d
+    return wp.normalize(n)
+
+
+@wp.struct
+class SurfaceHit:
+    """Where a ray hits a surface."""
+
+    found: wp.bool
+    is_solid: wp.bool
+    """Whether it is that of an opaque solid."""
+    t: wp.float32
+    normal: wp.vec3
+    """On the side that the ray comes from."""
+    colour: wp.vec3
+    light: wp.vec3
+    reflectivity: wp.float32
+    """Of a solid."""
+    face: wp.int32
+    u: wp.float32
+    v: wp.float32
+
+
+@wp.func
+def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32):
+    """Where a ray hits a triangle."""
+    i = surface.corners[3 * face]
+    j = surface.corners[3 * face + 1]
+    k = surface.corners[3 * face + 2]
+    mesh = wp.mesh_get(surface.mesh)
+    flat = wp.normalize(wp.cross(mesh.points[j] - mesh.points[i], mesh.points[k] - mesh.points[i]))
+    met = SurfaceHit()
+    met.found = True
+    met.t = t
+    met.normal = facing(at_corners(surface, surface.normals, face, u, v), flat, d)
+    met.colour = at_corners(surface, surface.colours, face, u, v)
+    met.light = at_corners(surface, surface.light, face, u, v)
+    met.face = face
+    met.u = u
+    met.v = v
+    return met
+
+
+@wp.func
+def medium_at(surface: LitSurface, met: SurfaceHit):
+    """Scattering and absorption [1/m] of the fluid that a ray comes into."""
+    return (
+        met.u * surface.media[surface.corners[3 * met.face]]
+        + met.v * surface.media[surface.corners[3 * met.face + 1]]
+        + (1.0 - met.u - met.v) * surface.media[surface.corners[3 * met.face + 2]]
+    )
+
+
+OPAQUE, CLEAR = wp.constant(0), wp.constant(1)
+"""Which of the surfaces of solids."""
+NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
+FAR = wp.constant(wp.float32(1.0e9))
+
+
+def shading_module(has_opaque: bool, has_clear: bool) -> Any:
+    """The Warp module of kernels for scenes with opaque or transparent solids, or with none."""
+    return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
+
+
+@wp.struct
+class Solids:
+    """What fluid flows around, or is inside of."""
+
+    opaque: wp.uint64
+    """The mesh of opaque ones."""
+    are_cut: wp.int32
+    """Whether opaque ones are shown within the container only."""
+    clear: wp.uint64
+    """The mesh of those that are transparent and of tanks, which all of space outside of a cavity is within."""
+    has_tank: wp.int32
+    surfaces: wp.array(dtype=LitSurface)
+    """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
+
+
+@wp.struct
+class Environment:
+    """Everything around the fluid."""
+
+    size: wp.float32
+    """Of what is shown [m]: floor, grid and rims go by it."""
+    nearest: wp.float32
+    """How far a ray starts from the surface that sends it [m]."""
+    sun: wp.vec3
+    """Unit vector towards the lamp."""
+    fill: wp.vec3
+    """Unit vector towards a second, weak one, which is only seen in reflections."""
+    lamp: wp.vec3
+    """What is seen of the first in reflections."""
+    strip: wp.vec3
+    """What is seen of the second."""
+    sunlight: wp.vec3
+    """The light of the lamp that falls on what faces it."""
+    horizon: wp.vec3
+    zenith: wp.vec3
+    has_floor: wp.int32
+    floor_colour: wp.vec3
+    floor_height: wp.float32
+    """[m]"""
+    floor_centre: wp.vec3
+    """[m]; its height does not matter"""
+    grid: wp.float32
+    """Distance between the lines on the floor [m]; none if 0."""
+    shadow_corner: wp.vec3
+    """[m] where the first node of the shadow lies"""
+    shadow_cell: wp.float32
+    """Distance between its nodes [m]."""
+    glass: wp.int32
+    """NO_GLASS, GLASS_BOX or GLASS_CYLINDER, whose axis is the second of its own frame."""
+    glass_frame: wp.mat33
+    """From the frame of the picture to that of the container."""
+    glass_lower: wp.vec3
+    """[m] in its own frame"""
+    glass_upper: wp.vec3
+    """[m]"""
+    has_room: wp.int32
+    """Whether fluid is shown within the container only."""
+    room_lower: wp.vec3
+    """[m] in the frame of the container: where that ends; -FAR where it does not"""
+    room_upper: wp.vec3
+    """[m]"""
+    panes: wp.mat33
+    """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
+    edge_colour: wp.vec3
+    """Of the container's edges."""
+    has_walls: wp.int32
+    """Whether the container is opaque: one looks into it from outside, and sees its walls from within."""
+    wall_colour: wp.vec3
+    wall_reflectivity: wp.float32
+    solids: Solids
+
+
+@wp.func
+def smooth_step(lower: wp.float32, upper: wp.float32, x: wp.float32):
+    t = wp.clamp((x - lower) / (upper - lower), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@wp.func
+def schlick(normal_reflectance: wp.float32, cosine: wp.float32):
+    """Fresnel's reflectance, as Schlick (1994) approximates it."""
+    m = wp.clamp(1.0 - cosine, 0.0, 1.0)
+    m2 = m * m
+    return normal_reflectance + (1.0 - normal_reflectance) * m2 * m2 * m
+
+
+@wp.func
+def mirrored(direction: wp.vec3, normal: wp.vec3):
+    return direction - 2.0 * wp.dot(direction, normal) * normal
+
+
+@wp.func
+def sky(s: Environment, d: wp.vec3):
+    """Light from a direction above the floor: a gradient, a soft lamp, and a strip of light on the other side."""
+    base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
+    lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
+    strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
+    return base + s.lamp * lamp + s.strip * strip
+
+
+@wp.func
+def open_light(s: Environment, normal: wp.vec3):
+    """The light that falls on what nothing lies in the way of."""
+    return 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(normal, s.sun), 0.0)
+
+
+@wp.func
+def shadow_at(s: Environment, shadow: wp.array2d(dtype=wp.vec3), x: wp.float32, z: wp.float32):
+    """The part of the light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
+    u = (x - s.shadow_corner[0]) / s.shadow_cell
+    v = (z - s.shadow_corner[2]) / s.shadow_cell
+    i = wp.int32(wp.floor(u))
+    j = wp.int32(wp.floor(v))
+    if i < 0 or j < 0 or i + 1 >= shadow.shape[0] or j + 1 >= shadow.shape[1]:
+        return wp.vec3(1.0)
+    a = u - wp.float32(i)
+    b = v - wp.float32(j)
+    low = wp.lerp(shadow[i, j], shadow[i + 1, j], a)
+    high = wp.lerp(shadow[i, j + 1], shadow[i + 1, j + 1], a)
+    return wp.lerp(low, high, b)
+
+
+@wp.func
+def line(x: wp.float32, grid: wp.float32, width: wp.float32):
+    """1 on the lines of a grid, 0 between them; thinner than a pixel they fade."""
+    off = wp.abs(x / grid - wp.round(x / grid)) * grid
+    return 1.0 - smooth_step(0.35 * width, width, off)
+
+
+@wp.func
+def floor(s: Environment, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footprint: wp.float32):
+    """The floor at p, which becomes the horizon further out; ``footprint``: the width of a pixel there [m]."""
+    colour = s.floor_colour
+    if s.grid > 0.0:
+        thin = 0.0035 * s.size
+        width = wp.max(thin, 1.5 * footprint)
+        ink = wp.max(line(p[0] - s.floor_centre[0], s.grid, width), line(p[2] - s.floor_centre[2], s.grid, width))
+        colour = colour * (1.0 - 0.10 * ink * thin / width)
+    lit = wp.cw_mul(colour, shadow_at(s, shadow, p[0], p[2]))
+    away = wp.length(wp.vec2(p[0] - s.floor_centre[0], p[2] - s.floor_centre[2])) / s.size
+    return wp.lerp(lit, s.horizon, smooth_step(0.9, 3.2, away))
+
+
+@wp.func
+def open_background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+    """What a ray sees that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
+    if s.has_floor > 0 and d[1] < -1.0e-4:
+        t = (s.floor_height - o[1]) / d[1]
+        if t > 0.0:
+            slant = wp.max(-d[1], 0.05)
+            return floor(s, shadow, o + t * d, spread * t / slant)
+    return sky(s, wp.vec3(d[0], wp.max(d[1], 0.0), d[2]))
+
+
+@wp.func
+def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
+    """The part of a ray's span, from where to where, between two planes across an axis; o and d along that axis."""
+    if wp.abs(d) > 1.0e-9:
+        t1 = (lower - o) / d
+        t2 = (upper - o) / d
+        return wp.vec2(wp.max(span[0], wp.min(t1, t2)), wp.min(span[1], wp.max(t1, t2)))
+    if o < lower or o > upper:
+        return wp.vec2(span[0], -FAR)
+    return span
+
+
+@wp.func
+def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
+    """From where to where a ray is within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR
+    where it is not."""
+    radius = 0.5 * (upper[0] - lower[0])
+    x = o[0] - 0.5 * (lower[0] + upper[0])
+    z = o[2] - 0.5 * (lower[2] + upper[2])
+    a = d[0] * d[0] + d[2] * d[2]
+    b = x * d[0] + z * d[2]
+    c = x * x + z * z - radius * radius
+    if a <= 1.0e-12 and c <= 0.0:
+        return wp.vec2(-FAR, FAR)
+    discriminant = b * b - a * c
+    if a <= 1.0e-12 or discriminant <= 0.0:
+        return wp.vec2(FAR, -FAR)
+    root = wp.sqrt(discriminant)
+    return wp.vec2((-b - root) / a, (-b + root) / a)
+
+
+@wp.func
+def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
+    """From where to where a ray is within the walls of the container; from FAR to -FAR where it is not."""
+    p = s.glass_frame * o
+    q = s.glass_frame * d
+    span = wp.vec2(-FAR, FAR)
+    if s.glass == 2:
+        span = within_tube(s.room_lower, s.room_upper, p, q)
+    for a in range(3):
+        if s.glass == 1 or a == 1:
+            span = between(s.room_lower[a], s.room_upper[a], p[a], q[a], span)
+    if span[0] >= span[1]:
+        return wp.vec2(FAR, -FAR)
+    return span
+
+
+@wp.func
+def room(s: Environment, o: wp.vec3, d: wp.vec3):
+    """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
+    if s.has_room == 0:
+        return wp.vec2(-FAR, FAR)
+    return within_walls(s, o, d)
+
+
+@wp.func
+def wall_normal(s: Environment, p: wp.vec3):
+    """Outwards, of the wall that a point is on."""
+    q = s.glass_frame * p
+    n = wp.vec3(0.0)
+    best = FAR
+    for a in range(3):
+        if s.glass == 1 or a == 1:
+            low = wp.abs(q[a] - s.room_lower[a])
+            high = wp.abs(q[a] - s.room_upper[a])
+            if low < best:
+                best = low
+                n = wp.vec3(0.0)
+                n[a] = -1.0
+            if high < best:
+                best = high
+                n = wp.vec3(0.0)
+                n[a] = 1.0
+    if s.glass == 2:
+        x = q[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
+        z = q[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
+        away = wp.sqrt(x * x + z * z)
+        if wp.abs(away - 0.5 * (s.room_upper[0] - s.room_lower[0])) < best:
+            n = wp.vec3(x / away, 0.0, z / away)
+    return wp.transpose(s.glass_frame) * n
+
+
+EDGE = (0.50, 0.62, 0.64)
+"""Linear, of an edge of clear glass."""
+GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
+
+
+@wp.struct
+class Passed:
+    """What the glass on a way adds and leaves."""
+
+    light: wp.vec3
+    through: wp.float32
+
+
+@wp.func
+def pane(
+    s: Environment,
+    d: wp.vec3,
+    normal: wp.vec3,
+    rim: wp.float32,
+    is_pane: wp.float32,
+    colour: wp.vec3,
+    behind: Passed,
+):
+    """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge, which
+    has a colour, is seen, 0 to 1."""
+    cosine = wp.abs(wp.dot(d, normal))
+    f = schlick(0.04, cosine)
+    reflectance = 0.7 * is_pane * 2.0 * f / (1.0 + f)
+    r = mirrored(d, normal)
+    seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
+    seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
+    edge = colour * 0.75 + 0.25 * seen
+    light = behind.light + behind.through * (rim * edge + (1.0 - rim) * reflectance * seen)
+    passed = Passed()
+    passed.light = light
+    passed.through = behind.through * (1.0 - rim) * (1.0 - reflectance) * (1.0 - 0.015 * is_pane)
+    return passed
+
+
+@wp.func
+def rim_of(off: wp.float32, width: wp.float32):
+    """How much of an edge is seen at a distance from it."""
+    return 0.8 * (1.0 - smooth_step(0.55 * width, width, off))
