@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.gradients import Tape
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.rollout.rollout import BackwardStep, Rollout

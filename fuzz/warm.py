@@ -2,7 +2,7 @@
 
 import importlib
 
-from cortado.device.silence import silenced
+from cortado.device.warp_start import silenced
 
 MODULES = (
     "av",

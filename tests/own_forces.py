@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.scene.parameters.known import TIME
 from cortado.scene.parameters.parameter import Axis, Parameter
 

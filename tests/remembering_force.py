@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.sph.carried import Carried

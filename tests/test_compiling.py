@@ -13,8 +13,7 @@ import cortado
 from compiling_notice import COMPILING, UNOPTIMISED
 from cortado.device import compiling
 from cortado.device.compiling import kernels_of
-from cortado.device.kernels import is_derivative
-from cortado.device.modules import DEEP, SHALLOW, UNUSED, kernel_module
+from cortado.device.modules import DEEP, SHALLOW, UNUSED, is_derivative, kernel_module
 from scenes import plane, pour
 
 FIRST = {

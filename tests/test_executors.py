@@ -27,7 +27,7 @@ from cortado import (
 )
 from cortado.cli.commands.executor import Where
 from cortado.device import worker_calls as calls
-from cortado.device.cores import usable_cores
+from cortado.device.threads import usable_cores
 from cortado.errors import CortadoError, OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers
 from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing

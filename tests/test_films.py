@@ -6,7 +6,7 @@ import warp as wp
 
 import cortado
 from cortado.cli.commands.picture import camera_override
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
 from cortado.files.srgb import to_srgb

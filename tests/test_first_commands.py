@@ -66,7 +66,7 @@ def test_cortado_alone_shows_every_command(cortado_command):
 @pytest.mark.parametrize("example", COMMANDS)
 def test_what_it_shows_can_be_typed(example, cortado_command, monkeypatch):
     assert cortado.Simulation  # imported before its imports are replaced
-    monkeypatch.setattr("cortado.device.kernel_cache.start_warp", lambda: pytest.fail("the command was understood"))
+    monkeypatch.setattr("cortado.device.warp_start.start_warp", lambda: pytest.fail("the command was understood"))
     words = shlex.split(example)[1:]
     for word in words:
         if word.endswith(".toml"):

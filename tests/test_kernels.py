@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.device.binding import bound
-from cortado.device.bundles import Bundles, bundles_of
-from cortado.device.grid import Grid
-from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
+from cortado.device.cells import Grid
+from cortado.device.launching import Bundles, bound, bundles_of
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.device.reduction import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch

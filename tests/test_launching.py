@@ -6,9 +6,7 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, losses
-from cortado.device.binding import bound
-from cortado.device.bundles import Bundles
-from cortado.device.launching import KernelLauncher, launch, launch_together, watched
+from cortado.device.launching import Bundles, KernelLauncher, bound, launch, launch_together, watched
 from cortado.device.precision import FLOAT64
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type

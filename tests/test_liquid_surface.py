@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 import cortado
 from cortado.device import bands
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.errors import ComputationError
 from cortado.pictures.exports.held_volume import contained_liquid, enclosed, with_volume
 from cortado.pictures.painter import stage_of

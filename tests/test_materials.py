@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.errors import SceneError
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.stage import TINT, media_of

@@ -11,8 +11,7 @@ import warp as wp
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.device.bands import BandLauncher
-from cortado.device.launching import launch
+from cortado.device.launching import BandLauncher, launch
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import corners
 from cortado.errors import CortadoWarning, InputError, SceneError

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.particle_view import container_outline, outline, scene_view

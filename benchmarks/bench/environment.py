@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cortado.device.cores import usable_cores
+from cortado.device.threads import usable_cores
 from cortado.version import __version__
 
 

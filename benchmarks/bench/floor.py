@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from benchmarks.bench.timing import median_seconds
-from cortado.device.bundles import unbundled
-from cortado.device.cores import usable_cores
+from cortado.device.launching import unbundled
+from cortado.device.threads import usable_cores
 
 COPIED = 128 * 2**20
 """[bytes] that are copied to measure the bandwidth."""

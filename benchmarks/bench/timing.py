@@ -7,7 +7,8 @@ from statistics import median
 
 import warp as wp
 
-from cortado.device.launching import CapturedGraph, KernelLauncher, add
+from cortado.device.launching import CapturedGraph, KernelLauncher
+from cortado.device.reduction import add
 
 MOST_LAUNCHES = 20
 """Launches at most that are timed together, so that the cost of waiting for the device is shared by them."""

@@ -1,8 +1,8 @@
-"""Objects that do not change once they are made, and say so to whom sets an attribute or a setting of theirs."""
+"""Objects that do not change once they are made, and objects that stay in their process: both refuse in a sentence."""
 
 from collections.abc import Callable, Mapping
 from functools import wraps
-from typing import Any, NoReturn, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 from cortado.calls import told
 from cortado.errors import InputError
@@ -76,3 +76,15 @@ def keep_own(made: object, name: str) -> None:
         object.__setattr__(made, name, FixedDict(value))
     elif isinstance(value, list):
         object.__setattr__(made, name, tuple(value))
+
+
+class Staying:
+    """An object with arrays on a device, which raises `InputError` where it is pickled or copied."""
+
+    instead: ClassVar[str] = "but NumPy arrays of what it holds can"
+    """The end of the sentence: what can be pickled in its place."""
+
+    def __reduce__(self) -> NoReturn:
+        name = type(self).__name__
+        article = "An" if name[0] in "AEIOU" else "A"
+        raise InputError(f"{article} {name} can be neither pickled nor copied, {self.instead}.")

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
-from cortado.device.staying import Staying
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
+from cortado.fixed import Staying
 from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
 from cortado.losses.loss import StepBar

@@ -13,12 +13,11 @@ import numpy as np
 
 from cortado.arrays import whole_number
 from cortado.calls import public
-from cortado.device.driver import device_named
-from cortado.device.kernel_cache import start_warp
 from cortado.device.lanes import checked_lanes
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.threads import WARP, Turn, in_turn
+from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.calibration import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
 from cortado.files.srgb import ShadedPicture

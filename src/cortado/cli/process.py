@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             work = _understood(program, arguments)
             logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
-            from cortado.device.kernel_cache import start_warp  # with Warp, once the command is understood
+            from cortado.device.warp_start import start_warp  # with Warp, once the command is understood
 
             start_warp()
             text = work()
@@ -78,7 +78,7 @@ def _say(error: BaseException | str, code: int) -> int:
 
 
 def _complaint(error: Exception) -> str | None:
-    from cortado.device.kernel_cache import complaint
+    from cortado.device.warp_start import complaint
 
     return complaint(error)
 

@@ -15,9 +15,8 @@ from weakref import WeakValueDictionary
 
 import warp as wp
 
-from cortado.device.cores import usable_cores
-from cortado.device.kernels import is_derivative
-from cortado.device.threads import MOST_CORES, helpers, in_parallel
+from cortado.device.modules import is_derivative
+from cortado.device.threads import MOST_CORES, helpers, in_parallel, usable_cores
 from cortado.files.terminal import note, timed_note
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()

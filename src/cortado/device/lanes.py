@@ -21,11 +21,11 @@ from cortado.errors import InputError, shown
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
 """Up to so many particles a GPU gets so many lanes for each; beyond them one. Measured on an H200."""
 _OF_MODULES: dict[str, int] = {}
-"""What LANES is in the kernels of a Warp module, by its name."""
+"""The value of LANES in the kernels of a Warp module, by its name."""
 
 
 def set_lanes(module: Any, lanes: int) -> None:
-    """Say what LANES is in the kernels of a Warp module."""
+    """Register the value of LANES in the kernels of a Warp module."""
     _OF_MODULES[module.name] = lanes
 
 
@@ -64,7 +64,7 @@ COUNTS = (1, 2, 4, 8, 16)
 
 
 def checked_lanes(lanes: Any) -> int | None:
-    """What a user gives as ``lanes``; raises `InputError`."""
+    """The argument ``lanes`` of a user, or None; raises `InputError` for a number of lanes that there cannot be."""
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
         wanted = ", ".join(map(str, COUNTS))
         raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")

@@ -1,8 +1,8 @@
-"""How much memory a computation will take, and how much is free: said before it is asked for.
+"""Estimates of the memory of a computation, and how much is free, for a sentence before it is allocated.
 
-What is counted: particles with their neighbour lists, wall particles, tables and records of every step, the frames that
-a report reads back, and in a renderer nodes, pixels and samples. The bytes of each were measured, and hold to a factor
-of about 1.5. Checkpoints are not counted, as a rollout keeps no more of them than there is room for.
+They count particles with their neighbour lists, wall particles, tables and records of every step, the frames that a
+report reads back, and in a renderer nodes, pixels and samples. The bytes of each were measured, and hold to a factor of
+about 1.5. Checkpoints are not counted, as a rollout keeps no more of them than there is room for.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from cortado.errors import InputError
 _PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
 """[bytes]"""
 _WEIGHING = 1600.0
-"""[bytes] of a wall particle while its weight is sought"""
+"""[bytes] of a wall particle while its weight is computed."""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
 """[numbers]"""
@@ -26,7 +26,7 @@ _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "m
 
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
-    """[bytes] of a scene that is cut into particles."""
+    """[bytes] of cutting a scene into particles."""
     of_walls = (_WALL + _WEIGHING) * walls
     return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": of_walls}
 
@@ -50,7 +50,7 @@ def frame_parts(frames: int, numbers: int, real: int) -> dict[str, float]:
 
 
 def gradient_parts(particles: int, iterations: int, real: int) -> dict[str, float]:
-    """[bytes] of a way back, with so many iterations of the pressure in a step."""
+    """[bytes] of a gradient, with so many iterations of the pressure in a step."""
     return {
         f"the gradient of {particles:.3g} particles": particles
         * real
@@ -81,7 +81,7 @@ def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None
 
 
 def shortage(parts: Mapping[str, float], device: Any = None) -> str:
-    """What is needed and what is free, in words; empty if it suffices."""
+    """The memory that is needed and that which is free, in words; empty if it suffices."""
     needed, free = sum(parts.values()), available(device)
     if needed <= free:
         return ""
@@ -91,7 +91,7 @@ def shortage(parts: Mapping[str, float], device: Any = None) -> str:
 
 
 def within(budget: float, device: Any = None) -> int:
-    """[bytes] of a budget for what can be computed again, at most half of what is free."""
+    """[bytes] of a budget for data that can be computed again: at most half of the free memory."""
     return int(min(budget, 0.5 * available(device)))
 
 

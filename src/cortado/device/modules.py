@@ -6,6 +6,7 @@ a fifth longer, one of PCISPH a twentieth, and both have the same bits. With LLV
 fifth longer than with 7.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -24,3 +25,30 @@ def kernel_module(name: str, backward: bool = False) -> Any:
     flags = wp.config.cpu_compiler_flags
     module.options["cpu_compiler_flags"] = flags and flags.replace(SHALLOW, f"{DEEP} {UNUSED}")
     return module
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A Warp kernel, or a Warp function, with its derivatives in both modes."""
+
+    forward: Any
+    tangent: Any
+    """Forward mode: from the tangents of the inputs, ``x_dot`` of an argument ``x``, to those of the outputs."""
+    adjoint: Any
+    """Reverse mode: from the adjoints of the outputs, adds to the adjoints of the inputs, ``x_bar``."""
+
+
+def kind_of(forward: bool, taped: bool) -> str:
+    """The part of the name of a Warp module that says which kernels it has: "forward", "taped" or "derivative".
+
+    Warp's own adjoint of forward kernels, which `gradients.Tape` needs, takes three times as long to compile as the
+    kernels: those that a tape can differentiate are others, in modules of their own.
+    """
+    if not forward:
+        return "derivative"
+    return "taped" if taped else "forward"
+
+
+def is_derivative(module: Any) -> bool:
+    """Whether the kernels of a Warp module are derivatives."""
+    return "_derivative_" in module.name or "_tangent_" in module.name

@@ -1,4 +1,4 @@
-"""The two floating-point precisions as objects: scalar, vector and NumPy types that belong together."""
+"""The two floating-point precisions: scalar, vector and NumPy types that belong together; roots and reciprocals."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -60,3 +60,56 @@ def precision_named(name: str) -> Precision:
         if isinstance(name, str) and precision.name == name:
             return precision
     raise InputError(f'precision is {shown(name)}, but must be "float32" or "float64".')
+
+
+@dataclass(frozen=True)
+class Arithmetic:
+    """Warp functions of a positive number that is neither subnormal nor infinite."""
+
+    root: Any
+    inverse_root: Any
+    reciprocal: Any
+
+
+@cache
+def arithmetic(precision: Precision, taped: bool) -> Arithmetic:
+    """The functions of a precision; a tape can differentiate ``taped`` ones, which round as IEEE 754 asks for."""
+    return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
+
+
+def _plain(precision: Precision) -> Arithmetic:
+    real = precision.real
+
+    @wp.func
+    def root(x: real) -> real:
+        return wp.sqrt(x)
+
+    @wp.func
+    def inverse_root(x: real) -> real:
+        return real(1.0) / wp.sqrt(x)
+
+    @wp.func
+    def reciprocal(x: real) -> real:
+        return real(1.0) / x
+
+    return Arithmetic(root, inverse_root, reciprocal)
+
+
+def _of_the_gpu() -> Arithmetic:
+    """For the CPU these are as the plain ones."""
+
+    def native(cuda: str, cpu: str) -> str:
+        return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
+
+    approximate = 'float y; asm("{}.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return {};'
+
+    @wp.func_native(native(approximate.format("rsqrt", "x * y"), "return sqrtf(x);"))
+    def root(x: wp.float32) -> wp.float32: ...
+
+    @wp.func_native(native(approximate.format("rsqrt", "y"), "return 1.0f / sqrtf(x);"))
+    def inverse_root(x: wp.float32) -> wp.float32: ...
+
+    @wp.func_native(native(approximate.format("rcp", "y"), "return 1.0f / x;"))
+    def reciprocal(x: wp.float32) -> wp.float32: ...
+
+    return Arithmetic(root, inverse_root, reciprocal)

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
@@ -36,7 +37,7 @@ class ReductionKernel:
 
 
 def type_name(dtype: Any) -> str:
-    """Of a number, vector or matrix type, to tell their modules apart."""
+    """The name of a number, vector or matrix type, for the name of a Warp module."""
     shape = getattr(dtype, "_shape_", ())
     return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
 
@@ -81,7 +82,7 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """The same with a block of threads for each t, which shares the values out among them. ``combine`` is an expression
+    """The kernel of `_of_threads`, with a block of threads in the place of each thread t. ``combine`` is an expression
     of C++ in a and b, of the type T."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
@@ -134,3 +135,41 @@ def add_kernel(dtype: Any) -> Any:
         total[i] = total[i] + value[i]
 
     return accumulate
+
+
+class TreeReduction:
+    """Adds one value of each particle on the device, scene by scene, in the same order every time."""
+
+    def __init__(self, level: ReductionKernel, dtype: Any, particles: int, device: Any, members: int = 1):
+        """``particles`` of each of ``members`` scenes."""
+        self._level, self._device, self._particles = level, device, particles
+        self._partials: list[tuple[int, wp.array]] = []
+        size = particles
+        while size > 1 or not self._partials:
+            size = -(-size // level.most)
+            self._partials.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
+
+    def __call__(self, values: wp.array) -> wp.array:
+        """The sums as an array (members,), which the next call overwrites."""
+        count, level, device = self._particles, self._level, self._device
+        for size, sums in self._partials:
+            arguments = {"count": count, "stride": size, "values": values, "partial": sums}
+            launch(level.kernel, len(sums) * level.threads, device, block=level.threads, **arguments)
+            count, values = size, sums
+        return values
+
+
+def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
+    """Sums of (members n,) numbers, vectors or matrices of a Warp type."""
+    return TreeReduction(sum_kernel(dtype, device.is_cpu), dtype, particles, device, members)
+
+
+def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
+    """Sums of first and maxima of second components of pairs (members n,)."""
+    level = sum_and_maximum_kernel(precision, device.is_cpu)
+    return TreeReduction(level, precision.pair, particles, device, members)
+
+
+def add(values: wp.array, total: wp.array) -> None:
+    """total += values, element by element."""
+    launch(add_kernel(values.dtype), len(values), values.device, value=values, total=total)

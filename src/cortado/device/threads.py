@@ -1,4 +1,4 @@
-"""Threads and processes: who may use Warp when, the threads that help with a launch, and what a fork leaves of both.
+"""Cores, threads and processes: how many cores launches use, who may use Warp when, and what a fork leaves of both.
 
 Warp keeps one state for a whole process: the graph that is being captured, the tape that is being recorded, the modules
 that are loaded. Two threads in there at a time spoil each other's results, so that Cortado lets them in one by one.
@@ -14,7 +14,23 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 from weakref import WeakSet
 
 from cortado.calls import told
-from cortado.errors import ComputationError
+from cortado.errors import ComputationError, InputError, shown
+
+CORES = "CORTADO_CORES"
+"""The environment variable that limits the number of cores, for processes that share a machine."""
+
+
+def usable_cores() -> int:
+    """The cores of this process where the system tells them, and those of the machine elsewhere; no more than the
+    environment variable CORTADO_CORES says. Raises `InputError` where that is no number of cores."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get(CORES, "").strip()
+    if not limit:
+        return there
+    if not limit.isdecimal() or int(limit) < 1:
+        raise InputError(f"The environment variable {CORES} is {shown(limit)}, but must be a number of cores.")
+    return min(int(limit), there)
+
 
 MOST_CORES = 16
 """Cores at most that a launch on a CPU uses."""
@@ -22,7 +38,7 @@ MOST_CORES = 16
 
 @cache
 def helpers() -> ThreadPoolExecutor:
-    """The threads that help the one that launches."""
+    """The threads that share the work of the one that launches."""
     return ThreadPoolExecutor(MOST_CORES - 1, thread_name_prefix="cortado")
 
 
@@ -50,53 +66,51 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
         helper.result()
 
 
-class _Entries(threading.local):
-    count = 0
+class WarpLock(ContextDecorator, threading.local):
+    """The lock that a thread holds while it uses Warp; a context or a decorator of functions. A thread may enter it
+    repeatedly."""
 
-
-class WarpTurn(ContextDecorator):
-    """What a thread holds while it uses Warp; a context or a decorator of functions. It may be entered repeatedly."""
-
-    def __init__(self) -> None:
-        self._lock, self._entries = threading.RLock(), _Entries()
+    _lock = threading.RLock()
+    _entries = 0
+    """Of this thread."""
 
     def __enter__(self) -> None:
-        if not self._entries.count:
+        if not self._entries:
             self._lock.acquire()
-        self._entries.count += 1
+        self._entries += 1
 
     def __exit__(self, *error: object) -> None:
-        self._entries.count -= 1
-        if self._entries.count <= 0:
+        self._entries -= 1
+        if self._entries <= 0:
             self._let_go()
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Let other threads in meanwhile: around what uses none of Warp's state, or waits for another thread."""
-        count = self._entries.count
-        if count:
+        """Release the lock meanwhile: around what uses none of Warp's state, or waits for another thread."""
+        entries = self._entries
+        if entries:
             self._let_go()
         try:
             yield
         finally:
-            if count:
+            if entries:
                 self._lock.acquire()
-                self._entries.count = count
+                self._entries = entries
 
     def _let_go(self) -> None:
-        self._entries.count = 0
+        self._entries = 0
         with suppress(RuntimeError):  # until it is not held: an interruption may have come right after it was taken
             while True:
                 self._lock.release()
 
 
-WARP = WarpTurn()
-"""The one of this process."""
+WARP = WarpLock()
+"""The lock of this process."""
 
 
 class Turn:
-    """What a thread holds while it uses a simulation: others wait for its end, but those with other simulations get in
-    where a captured graph is replayed.
+    """The lock that a thread holds while it uses a simulation. Other threads wait for it; those with other simulations
+    may use Warp where a captured graph is replayed.
 
     ``with simulation.turn:`` makes one piece of several calls.
     """
@@ -148,7 +162,7 @@ Self = TypeVar("Self", bound=_HasTurn)
 
 
 def in_turn(method: Callable[Concatenate[Self, P], R]) -> Callable[Concatenate[Self, P], R]:
-    """A method that holds the ``turn`` of its object from beginning to end, once its call fits it."""
+    """Make a method hold the lock ``turn`` of its object while it runs; the arguments of a call are checked before."""
 
     @wraps(method)
     def held(self: Self, *args: P.args, **options: P.kwargs) -> R:

@@ -28,18 +28,18 @@ _one_at_a_time = threading.RLock()
 
 @dataclass(frozen=True)
 class Payload:
-    """A function in transit."""
+    """A function on its way to a worker process."""
 
     digest: str
-    """A checksum of the content."""
+    """A checksum of the pickled function."""
     versions: str
-    """Of what decides about the bits of a result, where the function was pickled."""
+    """The `versions` of the process that pickled the function."""
     content: bytes | None
-    """Pickled; None where a worker should have it."""
+    """The pickled function; None where a worker should have it."""
 
     @classmethod
     def of(cls, function: Callable[[Any], Any]) -> "Payload":
-        """Raises `InputError` for a function that cannot be pickled."""
+        """Pickle a function; raises `InputError` where that is impossible."""
         content = pickled(function, "The function")
         return cls(sha256(content).hexdigest(), versions(), content)
 
@@ -51,18 +51,18 @@ class Payload:
 
 @dataclass(frozen=True)
 class Lacking:
-    """The answer of a worker that does not have a function which was only mentioned."""
+    """The answer of a worker that was sent no content and does not have the function."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a call came to in a worker process."""
+    """The result of a call in a worker process, or its error."""
 
     content: bytes = b""
-    """The result, pickled where it was made: what goes wrong with that is an error of the call."""
+    """The result, pickled in the worker, so that a result that cannot be pickled is an error of the call."""
     error: BaseException | None = None
     traceback: str = ""
-    """Of an error that is none of Cortado's own."""
+    """The traceback of an error that is none of Cortado's own."""
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
     """(text, category) of each warning."""
 
@@ -78,7 +78,8 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """A value pickled, with classes and functions of the main module themselves; raises `InputError`."""
+    """A value pickled, with the code of classes and functions of the main module; raises `InputError` where that is
+    impossible, in a sentence that begins with ``what``."""
     import cloudpickle
 
     try:
@@ -89,7 +90,7 @@ def pickled(value: Any, what: str) -> bytes:
 
 @cache
 def versions() -> str:
-    """Of what decides about the bits of a result, in words."""
+    """The versions that decide about the bits of a result, in words."""
     return f"Cortado {__version__}, Warp {metadata.version('warp-lang')} and NumPy {metadata.version('numpy')}"
 
 
@@ -106,7 +107,9 @@ def call(payload: Payload, item: bytes) -> Answer | Lacking:
         try:
             answer = Answer(pickled(_function(payload)(_unpickled(item)), "The result"))
         except Exception as error:
-            answer = Answer(error=_sendable(error), traceback="" if _is_ours(error) else traceback.format_exc())
+            answer = Answer(
+                error=_sendable(error), traceback="" if isinstance(error, CortadoError) else traceback.format_exc()
+            )
         except BaseException as error:  # sys.exit, or KeyboardInterrupt
             how = in_words(error)
             answer = Answer(
@@ -141,10 +144,6 @@ def _unpickled(content: bytes) -> Any:
             f"A worker cannot make what it was sent: {in_words(error)}; classes and functions that are sent must be in "
             "a module that every worker can import."
         ) from error
-
-
-def _is_ours(error: BaseException) -> bool:
-    return isinstance(error, CortadoError)
 
 
 def _sendable(error: Exception) -> BaseException:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 def started() -> None:
     """Start Warp, which modules of kernels need."""
-    from cortado.device.kernel_cache import start_warp
+    from cortado.device.warp_start import start_warp
 
     start_warp()
 
@@ -21,8 +21,7 @@ def _launchers() -> tuple[Any, Any]:
     started()
     import warp as wp
 
-    from cortado.device.bands import BandLauncher
-    from cortado.device.launching import launch
+    from cortado.device.launching import BandLauncher, launch
 
     cpu = wp.get_device("cpu")
     return partial(launch, device=cpu), BandLauncher(cpu)
@@ -34,7 +33,7 @@ def launched(kernel: Any, threads: int, **arguments: Any) -> None:
 
 
 def launched_in_bands(kernel: Any, threads: int, **arguments: Any) -> None:
-    """The same in bands (`cortado.device.bands`): no two threads of the kernel may write to one place."""
+    """The same in bands (`cortado.device.launching`): no two threads of the kernel may write to one place."""
     _perform(1, kernel, threads, arguments)
 
 

@@ -15,8 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.arithmetic import arithmetic
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import SEEN, Scenes
@@ -21,6 +20,7 @@ from cortado.environments.spaces import (
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError
+from cortado.fixed import Staying
 from cortado.runs.sensors.sensor import Sensor
 
 Observation = NDArray[np.float32]

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import whole_number
-from cortado.device.staying import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.fluid_env import Info, Observation
 from cortado.environments.gym import AutoresetMode, VectorEnv, batch_space, np_random
@@ -23,6 +22,7 @@ from cortado.environments.spaces import (
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, shown
+from cortado.fixed import Staying
 from cortado.runs.sensors.sensor import Sensor
 
 

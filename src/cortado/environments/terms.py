@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import add, launch, sum_of
+from cortado.device.launching import launch
+from cortado.device.reduction import add, sum_of
 from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.discretise.pairs import apart
 from cortado.environments.kernels import EnvironmentKernels, environment_kernels

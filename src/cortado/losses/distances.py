@@ -8,9 +8,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import read_only, require_methods
-from cortado.device.launching import TreeReduction, launch, sum_of
+from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
+from cortado.device.reduction import TreeReduction, sum_of
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.files.srgb import LIGHT, check_light

@@ -9,8 +9,8 @@ import numpy as np
 
 from cortado.arrays import is_whole
 from cortado.code_words import code_words
-from cortado.device.launching import add
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.device.reduction import add
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.particles.state import State

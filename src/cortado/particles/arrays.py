@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.device.staying import Staying
+from cortado.fixed import Staying
 from cortado.scene.parameters.known import argument
 
 

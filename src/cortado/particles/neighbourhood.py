@@ -6,11 +6,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.arithmetic import arithmetic
-from cortado.device.kernels import kind_of
 from cortado.device.lanes import set_lanes
-from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.modules import kernel_module, kind_of
+from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.particles.loads import loads

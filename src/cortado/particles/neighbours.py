@@ -14,11 +14,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, cell_functions, cell_grid_type
-from cortado.device.grid import Grid
-from cortado.device.host import HostCopy
+from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
-from cortado.device.launching import MOST_PARTS, KernelLauncher
+from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
 from cortado.errors import InputError
 from cortado.particles.candidates import scan_around
 from cortado.particles.images import image_kernel

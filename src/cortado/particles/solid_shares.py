@@ -23,10 +23,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.binding import Named
-from cortado.device.bundles import bundle
-from cortado.device.launching import add
+from cortado.device.launching import Named, bundle
 from cortado.device.precision import Precision
+from cortado.device.reduction import add
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.state import Layout

@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import TreeReduction, sum_of
 from cortado.device.precision import Precision
+from cortado.device.reduction import TreeReduction, sum_of
 from cortado.particles.arrays import Arrays, components, padded, zeros
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.known import REGISTRY, Known

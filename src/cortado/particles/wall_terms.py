@@ -15,8 +15,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.solid_shares import ALL_WALLS, WorkMaker, solid_kernel
 from cortado.particles.terms import Term

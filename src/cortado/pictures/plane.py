@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.device.cores import usable_cores
+from cortado.device.threads import usable_cores
 from cortado.discretise.pairs import wrapped
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids

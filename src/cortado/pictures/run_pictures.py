@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
 
 from cortado.arrays import whole_number
-from cortado.device.driver import device_named
-from cortado.device.kernel_cache import start_warp
+from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.shapes import Points, corners
 from cortado.errors import InputError, SceneError, shown
 from cortado.files.input_files import as_path

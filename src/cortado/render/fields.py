@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort
-from cortado.device.grid import Grid
-from cortado.device.launching import launch, sum_of
+from cortado.device.cells import CellSort, Grid
+from cortado.device.launching import launch
 from cortado.device.memory import field_parts, require
 from cortado.device.precision import Precision
+from cortado.device.reduction import sum_of
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import launch, sum_of
+from cortado.device.launching import launch
 from cortado.device.memory import field_parts, picture_parts, require, sample_parts
 from cortado.device.precision import Precision
+from cortado.device.reduction import sum_of
 from cortado.render.absorption import absorption_kernels, pose_type
 from cortado.render.calibration import ViewTangent
 from cortado.render.cameras import Camera

@@ -9,9 +9,9 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.calls import public
-from cortado.device.kernel_cache import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
+from cortado.device.warp_start import start_warp
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import sum_and_maximum
+from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import State
 from cortado.rollout.compression_kernels import compression_kernels
 from cortado.solvers.projection.steps import ProjectionSteps

@@ -14,11 +14,12 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
-from cortado.device.launching import CapturedGraph, add
+from cortado.device.launching import CapturedGraph
 from cortado.device.memory import require, step_parts, within
-from cortado.device.staying import Staying
+from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
+from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, checkpoint_interval
 from cortado.rollout.chunks import chunk_length

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import sum_and_maximum
+from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import Parameters, State
 from cortado.rollout.compressions import Compressions
 from cortado.rollout.retaking import Retaken

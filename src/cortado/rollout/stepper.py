@@ -9,9 +9,9 @@ import numpy as np
 import warp as wp
 
 from cortado.device.memory import require
-from cortado.device.staying import Staying
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError, shown, warn
+from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State
 from cortado.rollout.adjoint_step import AdjointStep
 from cortado.rollout.device_rows import DeviceRows

@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.sph.free_functions import free_module
 

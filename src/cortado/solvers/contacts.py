@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.binding import Named
-from cortado.device.launching import sum_of
+from cortado.device.launching import Named
+from cortado.device.reduction import sum_of
 from cortado.particles.arrays import padded
 from cortado.particles.solid_shares import WHOLE
 from cortado.particles.state import Layout

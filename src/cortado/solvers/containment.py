@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.host import HostCopy
-from cortado.device.launching import KernelLauncher
+from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE, Region
 from cortado.discretise.shapes import Points

@@ -5,7 +5,7 @@ A solver that measures more of the same neighbours at once has a subclass of its
 
 from functools import partial
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.sph.density import density_kernels, density_solid_kernel
 from cortado.sph.parts import Adjoints, StepContext, Tangents

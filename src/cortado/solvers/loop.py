@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.host import HostCopy
-from cortado.device.launching import KernelLauncher, sum_and_maximum
+from cortado.device.launching import HostCopy, KernelLauncher
+from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import Layout
 from cortado.solvers.containment import Containment
 from cortado.solvers.convergence import AVERAGE, UNKNOWN, Measure, convergence_kernels

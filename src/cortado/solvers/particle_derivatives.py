@@ -4,7 +4,7 @@ from weakref import finalize
 
 import warp as wp
 
-from cortado.device.launching import add
+from cortado.device.reduction import add
 from cortado.particles.arrays import Fields
 from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Parameters, State

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
-from cortado.device.staying import Staying
 from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
+from cortado.fixed import Staying
 from cortado.particles.arrays import Fields
 from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type

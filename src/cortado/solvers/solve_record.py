@@ -5,8 +5,7 @@ from typing import Protocol
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.host import HostCopy
-from cortado.device.launching import KernelLauncher
+from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.particles.state import Layout
 from cortado.solvers.convergence import convergence_kernels
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.formula import Formula
 from cortado.sph.formula_kernels import applied, change_along, work_of

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping
 
 import warp as wp
 
-from cortado.device.kernels import kind_of
-from cortado.device.modules import kernel_module
+from cortado.device.modules import kernel_module, kind_of
 from cortado.device.reduction import type_name
 from cortado.particles.fields import StateField
 from cortado.particles.state import Layout, State

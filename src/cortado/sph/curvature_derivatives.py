@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import bundle
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.curvature_functions import curvature_functions
 from cortado.sph.curvature_sums import curvature_sums

@@ -26,8 +26,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.curvature_derivatives import curvature_adjoints, curvature_tangents

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.device.silence import c_stderr_to
+from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
 from cortado.sph.frozen import Frozen
 from cortado.sph.function_source import definition

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
+from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of

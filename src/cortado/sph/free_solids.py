@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from cortado.device.binding import Named
+from cortado.device.launching import Named
 from cortado.discretise.solids.mass import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField

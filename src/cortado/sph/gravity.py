@@ -4,9 +4,9 @@ from functools import cache, cached_property
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
-from cortado.device.launching import TreeReduction
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
+from cortado.device.reduction import TreeReduction
 from cortado.particles.state import Layout
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents

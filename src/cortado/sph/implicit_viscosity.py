@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import add
+from cortado.device.reduction import add
 from cortado.errors import MissingDerivativeError
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene

@@ -6,8 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.kernels import kind_of
-from cortado.device.modules import kernel_module
+from cortado.device.modules import kernel_module, kind_of
 from cortado.device.precision import Precision
 
 

@@ -13,8 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.kernels import Kernels, kind_of
-from cortado.device.modules import kernel_module
+from cortado.device.modules import Kernels, kernel_module, kind_of
 from cortado.device.precision import Precision
 from cortado.sph.order import OrderKernels, order_kernels
 

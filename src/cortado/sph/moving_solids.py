@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
+from cortado.device.launching import bundle
 from cortado.device.precision import Precision
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import read_only
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.particles.neighbourhood import Discretisation

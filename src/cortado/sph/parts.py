@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.device.binding import Named
-from cortado.device.launching import KernelLauncher, add
+from cortado.device.launching import KernelLauncher, Named
+from cortado.device.reduction import add
 from cortado.discretise.walls.layers import WallLayers
 from cortado.particles.arrays import Arrays, Fields, zeros
 from cortado.particles.neighbourhood import Discretisation

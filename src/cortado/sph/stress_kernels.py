@@ -28,9 +28,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.solid_shares import solid_kernel
 from cortado.sph.packed import theta_of

@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import bundle
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import theta_of

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.device.binding import Named
+from cortado.device.launching import Named
 from cortado.particles.solid_shares import WorkMaker
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.moment_functions import matrix_type

@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import fluid_sum

@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.binding import Named
-from cortado.device.launching import add
+from cortado.device.launching import Named
+from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
 from cortado.scene.parameters.parameter import Parameter
 from cortado.sph.formula import compiled

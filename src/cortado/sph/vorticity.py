@@ -12,8 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum

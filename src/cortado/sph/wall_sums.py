@@ -5,7 +5,7 @@ from typing import Protocol
 
 import warp as wp
 
-from cortado.device.binding import Named
+from cortado.device.launching import Named
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.parts import Adjoints, StepContext, Tangents

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.device.cores import usable_cores
+from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points, block_about
 from cortado.discretise.solids.solid import Solid, Which
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.bands import BandLauncher
-from cortado.device.cores import usable_cores
-from cortado.device.threads import WARP
+from cortado.device.launching import BandLauncher
+from cortado.device.threads import WARP, usable_cores
 from cortado.discretise.shapes import Points
 from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface, sized_level

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.pictures.tracing.near_particles import MODULE, NearParticles, bump_at, marked, sum_near
 
 WIDTH = wp.constant(4)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.bands import BandLauncher
-from cortado.device.cores import usable_cores
+from cortado.device.launching import BandLauncher
+from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
 from cortado.pictures.tracing.level_blocks import level_blocks

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.device.launching import launch as launch_once
 from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points

@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.pictures.tracing.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 from cortado.pictures.tracing.near_particles import MODULE, NearParticles, count_near
 

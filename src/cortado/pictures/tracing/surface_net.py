@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.pictures.tracing.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_of, level_at, node_of, place_of
 from cortado.pictures.tracing.near_particles import MODULE, last_of
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.bands import BandLauncher
+from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.stage import Stage

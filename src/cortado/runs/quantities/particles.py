@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.binding import Named
+from cortado.device.launching import Named
 from cortado.particles.arrays import Fields
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import Adjoints, StepContext

@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
+from cortado.device.launching import bundle
 from cortado.particles.neighbourhood import Discretisation
 from cortado.sph.integration import new_state_adjoint
 

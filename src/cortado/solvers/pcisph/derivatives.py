@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.binding import Named
-from cortado.device.launching import add
+from cortado.device.launching import Named
+from cortado.device.reduction import add
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.solvers.pcisph.begin_adjoint import begin_adjoint_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import DensityRatioKernels, density_ratio_kernels

@@ -16,9 +16,9 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share

@@ -16,8 +16,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.wall_slope import wall_slope_sums
 

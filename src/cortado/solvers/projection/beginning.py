@@ -17,8 +17,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.solvers.projection.effects import weights_type
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.binding import Named
-from cortado.device.launching import add
+from cortado.device.launching import Named
+from cortado.device.reduction import add
 from cortado.particles.arrays import zeros
 from cortado.particles.state import Layout
 from cortado.scene.motions import density_name

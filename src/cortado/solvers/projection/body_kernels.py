@@ -20,9 +20,9 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.solvers.projection.beside import normal_part

@@ -6,8 +6,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
 from cortado.sph.free_functions import free_module, rate_function

@@ -13,7 +13,7 @@ with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the p
 import numpy as np
 import warp as wp
 
-from cortado.device.binding import Named
+from cortado.device.launching import Named
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_body_kernels import coarse_body_kernels

@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
 from cortado.device.cells import cell_grid_type
+from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.solvers.projection.coarse_hats import hat_functions, node_functions

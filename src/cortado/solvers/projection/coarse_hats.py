@@ -10,8 +10,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
 from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.launching import bundle
 from cortado.device.precision import Precision
 
 ALONE = 0.01

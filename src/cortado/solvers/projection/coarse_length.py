@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
+from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 

@@ -21,9 +21,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.binding import Named
-from cortado.device.bundles import bundle
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import Named, bundle
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Parameters, State
 from cortado.solvers.projection.clamp import clamp_functions

@@ -18,9 +18,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.binding import Named
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.launching import Named
+from cortado.device.modules import Kernels
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum

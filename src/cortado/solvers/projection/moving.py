@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.sph.integration import integration_module
 

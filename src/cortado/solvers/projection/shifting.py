@@ -20,8 +20,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.bundles import bundle
-from cortado.device.kernels import Kernels
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
 from cortado.solvers.projection.effects import effect_functions, weights_type

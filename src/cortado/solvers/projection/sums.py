@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.arithmetic import arithmetic
+from cortado.device.precision import arithmetic
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum

@@ -5,8 +5,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import matrix_type
