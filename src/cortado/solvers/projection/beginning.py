@@ -111,10 +111,8 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         kick_before: wp.array(dtype=vector),
         weights: wp.array(dtype=weights4),
         beside: wp.array(dtype=vector),
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        u_bar: wp.array(dtype=vector),
         surfaced: wp.array(dtype=int),
+        bar: bundle(k=real, y=real, u=vector),
         # in and out
         weights_bar: wp.array(dtype=weights4),
         v_bar: wp.array(dtype=vector),
@@ -125,13 +123,13 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         """``v_bar`` is the adjoint of v*."""
         i = wp.tid()
         part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
-        bar, full, no = k_bar[i] + y_bar[i], part * weights[i][1], real(0.0)
-        k_before_bar[i] = full * bar
-        kick_before_bar[i] = full * u_bar[i]
-        full_bar = part * (k_before[i] * bar + wp.dot(kick_before[i], u_bar[i]))
+        y_bar, full, no = bar.k[i] + bar.y[i], part * weights[i][1], real(0.0)
+        k_before_bar[i] = full * y_bar
+        kick_before_bar[i] = full * bar.u[i]
+        full_bar = part * (k_before[i] * y_bar + wp.dot(kick_before[i], bar.u[i]))
         weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
         if surfaced[i // particles] == 0:
             weights_bar[i][0] = no
-        v_bar[i] = v_bar[i] + u_bar[i]
+        v_bar[i] = v_bar[i] + bar.u[i]
 
     return Kernels(begin, begin_tangent, begin_adjoint)
