@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.launching import Bundles, bound, bundles_of
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import TreeReduction, add, sum_and_maximum, sum_of

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.cells import CellSort, Grid
+from cortado.device.cells import CellSort
+from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.memory import field_parts, require
 from cortado.device.precision import Precision

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solids.mass import Mass

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
 

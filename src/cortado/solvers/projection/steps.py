@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.cells import Grid
+from cortado.device.grid import Grid
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
