@@ -13,12 +13,9 @@ import warp as wp
 import cortado
 from cortado import DivergedError, InputError, Problem, Simulation, gradients, losses
 from cortado.certificate import Consistency, certify
-from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.consistency import balanced
-from cortado.certificate.growth import growth
-from cortado.certificate.horizon import Horizon
-from cortado.certificate.loss_history import LossHistory
-from cortado.certificate.twin import in_float64
+from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
+from cortado.certificate.loss_history import LossHistory, in_float64
 from cortado.forward_pass import ProblemForwardPass
 from cortado.pictures.run_plots import gradient_check
 from cortado.render.scene_renderer import scene_renderer
@@ -100,7 +97,7 @@ def test_beyond_the_horizon_another_estimator_is_advised():
 
 
 def test_averages_are_tried_where_no_single_run_is_good(monkeypatch):
-    monkeypatch.setattr("cortado.certificate.alignment.GOOD_COSINE", 2.0)
+    monkeypatch.setattr("cortado.certificate.horizon.GOOD_COSINE", 2.0)
     problem = problem_of(plane(), 20)
     found = certify(problem)
     names = [judged.estimator for judged in found.alignment.estimators]

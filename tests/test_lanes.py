@@ -14,7 +14,7 @@ from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.errors import InputError
-from cortado.gradients.filter_kernels import adjoint_filter_kernels
+from cortado.gradients.adjoint_filters import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import fill_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels

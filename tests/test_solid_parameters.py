@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cortado import Problem, Scene, Simulation, certify
-from cortado.certificate.perturbations import coherent_directions, scales
+from cortado.certificate.horizon import coherent_directions, scales
 from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass

@@ -1,8 +1,10 @@
 """The certificate of a problem's gradients: are they right, up to which step are they useful, what to use beyond."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from html import escape
+from io import StringIO
+from math import log10
 from os import PathLike
 from typing import Any
 
@@ -10,27 +12,28 @@ import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
 from cortado.calls import public
-from cortado.certificate.alignment import Alignment, alignment
 from cortado.certificate.consistency import Consistency, balanced, check_consistency
-from cortado.certificate.growth import growth
-from cortado.certificate.horizon import Horizon, horizon
-from cortado.certificate.loss_history import LossHistory
-from cortado.certificate.perturbations import (
+from cortado.certificate.horizon import (
     PERTURBATION,
+    Alignment,
+    Horizon,
+    alignment,
     checked_parameters,
     coherent_directions,
     directions,
     everything,
+    growth,
+    horizon,
     scales,
 )
-from cortado.certificate.shorter import first_rows, up_to
-from cortado.certificate.text import beyond_words, consistency_words, gradient_table, horizon_table, parameter_table
-from cortado.certificate.twin import in_float64
+from cortado.certificate.loss_history import LossHistory, first_rows, in_float64, up_to
 from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointNorms
-from cortado.gradients.points import NO_RUN
+from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
+from cortado.runs.run_environment import as_json
+from cortado.runs.run_files import finite
 from cortado.scene.parameters.parameter import Range, Role
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.scene import Scene
@@ -81,21 +84,36 @@ class Certificate:
     def __str__(self) -> str:
         """As tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
-        tried = {one.parameter for one in self.horizons if one.lasts}
-        lines = [size, parameter_table(self.loss_changes, self.wrong, tried)]
+        lines = [size, _table(["parameter", "slope times a perturbation", "adjoint"], self._changes())]
         if not self.right:
             return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}.", *self.beyond])
+        ends = []
+        for one in self.horizons:
+            predicted = "later" if one.predicted is None else f"step {one.predicted}"
+            ends.append((one.parameter, predicted, f"step {one.measured}" + (", the last" if one.lasts else "")))
         lines += [
             f"The adjoint is right: {consistency_words(self.consistency, self.beside)}.",
             f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
-            horizon_table(self.horizons),
-            *([] if self.alignment is None else [gradient_table(self.alignment)]),
+            _table(["parameter", "predicted horizon", "measured horizon"], ends),
+        ]
+        if self.alignment is not None:
+            rows = [(one.estimator, f"{one.cosine:.3f}", f"{one.size:.3g}") for one in self.alignment.estimators]
+            error = f"to the gradient of the smoothed loss, whose own error is {self.alignment.noise:.0%}"
+            lines += [_table(["estimator", "cosine", "size"], rows), error]
+        lines += [
             f"Up to step {self.horizon} of {self.steps}, {self.horizon * self.time_step:.4g} of "
             f"{self.steps * self.time_step:.4g} s, the exact gradient is useful. For {self.steps} steps use "
             f"gradients.{self.estimator}{self._spread}.",
             *self.beyond,
         ]
         return "\n".join(lines)
+
+    def _changes(self) -> Iterator[tuple[str, str, str]]:
+        """Of each parameter by how much it changes the loss, extrapolated unless its horizon lasts, and the verdict."""
+        tried = {one.parameter for one in self.horizons if one.lasts}
+        for name, share in self.loss_changes.items():
+            verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
+            yield name, f"{share:.3e}" + (", extrapolated" if share and name not in tried else ""), verdict
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
@@ -136,7 +154,7 @@ class Certificate:
         for one, made in zip(self.horizons, found["horizons"], strict=True):
             made |= {"measured": one.measured, "predicted": one.predicted}
         found |= {"right": self.right, "horizon": self.horizon, "estimator": self.estimator}
-        return _plain(found)
+        return finite(as_json(found))
 
 
 @public
@@ -288,12 +306,43 @@ def _beside(
     return check_consistency(LossHistory(problem), moved, gradient, balanced(gradient, along)), problem.steps
 
 
-def _plain(found: Any) -> Any:
-    """With arrays as lists, and None for what is not finite."""
-    if isinstance(found, dict):
-        return {name: _plain(value) for name, value in found.items()}
-    if isinstance(found, (list, tuple, np.ndarray)):
-        return [_plain(value) for value in found]
-    if isinstance(found, (float, np.floating)):
-        return float(found) if np.isfinite(found) else None
-    return found.item() if isinstance(found, np.generic) else found
+WIDTH = 110
+"""Characters of a table at most."""
+
+
+def beyond_words(horizon: Horizon) -> str | None:
+    """Up to which step there is an answer; None where it is the last one."""
+    if horizon.reached == horizon.sample_steps[-1]:
+        return None
+    moved = f"a run that the perturbation of {horizon.parameter} moves"
+    if horizon.reached == 0:
+        return f"Of {horizon.parameter} there is no horizon: {moved} cannot begin, or loses a particle at once."
+    return f"Beyond step {horizon.reached} there is no answer for {horizon.parameter}: {moved} loses a particle."
+
+
+def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
+    """To how many digits reverse mode, forward mode and central differences agree, and whether that is on a corner."""
+    digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
+    if c.miss is None:
+        return f"{digits}, no difference is reliable here"
+    slopes = f"on a corner of the loss: slopes of both sides differ by {100.0 * c.corner[c.converged][-1]:.2g} %"
+    if beside is not None:
+        return f"{digits}, {slopes}; beside it, {consistency_words(beside)}"
+    found = f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}"
+    return f"{found} ({slopes})" if c.is_on_a_corner else found
+
+
+def _digits(distance: float) -> str:
+    return f"{min(max(-log10(distance), 0.0), 16.0):.0f}" if distance > 0.0 else "16"
+
+
+def _table(columns: list[str], rows: Iterable[tuple[str, ...]]) -> str:
+    from rich.console import Console
+    from rich.table import Table
+
+    table: Any = Table(*columns)
+    for row in rows:
+        table.add_row(*row)
+    text = StringIO()
+    Console(file=text, width=WIDTH, force_jupyter=False).print(table)  # a notebook would show it elsewhere
+    return text.getvalue().rstrip()

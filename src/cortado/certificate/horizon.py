@@ -1,12 +1,141 @@
-"""The horizon: the number of steps up to which the exact gradient predicts what a meaningful perturbation does."""
+"""Up to how many steps the exact gradient is useful, for meaningful perturbations, and which gradients are beyond."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from cortado.certificate.loss_history import LossHistory
-from cortado.scene.parameters.values import Arrays
+from cortado.errors import InputError, shown
+from cortado.gradients import AdjointViscosity, EnsembleMean, Exact, GradientEstimator, Guided, RandomizedSmoothing
+from cortado.gradients.estimator import NO_RUN
+from cortado.problem import Problem
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
+from cortado.scene.parameters.values import Arrays, Values
 from cortado.words import ShortRepr
+
+PERTURBATION = 0.05
+"""Size of a meaningful perturbation, relative to that of the parameter or, for states, of the flow (`scales`)."""
+
+
+def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
+    """The values of parameters, given as values or as names of the scene's."""
+    simulation = problem.simulation
+    if problem.state is not None:
+        raise InputError(
+            "problem begins at a state, but must begin as its scene does to be certified, as first positions and "
+            "velocities are moved, too."
+        )
+    values = ParameterSpace(simulation, problem.steps).defaults()
+    for view, other in simulation.known.views.items():
+        parameter = simulation.known[view]
+        led = other == "gravity" and simulation.scene.schedule.leads_gravity
+        if parameter.present(simulation.scene) and not led:
+            values[view] = parameter.value(simulation)
+    if not isinstance(parameters, (Mapping, Sequence)) or isinstance(parameters, (str, bytes)):
+        raise InputError(f"parameters is {shown(parameters)}, but must be values by name, or a list of names.")
+    known = ", ".join(values)
+    if isinstance(parameters, Mapping):
+        values = dict(parameters)
+    unknown = [name for name in parameters if not isinstance(name, str) or name not in values]
+    if unknown:
+        raise InputError(f"parameter {shown(unknown[0])} is unknown, but must be one of {known}.")
+    if not parameters:
+        raise InputError(f"parameters is empty, but must have at least one of {known}.")
+    found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
+    for name, value in found.items():
+        if not _moves_both_ways(simulation.known[name], value):
+            raise InputError(f"parameter {name} is 0, but must be greater than 0, so that it can be moved both ways.")
+    return found
+
+
+def everything(problem: Problem, chosen: Arrays) -> Arrays:
+    """Every parameter of the problem that acts and that can be both increased and decreased, with its values.
+
+    Values are the chosen ones, else the scene's, as its schedule has them; parameters over time have a row for each
+    step. A viscosity of 0 cannot be decreased and is left out; so is a mobility in a scene of one phase, where it does
+    nothing.
+    """
+    values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
+    found = {}
+    for name, value in values.items():
+        parameter = problem.simulation.known[name]
+        over_time = parameter.axis is Axis.STEP
+        idle = over_time and problem.steps == 0
+        idle = idle or any(view in chosen and name == other for view, other in problem.simulation.known.views.items())
+        idle = idle or not _moves_both_ways(parameter, value)
+        if idle or not parameter.acts(problem.simulation, values):
+            continue
+        row = value.shape[value.ndim - parameter.rank :]
+        found[name] = np.broadcast_to(value, (problem.steps, *row)).copy() if over_time else value
+    return found
+
+
+def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
+    """Whether no number of a parameter is at the end of its range."""
+    return parameter.range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
+
+
+def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
+    """The size of a meaningful perturbation of every number of these parameters, in their shapes and units.
+
+    It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
+    """
+    known = problem.simulation.known
+    return {
+        name: np.broadcast_to(perturbation * known[name].change(problem.simulation, value), value.shape)
+        for name, value in values.items()
+    }
+
+
+def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
+    """For every parameter a random direction of the given size; one that is a single number is increased."""
+    return {
+        name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
+        for name, value in values.items()
+    }
+
+
+def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
+    """Random directions that are smooth in space and constant in time, which move the fluid as a whole; of a path that
+    begins at 0 they grow in time.
+
+    An independent random number for each particle would only move particles against their neighbours.
+    """
+    x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
+    x = x / (np.abs(x).max() or 1.0)
+    found = directions(values, sizes, random)
+    for name in found:
+        parameter = problem.simulation.known[name]
+        if parameter.axis not in (Axis.STEP, Axis.PARTICLE):
+            continue
+        columns = values[name].shape[values[name].ndim - parameter.rank :]
+        field = random.standard_normal(columns)
+        if parameter.role is Role.STATE:
+            field = field + x @ random.standard_normal((x.shape[1], *columns))
+        if parameter.grows and values[name].ndim > parameter.rank:
+            field = np.multiply.outer(np.arange(1.0, problem.steps + 1.0) / problem.steps, field)
+        found[name] = sizes[name] * field
+    return found
+
+
+def growth(norms: np.ndarray, time_step: float) -> float:
+    """Growth of an adjoint from the last state to the first, in e-folds: of a line fitted to the logarithm of its norm.
+
+    The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^ grows linearly,
+    it hardly grows.
+    """
+    steps = len(norms) - 1
+    total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
+    there = np.flatnonzero(total > 0.0)
+    if len(there) < 3:
+        return 0.0
+    if not np.isfinite(total).all():
+        return np.inf
+    return float(np.polyfit(there, np.log(total[there]), 1)[0] * (there[-1] - there[0]))
+
 
 WITHIN = 0.25
 """The exact derivative counts as useful where its relative distance from the finite difference is at most this."""
@@ -65,3 +194,89 @@ def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.nd
     tangent = history.tangent(values, along)
     difference = history.difference(values, along, 1.0)
     return Horizon(name, history.sample_steps, tangent.slopes, difference, tangent.strain / spacing)
+
+
+MOST_NUMBERS = 12
+"""Components that a smoothed gradient is computed for at most: each costs two runs a sample."""
+SAMPLES = 2
+LEAST_COSINE = 0.5
+"""An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
+GOOD_COSINE = 0.95
+"""Where no estimator of one run has this cosine, averages over an ensemble are tried, which cost some ten times as
+much."""
+ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
+"""Of one run."""
+AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
+    "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
+    "Guided(spread)": lambda spread: Guided(spread, seed=1),
+}
+"""The best ones of the table in `docs/gradients.md`, with other random numbers than the smoothed gradient."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
+
+    estimator: str
+    """As it is written in Python, after ``gradients.``"""
+    cosine: float
+    size: float
+    """Its norm over that of the smoothed gradient."""
+
+    @property
+    def merit(self) -> float:
+        """The cosine over how many times too large or too small the gradient is; 1 is perfect."""
+        return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How well the gradients of several estimators are aligned with the smoothed one."""
+
+    noise: float
+    """Standard error of the smoothed gradient, relative."""
+    estimators: tuple[Judged, ...]
+    """`Exact` comes first."""
+    spread: Mapping[str, float] = field(default_factory=dict)
+    """By parameter, of the smoothed gradient and of averages."""
+
+    @property
+    def best(self) -> Judged | None:
+        """The estimator other than `Exact` that has the greatest merit; None where no cosine is large enough."""
+        good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
+        return max(good, key=lambda judged: judged.merit, default=None)
+
+
+def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
+    """The alignment for all these parameters together.
+
+    None where they have too many components for a smoothed gradient, where it has no run, and where the loss
+    does not depend on them.
+    """
+    if sum(value.size for value in values.values()) > MOST_NUMBERS:
+        return None
+    spread = {name: float(size.mean()) for name, size in sizes.items()}
+    try:
+        smoothed = RandomizedSmoothing(spread, SAMPLES).estimate(problem, values)
+    except NO_RUN:
+        return None
+
+    def numbers(gradient: Arrays) -> np.ndarray:
+        return np.concatenate([spread[name] * gradient[name].ravel() for name in values])
+
+    reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
+    length = float(np.linalg.norm(reference))
+
+    def judged(name: str, estimator: GradientEstimator) -> Judged:
+        gradient = numbers(exact if estimator == Exact() else problem.estimate(values, estimator).gradient)
+        size = float(np.linalg.norm(gradient))
+        cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
+        return Judged(name, cosine, size / length)
+
+    if not length > 0.0:
+        return None
+    found = [judged(f"{type(estimator).__name__}()", estimator) for estimator in ESTIMATORS]
+    if max(one.cosine for one in found) < GOOD_COSINE:
+        with suppress(*NO_RUN):
+            found += [judged(name, make(spread)) for name, make in AVERAGES.items()]
+    return Alignment(float(np.linalg.norm(error)) / length, tuple(found), spread)

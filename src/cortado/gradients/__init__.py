@@ -10,7 +10,7 @@ runs alone, is the reference that they are compared with.
 from cortado.arrays import require_function, require_methods
 from cortado.calls import face
 from cortado.gradients.adjoint_filters import AdjointNorms
-from cortado.gradients.ensemble import EnsembleMean, RandomizedSmoothing
+from cortado.gradients.ensembles import EnsembleMean, Guided, RandomizedSmoothing
 from cortado.gradients.estimator import (
     AdjointEstimator,
     Differentiable,
@@ -21,10 +21,7 @@ from cortado.gradients.estimator import (
     checked_estimate,
     checked_estimator,
 )
-from cortado.gradients.exact import Exact, Tape
-from cortado.gradients.filters import AdjointViscosity
-from cortado.gradients.guided import Guided
-from cortado.gradients.implicit import ImplicitPressure
+from cortado.gradients.reverse_mode import AdjointViscosity, Exact, ImplicitPressure, Tape
 from cortado.rollout.rollout import OBSERVED, Observer
 from cortado.scene.parameters.values import Values
 

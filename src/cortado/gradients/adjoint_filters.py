@@ -1,11 +1,163 @@
-"""Filters that act on the adjoint of a state between two backward steps, and the norms of adjoints."""
+"""Filters of the adjoint of a state between two backward steps, an eddy viscosity and a limit; norms of adjoints."""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.gradients.filter_kernels import adjoint_filter_kernels
+from cortado.device.lanes import lane_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Parameters, State
 from cortado.solvers.solver import Solver
+
+STRONGEST = 0.6
+"""Strength s of the viscosity at most: waves of two spacings are damped by a factor, and do not change their sign."""
+
+
+@cache
+def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
+    """The kernels of `AdjointViscosity`, which has their formulas, by name. Adjoints are in the scene's order, and
+    ``sort`` sorts them for ``viscosity``, which needs ``crowd`` and ``strength`` before it. Owing to the division by S
+    it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it where
+    particles hardly touch."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    weight, per_size = pair.weight, pair.per_size
+    LANES = discretisation.lanes
+    lane = lane_functions(discretisation.precision, LANES).lane
+    module = discretisation.module(False, "adjoint_filters")
+    strongest = wp.constant(real(STRONGEST))
+
+    @fluid_sum(discretisation)
+    def weights(x_ij: vector, s: neighbourhood) -> real:
+        return weight(x_ij, s)
+
+    @fluid_sum(discretisation)
+    def strain(x_ij: vector, v_ij: vector, most_i: real, most_j: real, s: neighbourhood) -> real:
+        """gamma_i^2"""
+        return weight(x_ij, s) / wp.max(most_i, most_j) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
+
+    @fluid_sum(discretisation)
+    def exchange(
+        x_ij: vector,
+        most_i: real,
+        most_j: real,
+        strengths_i: real,
+        strengths_j: real,
+        a_ij: vector,
+        b_ij: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector]:
+        share = wp.max(strengths_i, strengths_j) * (weight(x_ij, s) / wp.max(most_i, most_j))
+        return share * a_ij, share * b_ij
+
+    @wp.kernel(module=module, enable_backward=False)
+    def crowd(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        # out
+        most: wp.array(dtype=real),
+    ):
+        """max(S_i, W(h / 2))"""
+        i = s.first + wp.tid() // LANES
+        total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
+        if lane() > 0:
+            return
+        most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def strength(
+        s: neighbourhood,
+        coefficient: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        most: wp.array(dtype=real),
+        # out
+        strengths: wp.array(dtype=real),
+    ):
+        """s_i, of sorted particles as all arguments"""
+        i = s.first + wp.tid() // LANES
+        total = strain(i, x, v, most, s)
+        if lane() > 0:
+            return
+        strengths[i] = wp.min(coefficient * time_step[i // s.particles] * wp.sqrt(total), strongest)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sort(
+        order: wp.array(dtype=wp.int32),
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+        # out
+        a_sorted: wp.array(dtype=vector),
+        b_sorted: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        a_sorted[i] = a[order[i]]
+        b_sorted[i] = b[order[i]]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def viscosity(
+        s: neighbourhood,
+        order: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vector),
+        most: wp.array(dtype=real),
+        strengths: wp.array(dtype=real),
+        a_sorted: wp.array(dtype=vector),
+        b_sorted: wp.array(dtype=vector),
+        # out
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+    ):
+        """Two fields of an adjoint at once, which are written in the scene's order."""
+        i = s.first + wp.tid() // LANES
+        a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
+        if lane() > 0:
+            return
+        a[order[i]] = a_sorted[i] - a_total
+        b[order[i]] = b_sorted[i] - b_total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def squares(
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+        # out
+        found: wp.array(dtype=wp.vec2d),
+    ):
+        """|a_i|^2 and |b_i|^2, in float64: adjoints grow beyond what a square in float32 may be."""
+        i = wp.tid()
+        a_i = wp.vec3d(a[i])
+        b_i = wp.vec3d(b[i])
+        found[i] = wp.vec2d(wp.dot(a_i, a_i), wp.dot(b_i, b_i))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def limit(
+        times: wp.float64,
+        particles: int,
+        squares: wp.array(dtype=wp.vec2d),
+        sums: wp.array(dtype=wp.vec2d),
+        strengths: wp.array(dtype=real),
+        # in and out
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+    ):
+        """``squares`` of every particle, of a and of b; their ``sums`` over each scene, and that of all strengths of
+        the viscosity: a flow without strain is not limited."""
+        i = wp.tid()
+        if strengths[i // particles] == real(0.0):
+            return
+        most = (times * times / wp.float64(particles)) * sums[i // particles]
+        own = squares[i]
+        if own[0] > most[0]:
+            a[i] = real(wp.sqrt(most[0] / own[0])) * a[i]
+        if own[1] > most[1]:
+            b[i] = real(wp.sqrt(most[1] / own[1])) * b[i]
+
+    return SimpleNamespace(crowd=crowd, strength=strength, sort=sort, viscosity=viscosity, limit=limit, squares=squares)
 
 
 class EddyViscosity:

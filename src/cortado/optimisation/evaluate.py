@@ -9,8 +9,7 @@ from cortado.calls import public
 from cortado.errors import InputError, shown, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
-from cortado.gradients.estimator import Differentiable, checked_estimator
-from cortado.gradients.points import FalliblePoint, evaluated, without_runs
+from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_estimator, evaluated, without_runs
 from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
@@ -50,7 +49,7 @@ def evaluate(
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
     loss = np.nan if loss_if_diverged is None else loss_if_diverged
-    made = (FalliblePoint(_by_name(values), estimator, loss) for values in points)
+    made = (Point(_by_name(values), estimator, loss, NO_RUN) for values in points)
     found = evaluated(problem, made, chosen, on_result=on_result)
     lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
     if lost and loss_if_diverged is None:

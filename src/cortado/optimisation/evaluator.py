@@ -1,6 +1,7 @@
 """A problem as the function of one vector that an optimiser sees, which replays the log of a former run."""
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,12 +11,14 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import InProcess
-from cortado.gradients.left_out import Tally
-from cortado.gradients.points import FalliblePoint, evaluated
+from cortado.gradients.ensembles import Ensemble, LeftOutWarning
+from cortado.gradients.estimator import Differentiable, Estimate, Point, evaluated
 from cortado.optimisation.differentiable import Optimisable, loss_and_gradient
 from cortado.optimisation.promises import Promises
 from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
 from cortado.optimisation.result import Parameters, Record
+from cortado.rollout.rollout import Observer
+from cortado.scene.parameters.values import Values
 
 GREATEST_GRADIENT = 1e150
 """Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow."""
@@ -23,6 +26,25 @@ FEW = 6
 """Numbers of all parameters that a sentence names at most."""
 REFUSED = (DivergedError, InputError)
 """A trial with one of these is infinitely bad: the start had none, so the search has gone too far."""
+
+
+@dataclass
+class CountedEnsemble:
+    """An `Ensemble` that a search asks for one gradient after another: it counts the runs that averages leave out, and
+    warns the first time alone."""
+
+    ensemble: Any
+    left_out: int = 0
+    """Runs, over all estimates."""
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """The estimate of the ensemble."""
+        with warnings.catch_warnings():
+            if self.left_out:
+                warnings.simplefilter("ignore", LeftOutWarning)
+            found = self.ensemble.estimate(problem, parameters, observe)
+        self.left_out += found.left_out
+        return found
 
 
 @dataclass
@@ -45,10 +67,14 @@ class Evaluator:
     logged: int = 0
     """Entries of the log that this run has come to: evaluations, and losses that were tried."""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.estimator, Ensemble):
+            self.estimator = CountedEnsemble(self.estimator)
+
     @property
     def left_out(self) -> int:
         """Runs that averages over ensembles have left out, of the evaluations that were not replayed."""
-        return self.estimator.left_out if isinstance(self.estimator, Tally) else 0
+        return self.estimator.left_out if isinstance(self.estimator, CountedEnsemble) else 0
 
     def count_update(self) -> None:
         """Called by the optimiser after each update."""
@@ -115,7 +141,7 @@ class Evaluator:
         points, problem = [self.layout.unravel(vector) for vector in left], self.problem
         if callable(getattr(problem, "value", None)):
             made: Any = problem
-            trials = [FalliblePoint(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
+            trials = [Point(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
             evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
         else:
             for point in points:

@@ -16,7 +16,6 @@ from cortado.arrays import require_function, require_truth
 from cortado.calls import public
 from cortado.errors import InputError
 from cortado.files.input_files import as_path
-from cortado.gradients.left_out import tallied
 from cortado.optimisation.differentiable import LossFunction, Optimisable, as_differentiable
 from cortado.optimisation.evaluator import Evaluator, as_given
 from cortado.optimisation.named_optimisers import as_optimiser
@@ -88,7 +87,7 @@ def optimise(
         "problem": str(getattr(differentiable, "fingerprint", "")),
     }
     with closing(_open_log(checkpoint, resume, layout, identity)) as log:
-        evaluator = Evaluator(differentiable, tallied(gradient), layout, start, log, on_iteration)
+        evaluator = Evaluator(differentiable, gradient, layout, start, log, on_iteration)
         search = Search(
             evaluate=evaluator,
             attempt=evaluator.attempt,

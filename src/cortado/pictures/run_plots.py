@@ -84,8 +84,7 @@ def beside_measured(found: Mapping[str, Readings], measured: Sequence[Measured],
 
 if TYPE_CHECKING:
     from cortado.certificate import Certificate
-    from cortado.certificate.alignment import Alignment
-    from cortado.certificate.horizon import Horizon
+    from cortado.certificate.horizon import Alignment, Horizon
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:

@@ -1,18 +1,133 @@
-"""Estimators that filter the adjoint between two backward steps of another estimator."""
+"""Estimators that go back through a run step by step: exact, by a tape, with implicit pressures, or filtered."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from cortado.arrays import is_whole
 from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import EddyViscosity, Limit
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
-from cortado.gradients.exact import Exact
-from cortado.particles.state import State
+from cortado.particles.state import Parameters, State
+from cortado.rollout.adjoint_step import AdjointStep, ResumingStep
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.scene.fields import as_number
 from cortado.scene.parameters.values import Values
+from cortado.solvers.solver import Counts
+
+
+@dataclass(frozen=True)
+class Exact(AdjointEstimator):
+    """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
+
+    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories diverge it grows as
+    fast as they do, by a constant factor a step. Cost: every step is computed once more forward, and the backward step
+    has about twice the neighbour sums of a forward one.
+    """
+
+    batches = True
+
+    def derivative(self, rollout: Rollout) -> BackwardStep:
+        return AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
+
+
+@dataclass(frozen=True)
+class Tape(AdjointEstimator):
+    """The exact adjoint by Warp's own automatic differentiation of the forward kernels.
+
+    It is slower than `Exact`, with atomics on a GPU, and is kept to check it. Only for scenes with the solver
+    ``"pcisph"``; others say so.
+    """
+
+    batches = True
+
+    def derivative(self, rollout: Rollout) -> BackwardStep:
+        return _TapeStep(rollout)
+
+
+class _TapeStep:
+    capturable = False
+
+    def __init__(self, rollout: Rollout):
+        solver = rollout.solver
+        self.rollout, self._given, self._parameters = rollout, solver, rollout.parameters
+        self.solver = solver.differentiable()
+        self._before = self.solver.new_state(requires_grad=True)
+        self._after = self._before.following()
+        self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
+
+    def begin(self) -> None:
+        self.solver.match(self._given)
+        self._own.assign(self._parameters)
+        for array in self._own.arrays():
+            array.grad.zero_()
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._before.assign(state)
+        self.solver.follow(self._given)
+        wp.copy(self._own["time_step"], self._parameters["time_step"])  # of this step, where it is chosen
+        tape = wp.Tape()
+        try:
+            self._back(tape, counts, bar)
+        finally:
+            self._forget(tape)
+
+    def _back(self, tape: wp.Tape, counts: Counts, bar: State) -> None:
+        with tape:
+            self.solver.replay(self._before, self._own, counts)
+            self.solver.write_state(counts, self._own, self._after)
+        tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
+        for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
+            wp.copy(total, own.grad)
+
+    def _forget(self, tape: Any) -> None:
+        """Zero every adjoint but those of the parameters, which add up over the steps."""
+        kept = {own.ptr for own in self._own.arrays()}
+        for array, gradient in tape.gradients.items():
+            if isinstance(array, wp.array) and array.ptr not in kept:
+                gradient.zero_()
+
+    def parameters(self) -> Parameters:
+        return self._own.gradients()
+
+
+@dataclass(frozen=True)
+class ImplicitPressure(AdjointEstimator):
+    """The adjoint of the projection with its pressure as a fixed point, instead of iteration by iteration.
+
+    Formula: an iteration k' = Phi(k, u) of the pressure k from the inputs u, velocities and positions, has the fixed
+    point k = Phi(k, u), and so the adjoint u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
+
+    Bias: none at the fixed point. After a few iterations the pressure is not there yet, and the gradient is that of a
+    fluid with the same pressure that would be. The first guess of a step, the pressure of the last, has no adjoint. The
+    gradient with respect to the rest density of a single phase, which the pressure cancels, is of no use then.
+    Cost: it does not depend on the iterations of the solver, neither the memory nor the work.
+
+    Only for scenes with the solver ``"projection"``. Source: implicit differentiation of fixed points (Christianson
+    1994, Optimization Methods and Software 3).
+    """
+
+    tolerance: float = 0.1
+    """The solve ends where its residual has fallen to this part of the first, in the norm of its diagonal; at least 0,
+    where `iterations` are done in any case."""
+    iterations: int = 100
+    """At most, for each step."""
+
+    batches = True
+
+    def __post_init__(self) -> None:
+        tolerance = as_number(self.tolerance)
+        if tolerance is None or not 0.0 <= tolerance < 1.0:
+            raise InputError(f"tolerance is {shown(self.tolerance)}, but must be a number from 0 to below 1.")
+        if not is_whole(self.iterations) or self.iterations < 1:
+            raise InputError(f"iterations is {shown(self.iterations)}, but must be a whole number of at least 1.")
+
+    def derivative(self, rollout: Rollout) -> BackwardStep:
+        own = rollout.steps, float(self.tolerance), int(self.iterations)
+        return ResumingStep(rollout, rollout.solver.implicit_adjoint(*own))
+
 
 EXACT = Exact()
 

@@ -1,0 +1,433 @@
+"""Estimators over an ensemble of parameters and first states: means of differences, of gradients, and of both."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cortado.arrays import as_numbers, is_whole, require_at_most, require_whole
+from cortado.device.memory import require
+from cortado.device.precision import Precision
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, OutOfRangeError, shown, warn
+from cortado.executors import Executor, InProcess, checked_executor
+from cortado.fixed import keep_own
+from cortado.gradients.estimator import (
+    Differentiable,
+    Estimate,
+    GradientEstimator,
+    Point,
+    Sample,
+    checked_estimate,
+    checked_estimator,
+    evaluated,
+    without_runs,
+)
+from cortado.gradients.reverse_mode import AdjointViscosity
+from cortado.rollout.rollout import Observer
+from cortado.scene.fields import as_number
+from cortado.scene.parameters.values import Arrays, Values
+
+MOST_SAMPLES = 100_000
+"""Samples of an ensemble; more are taken for a mistake."""
+_RUN = 1000.0
+"""[bytes] of what is kept of a run besides numbers."""
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """An ensemble around the parameters that an estimator is asked about: its width, and how many samples are drawn.
+
+    The parameters, N numbers in all, are drawn from a ball of radius sqrt(N), in units of their spreads; to every
+    coordinate of the first positions a normal random number is added. Samples come in antithetic pairs, and are the
+    same at every call.
+    """
+
+    spread: float | Mapping[str, float] = 0.5
+    """Width of the ensemble in each parameter, in its units, one for all or by name. It is sqrt((N + 2) / N) times the
+    standard deviation of a component."""
+    samples: int = 8
+    """At most 100,000; all their results are kept until they are averaged, for which there has to be memory."""
+    position_noise: float = 0.01
+    """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
+    seed: int = 0
+    executor: Executor = field(default=InProcess(), compare=False, repr=False, kw_only=True)
+    """Where the members of the ensemble are computed, which changes no bit of the result."""
+
+    def __post_init__(self) -> None:
+        if not is_whole(self.samples) or self.samples < 2:
+            raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
+        require_at_most("samples", self.samples, MOST_SAMPLES)
+        position_noise = as_number(self.position_noise)
+        if position_noise is None or position_noise < 0.0:
+            raise InputError(
+                f"position_noise is {shown(self.position_noise)}, but must be a number of at least 0, in spacings."
+            )
+        require_whole("seed", self.seed, 0)
+        for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
+            _checked_spread(name, spread)
+        checked_executor(self.executor)
+        keep_own(self, "spread")
+
+    def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
+        """The ensemble around these parameters of a problem; another ``draw`` has other samples, independent of these.
+        Raises `InputError` for a batch, for no parameters, and for spreads that round-off swallows."""
+        if problem.simulation.batch is not None:
+            raise InputError(
+                f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
+                "samples it runs in batches of its own."
+            )
+        if not parameters:
+            raise InputError(f"parameters is empty, but must name what {type(self).__name__} is to vary.")
+        values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
+        widths = {name: self._spread(name) for name in values}
+        for name, value in values.items():
+            _check_resolved(name, value, widths[name], problem.simulation.precision)
+        spreads = np.concatenate([np.full(value.size, widths[name]) for name, value in values.items()])
+        start = problem.simulation.positions
+        position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
+        return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
+
+    def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
+        """Estimates at points, in their order. Where ``observe`` is given they are computed in this process, which has
+        the states that it is called with."""
+        executor = self.executor if observe is None else InProcess()
+        return evaluated(problem, points, executor, observe)
+
+    def require_memory(self, runs: int, numbers: int) -> None:
+        """Raises `InputError` unless there is memory for what so many runs leave, so many numbers each."""
+        require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
+
+    def _spread(self, name: str) -> float:
+        if isinstance(self.spread, Mapping) and name not in self.spread:
+            raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
+        return _checked_spread(name, self.spread[name] if isinstance(self.spread, Mapping) else self.spread)
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """An ensemble around the parameters of a problem, from which samples are drawn."""
+
+    values: Arrays
+    spreads: np.ndarray
+    """(numbers,) the spread of every component of the values, as one vector."""
+    start: np.ndarray
+    """(n, d) first positions of the simulation [m]"""
+    position_noise: float
+    """[m]"""
+    random: np.random.Generator
+
+    def rotation(self) -> np.ndarray:
+        """(numbers, numbers) rows of a random orthonormal basis, uniform over all of them."""
+        q, r = np.linalg.qr(self.random.standard_normal((len(self.spreads), len(self.spreads))))
+        return (q * np.sign(np.diag(r))).T
+
+    def offset(self) -> np.ndarray:
+        """(numbers,) uniform in the ball, in spreads."""
+        direction, numbers = self.random.standard_normal(len(self.spreads)), len(self.spreads)
+        radius = np.sqrt(numbers) * self.random.random() ** (1.0 / numbers)
+        return radius / np.linalg.norm(direction) * direction
+
+    def displacement(self) -> np.ndarray:
+        """(n, d) a random displacement of the first positions [m]"""
+        return self.position_noise * self.random.standard_normal(self.start.shape)
+
+    def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Sample:
+        """The parameters moved by ``u`` (numbers,), in spreads, and displaced first positions."""
+        values = _moved(self.values, self.spreads * u)
+        if self.position_noise:
+            values["initial_positions"] = values.get("initial_positions", self.start) + displacement
+        return Sample(values, estimator)
+
+    def named(self, numbers: np.ndarray) -> Arrays:
+        """One vector of numbers (numbers,) as arrays by the parameters' names."""
+        return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
+
+
+def _checked_spread(name: str, spread: object) -> float:
+    number = as_number(spread)
+    if number is None or number <= 0.0:
+        raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
+    return number
+
+
+def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:
+    """Raises `InputError` where a spread is lost in round-off, so that all samples would be the same."""
+    lost = np.asarray(value, precision.numpy) == np.asarray(value + spread, precision.numpy)
+    if lost.any():
+        wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
+        raise InputError(f"spread of {name} is {spread:g}, but must be {wanted}.")
+
+
+def _moved(values: Arrays, change: np.ndarray) -> Arrays:
+    """Values plus a change (numbers,), which is one vector for all of them."""
+    ends = np.cumsum([value.size for value in values.values()])
+    parts = np.split(change, ends[:-1])
+    return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
+
+
+MOST_LEFT_OUT = 0.25
+"""Share of what is averaged that may be left out; with more the average would be that of another ensemble."""
+ADVICE = "take a smaller spread, or a logarithm (cortado.optimisation.transforms)"
+
+
+class LeftOutWarning(CortadoWarning):
+    """An average is one over fewer runs than were asked for."""
+
+
+def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
+    """(members,) whether each member of an ensemble can be averaged, given the runs of one member after the other.
+    Where one of them diverged its member is left out: the others are as symmetric about the parameters as before.
+
+    ``what``: the members in words, in the plural. Warns of those that are left out; where they are more than a quarter
+    of all, it raises the error of the first run that diverged.
+    """
+    errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
+    lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
+    kept = np.array([not any(member) for member in lost], dtype=bool)
+    out = int(np.count_nonzero(~kept))
+    if not out:
+        return kept
+    present = [error for error in errors if error is not None]
+    said = f"{without_runs(present, f'{lost.size} runs of the ensemble')}, by which {out} of {len(kept)} {what}"
+    if out > MOST_LEFT_OUT * len(kept):
+        preface = f"{said} cannot be averaged, but at most a quarter may be left out: {ADVICE}. The first:"
+        if isinstance(present[0], DivergedError):
+            raise present[0].among_others(preface)
+        raise OutOfRangeError(f"{preface} {present[0]}")
+    warn(f"{said} are left out of the average. The first: {present[0]}", LeftOutWarning)
+    return kept
+
+
+SMOOTHING, SURROGATE = AdjointViscosity(order=2), AdjointViscosity()
+MOST_NUMBERS = 64
+"""Components that differences are taken along at most: each costs two runs a sample."""
+
+
+@dataclass(frozen=True)
+class RandomizedSmoothing(Ensemble):
+    """Central differences, averaged over an ensemble of parameters and first states: the reference for long runs.
+
+    Formula: for parameters u of N numbers, each in units of its spread h,
+
+        g = mean over samples of sum_k (L(u + r q_k) - L(u - r q_k)) / (2 r) q_k,   r = sqrt(N),
+
+    with q_1 ... q_N an orthonormal basis, rotated at random in every sample, and first positions perturbed, in the same
+    way on both sides of a difference. It is the gradient of the loss averaged over the ball of an `Ensemble`, of radius
+    h sqrt(N) (randomised smoothing, in antithetic and orthogonal directions).
+
+    Bias: features of the loss that are narrower than the spread are averaged out, as intended. Noise: the
+    ``standard_error`` of the `Estimate`. Cost: 2 N forward runs a sample, so that it is for a few dozen numbers at
+    most.
+
+    Runs that diverge: their differences are left out, up to a quarter of all, and the sum over the others of the sample
+    is scaled by N over their number. So the mean keeps its size, and has no bias from this as long as no direction
+    diverges more often than others.
+    """
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is not called, as there are no adjoints."""
+        ensemble = self.around(problem, parameters)
+        numbers = len(ensemble.spreads)
+        if numbers > MOST_NUMBERS:
+            raise InputError(
+                f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
+                "is run twice for each: take fewer, such as one gravity for all steps, or another estimator."
+            )
+        self.require_memory(2 * numbers * self.samples, numbers)
+        directions, r = [], np.sqrt(numbers)
+
+        def points() -> Iterator[Point]:
+            yield Point(ensemble.values)
+            for _ in range(self.samples):
+                for q in ensemble.rotation():
+                    displacement = ensemble.displacement()
+                    directions.append(q)
+                    yield ensemble.sample(r * q, displacement)
+                    yield ensemble.sample(-r * q, displacement)
+
+        at_them, *runs = self.evaluated(problem, points(), None)
+        kept = remaining(runs, len(directions), "differences")
+        found = np.zeros((self.samples, numbers))
+        for k in np.flatnonzero(kept):
+            found[k // numbers] += (runs[2 * k].loss - runs[2 * k + 1].loss) / (2.0 * r) * directions[k]
+        counts = kept.reshape(self.samples, numbers).sum(axis=1)
+        found = found[counts > 0] * (numbers / counts[counts > 0, None])
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
+        left_out = 2 * int(np.count_nonzero(~kept))
+        return Estimate(at_them.loss, gradient, error, len(found) - 1, left_out)
+
+
+@dataclass(frozen=True)
+class EnsembleMean(Ensemble):
+    """The mean of another estimator's gradients over an ensemble of parameters and first states.
+
+    Formula: g = mean over points of the ensemble of the estimator's gradient there. It is the gradient of the loss that
+    `RandomizedSmoothing` differentiates, as far as the estimator is right, and its cost does not depend on the number
+    of parameters. The mean of `Exact` gradients of long runs is useless, as the largest few of them dominate it.
+
+    Bias: that of the estimator; and where the loss is as small as the effect of the perturbed first positions, that
+    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` times that of the estimator, and a
+    forward run.
+
+    Samples that diverge: they are left out with the other one of their antithetic pair, up to a quarter of all pairs,
+    so that what remains is as symmetric about the parameters as before; half a pair would shift the mean to its side.
+    """
+
+    samples: int = 4
+    """An even number, as samples are drawn in antithetic pairs."""
+    estimator: GradientEstimator = SMOOTHING
+    """The estimator whose gradients are averaged."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_pairs(self.samples)
+        checked_estimator(self.estimator)
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is called with the adjoints of one sample after the other."""
+        ensemble = self.around(problem, parameters)
+        displaced = ensemble.start.size if self.position_noise else 0
+        self.require_memory(self.samples, 2 * len(ensemble.spreads) + displaced)
+
+        def points() -> Iterator[Point]:
+            yield Point(ensemble.values)
+            for _ in range(self.samples // 2):
+                u, displacement = ensemble.offset(), ensemble.displacement()
+                yield ensemble.sample(u, displacement, self.estimator)
+                yield ensemble.sample(-u, -displacement, self.estimator)
+
+        at_them, *samples = self.evaluated(problem, points(), observe)
+        kept = np.repeat(remaining(samples, self.samples // 2, "antithetic pairs"), 2)
+        checked = [checked_estimate(samples[k], ensemble.values) for k in np.flatnonzero(kept)]
+        numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
+        gradient, error = (ensemble.named(one) for one in self.combined(numbers))
+        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, len(samples) - len(checked))
+
+    def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The average (numbers,) of the gradients of the samples (samples, numbers), and its standard error: that of
+        the means of antithetic pairs, which follow each other."""
+        return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
+
+
+def require_pairs(samples: int) -> None:
+    """Raises `InputError` unless there are two antithetic pairs of samples or more, to know how they scatter."""
+    if samples % 2 or samples < 4:
+        raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
+
+
+def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of the rows and its standard error, also of numbers whose squares overflow; no number where one is
+    infinite."""
+    size = np.abs(samples).max(initial=0.0)
+    unit = size if 0.0 < size < np.inf else 1.0
+    with np.errstate(invalid="ignore"):
+        return samples.mean(axis=0), unit * (samples / unit).std(axis=0, ddof=1) / np.sqrt(len(samples))
+
+
+def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
+    """The gradient with respect to these parameters as one vector."""
+    return np.concatenate([gradient[name].ravel() for name in names])
+
+
+@dataclass(frozen=True)
+class Guided(Ensemble):
+    """The mean of a surrogate's gradients over an ensemble, each of its parts scaled by differences of the loss.
+
+    Formula: in units of the spreads, the mean of the surrogate's gradients is cut along the first axis of each
+    parameter, the steps or knots, into equal parts: p_1 ... p_K are their directions, of length 1, and
+
+        g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
+
+    where N_k is how many numbers of part k are not 0; first positions are perturbed in the same way on both sides. So g
+    is the projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan
+    et al. 2019, without their search outside of the span).
+
+    Bias: what the surrogate does not point at is missed; but sizes, over time too, are those of the smoothed loss.
+    Noise: the ``standard_error`` of the `Estimate` is that of the D_k and of the directions p_k together, with degrees
+    of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences``
+    forward runs, however many numbers a parameter has.
+
+    Runs that diverge: as in `EnsembleMean` for the surrogate's; a sample of the differences is left out as a whole, up
+    to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left out.
+    """
+
+    samples: int = 4
+    """Gradients of the surrogate, an even number."""
+    parts: int = 4
+    """Of each parameter; fewer where it has fewer rows, and one for a vector or a number."""
+    differences: int = 2
+    """Samples of each difference."""
+    surrogate: GradientEstimator = SURROGATE
+    """The estimator whose gradients give the directions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_pairs(self.samples)
+        require_whole("parts", self.parts, 1)
+        require_whole("differences", self.differences, 2)
+        for name in ("parts", "differences"):
+            require_at_most(name, getattr(self, name), MOST_SAMPLES)
+        checked_estimator(self.surrogate)
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is called with the adjoints of the surrogate's samples."""
+        ensemble = self.around(problem, parameters, draw=1)
+        surrogate = EnsembleMean(
+            self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
+        ).estimate(problem, parameters, observe)
+        assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
+        parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
+        self.require_memory(2 * self.differences * len(parts), 0)
+        reach = [np.sqrt(np.count_nonzero(part)) for part in parts]
+
+        def points() -> Iterator[Point]:
+            for _ in range(self.differences):
+                displacement = ensemble.displacement()
+                for r, part in zip(reach, parts, strict=True):
+                    yield ensemble.sample(r * part, displacement)
+                    yield ensemble.sample(-r * part, displacement)
+
+        runs = self.evaluated(problem, points(), None)
+        kept = remaining(runs, self.differences, "samples of the differences")
+        pairs = np.array([one.loss for one in runs]).reshape(self.differences, len(parts), 2)[kept]
+        slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
+        sizes, size_errors = mean_and_error(slopes)
+        along, across = (np.reshape(rows, (-1, len(ensemble.spreads))) for rows in (parts, turns))
+        errors = np.array([size_errors @ np.abs(along), np.abs(sizes) @ across])
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))
+        freedom = _freedom(errors, (len(pairs) - 1, surrogate.degrees_of_freedom))
+        left_out = surrogate.left_out + len(runs) // self.differences * int(np.count_nonzero(~kept))
+        return Estimate(surrogate.loss, gradient, error, freedom, left_out)
+
+    def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; and its
+        standard error. Parts without a gradient are left out."""
+        places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
+        firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
+        places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
+        whole, errors = (ensemble.spreads * joined(one, ensemble.values) for one in (gradient, error))
+        greatest = np.abs(whole).max()
+        if not np.isfinite(greatest):
+            raise ComputationError(
+                f"The gradient of {self.surrogate!r} is not finite, so that Guided has no direction; take another "
+                "surrogate, or fewer steps."
+            )
+        whole, errors = (one / (greatest or 1.0) for one in (whole, errors))  # so that no square overflows
+        lengths = {k: np.linalg.norm(whole[places == k]) for k in np.unique(places)}
+        parts, turns = (
+            [np.where(places == k, one, 0.0) / length for k, length in lengths.items() if length]
+            for one in (whole, errors)
+        )
+        return parts, turns
+
+
+def _places(value: np.ndarray, parts: int) -> np.ndarray:
+    """(size,) for each number of a parameter, the part that its row belongs to; 0 for a vector and a number."""
+    rows = len(value) if value.ndim > 1 else 1
+    return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
+
+
+def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
+    """Degrees of freedom of the sum of two errors (2, numbers) that have their own (Welch 1947)."""
+    shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
+    return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))
