@@ -20,7 +20,7 @@ from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
-from cortado.runs.frame_choice import EverySteps, FramesPerSecond
+from cortado.runs.recording import EverySteps, FramesPerSecond
 from cortado.scene.stability import stability_limit, stability_limits
 from scenes import jet, plane, two_layers
 

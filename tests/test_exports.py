@@ -16,7 +16,7 @@ from cortado.pictures.exports.exported import Exported, WholeFrames
 from cortado.pictures.exports.formats import FORMATS
 from cortado.pictures.labels import Scale
 from cortado.pictures.shown_run import ShownRun
-from cortado.runs.marks import Marks
+from cortado.runs.frame_file import Marks
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict

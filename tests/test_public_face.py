@@ -108,6 +108,6 @@ def test_types_are_checked_where_cortado_is_used(tmp_path):
         shutil.copytree(ROOT / ".mypy_cache", tmp_path / ".mypy_cache")
     command = [sys.executable, "-m", "mypy", f"--config-file={ROOT / 'pyproject.toml'}", "use.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    assert 'Revealed type is "cortado.runs.frame.Frame"' in found
+    assert 'Revealed type is "cortado.runs.trajectory.Frame"' in found
     assert 'Revealed type is "cortado.runs.trajectory.Trajectory"' in found
     assert '"Simulation" has incompatible type "int"' in found

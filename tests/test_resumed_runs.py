@@ -9,7 +9,7 @@ import pytest
 import cortado.cli.commands.run_recording as run_recording
 from bad_scenes import assert_one_sentence
 from cortado import InputError, Simulation, Trajectory, load_scene
-from cortado.runs.marks import Marks
+from cortado.runs.frame_file import Marks
 
 SCENE = """
 name = "gauged dam"

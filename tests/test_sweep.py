@@ -25,8 +25,7 @@ from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
 from cortado.optimisation.sweep.combinations import combinations
 from cortado.optimisation.sweep.table import write_table
-from cortado.runs.sensors.log import Readings, from_csv
-from cortado.runs.sensors.summary import summary
+from cortado.runs.sensors.readings import Readings, from_csv, summary
 from cortado.runs.trajectory import Trajectory
 from dask_processes import PATIENCE, scheduler
 

@@ -51,7 +51,7 @@ class Entry:
 
         from cortado.cli.commands.picture import draw_runs
         from cortado.cli.commands.run import RunRequest, run_scene
-        from cortado.runs.frame_choice import FramesPerSecond
+        from cortado.runs.recording import FramesPerSecond
         from cortado.runs.trajectory import Trajectory
 
         frames = FramesPerSecond((FRAMES - 1) / self.seconds)

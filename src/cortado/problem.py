@@ -24,7 +24,7 @@ from cortado.rollout.residual import Residual
 from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import Moment, row_of
-from cortado.runs.sensors.places import warn_of_places
+from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.trajectory import noted
 from cortado.scene.parameters.values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState

@@ -34,13 +34,12 @@ from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.stepping import Stepping
-from cortado.runs.frame import Frame
 from cortado.runs.pace import Film
 from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
-from cortado.runs.recorded import recorded
+from cortado.runs.recording import recorded
 from cortado.runs.sensors.sensor import Sensor
-from cortado.runs.trajectory import Trajectory
+from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.distance import check_distance
 from cortado.scene.parameters.values import OVER_TIME, scene_values

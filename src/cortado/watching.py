@@ -14,17 +14,15 @@ from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.stepper import Steppable
 from cortado.runs.quantities.evaluator import QuantityEvaluator
-from cortado.runs.quantities.moment import Moment
-from cortado.runs.quantities.recorder import Recorder
-from cortado.runs.sensors.log import Readings, SensorLog
-from cortado.runs.sensors.of_scene import sensors_of
-from cortado.runs.sensors.places import warn_of_places
+from cortado.runs.quantities.moment import Moment, Recorder
+from cortado.runs.sensors.placement import sensors_of, warn_of_places
+from cortado.runs.sensors.readings import Readings, SensorLog
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameters.values import Arrays
 
 
-class Measured(Steppable, Protocol):
-    """A simulation as its quantities see it."""
+class Watched(Steppable, Protocol):
+    """A simulation as `Watch` sees it."""
 
     @property
     def walls(self) -> NDArray:
@@ -46,7 +44,7 @@ class Watch:
 
     def __init__(
         self,
-        simulation: Measured,
+        simulation: Watched,
         rollout: Rollout,
         record: Iterable[str] = (),
         sensors: Mapping[str, Sensor] | None = None,

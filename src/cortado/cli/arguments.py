@@ -13,7 +13,7 @@ from cortado.errors import InputError
 from cortado.scene.toml import read_toml
 
 if TYPE_CHECKING:
-    from cortado.runs.frame_choice import FrameChoice
+    from cortado.runs.recording import FrameChoice
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -63,7 +63,7 @@ class FrameOptions:
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
         """Those of options that were checked: every so many steps if nothing is said."""
-        from cortado.runs.frame_choice import EverySteps, FramesPerSecond
+        from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
 

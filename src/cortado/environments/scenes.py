@@ -18,7 +18,7 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.stepper import Stepper
-from cortado.runs.sensors.places import warn_of_places
+from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.simulation import Simulation

@@ -10,7 +10,7 @@ from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import Scenes
 from cortado.errors import InputError, shown
 from cortado.files.srgb import to_srgb
-from cortado.runs.frame import Frame
+from cortado.runs.trajectory import Frame
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
 WIDTH, HEIGHT = 320, 200

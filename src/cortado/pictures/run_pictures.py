@@ -24,10 +24,9 @@ from cortado.pictures.plane import PlaneStage
 from cortado.pictures.report import Figures
 from cortado.pictures.shown_run import ShownRun, coloured_by
 from cortado.pictures.stage import Stage
-from cortado.runs.frame import Frame
-from cortado.runs.marks import common_rate
+from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Film, pace_of
-from cortado.runs.trajectory import Trajectory
+from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.camera_paths import CameraPath
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.picture import Picture

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
-from cortado.runs.sensors.log import Readings
-from cortado.runs.sensors.measured import Measured
+from cortado.runs.sensors.readings import MeasuredColumn, Readings
 from cortado.runs.trajectory import Trajectory
 
 
@@ -66,7 +65,7 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
     return Path(path)
 
 
-def beside_measured(found: Mapping[str, Readings], measured: Sequence[Measured], path: str | Path) -> Path:
+def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
     """A panel for each number that was measured: its points, the curve of the sensor, and the error in the title."""
     with drawing(path, height=1.5 + 2.5 * len(measured)) as figure:
         panels = figure.subplots(len(measured), 1, sharex=True, squeeze=False)[:, 0]

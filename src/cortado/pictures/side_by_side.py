@@ -21,7 +21,7 @@ from cortado.pictures.film import MOST, Around, Page, Panel, film, framed_togeth
 from cortado.pictures.labels import Scale, labelled, side_by_side
 from cortado.pictures.run_pictures import device_of, shown_as
 from cortado.pictures.shown_run import ShownRun, coloured_by
-from cortado.runs.marks import common_rate
+from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Film, pace_of
 from cortado.runs.run_files import computed
 from cortado.runs.trajectory import Trajectory

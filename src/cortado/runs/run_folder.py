@@ -12,10 +12,21 @@ from typing import Any, Self
 
 from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
-from cortado.runs.mesh_marks import mesh_marks, require_meshes
-from cortado.runs.run_environment import as_json, plain, require_same, session
-from cortado.runs.run_files import bytes_of, computed, cut_torn_line, finite, in_present_words, read_json
-from cortado.runs.sensors.log import Readings, as_csv, from_csv
+from cortado.runs.run_files import (
+    as_json,
+    bytes_of,
+    computed,
+    cut_torn_line,
+    finite,
+    in_present_words,
+    mesh_marks,
+    plain,
+    read_json,
+    require_meshes,
+    require_same,
+    session,
+)
+from cortado.runs.sensors.readings import Readings, as_csv, from_csv
 from cortado.scene.parameters.values import NAMES
 from cortado.scene.scene import Scene
 

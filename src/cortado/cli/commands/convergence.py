@@ -17,7 +17,7 @@ from cortado.optimisation.sweep.richardson import Extrapolation
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.summary import summary
+from cortado.runs.sensors.readings import summary
 from cortado.runs.trajectory import Trajectory
 
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"

@@ -28,7 +28,7 @@ from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.choosing import scheduled_bounds
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
-from cortado.runs.frame_choice import FrameChoice
+from cortado.runs.recording import FrameChoice
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit

@@ -6,7 +6,7 @@ from pathlib import Path
 from cortado.errors import InputError
 from cortado.pictures.run_plots import beside_measured
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.measured import Measured, measured_beside
+from cortado.runs.sensors.readings import MeasuredColumn, measured_beside
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
@@ -23,7 +23,7 @@ def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
     return "\n".join([*map(_line, found), f"The plot is {plot}."])
 
 
-def _line(one: Measured) -> str:
+def _line(one: MeasuredColumn) -> str:
     errors, unit = one.errors, one.unit
     left_out = f", {one.left_out} more are outside of the run" if one.left_out else ""
     return (

@@ -15,7 +15,7 @@ from cortado.pictures.image_files import write_picture
 from cortado.pictures.run_pictures import device_of, run_page
 from cortado.pictures.shown_run import ShownRun, coloured_by
 from cortado.pictures.side_by_side import labels, runs_page, shown_alike
-from cortado.runs.marks import common_rate
+from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory

@@ -21,7 +21,7 @@ from cortado.files.progress import announce
 from cortado.pictures.report import Section
 from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frame_choice import EverySteps, FrameChoice
+from cortado.runs.recording import EverySteps, FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.restart import RestartState

@@ -11,9 +11,8 @@ from cortado.particles.state import State
 from cortado.rollout.durations import done_of, ends_at_a_time
 from cortado.rollout.progress import Progress
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frame_choice import FrameChoice
-from cortado.runs.frame_file import append_frame, frame_writer
-from cortado.runs.marks import Marks
+from cortado.runs.frame_file import Marks, append_frame, frame_writer
+from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.simulation import Simulation

@@ -19,10 +19,10 @@ from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.supply import dry_sentence
-from cortado.runs.marks import common_rate
+from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Pace
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.log import Readings
+from cortado.runs.sensors.readings import Readings
 from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.in_words import scene_in_words

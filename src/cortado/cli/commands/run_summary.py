@@ -12,8 +12,7 @@ from cortado.discretise.region import TOLERANCE
 from cortado.particles.state import State
 from cortado.pictures.shown_run import is_out
 from cortado.rollout.rollout import Rollout
-from cortado.runs.sensors.log import Readings
-from cortado.runs.sensors.summary import summary
+from cortado.runs.sensors.readings import Readings, summary
 from cortado.scene.fluid_masses import FluidMasses
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver

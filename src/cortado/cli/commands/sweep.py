@@ -18,7 +18,7 @@ from cortado.files.progress import track, untracked
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.sweep.combinations import Combination, combinations
 from cortado.optimisation.sweep.table import NAME, failed, write_table
-from cortado.runs.frame_choice import FrameChoice
+from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml

@@ -14,7 +14,7 @@ from cortado.optimisation.fitting.observation import CLOCK, Again, Direction, Fr
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer
-from cortado.runs.sensors.places import warn_of_places
+from cortado.runs.sensors.placement import warn_of_places
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.restart import RestartState
 from cortado.scene.stability import is_implicit

@@ -13,7 +13,7 @@ from cortado.optimisation.fitting.tracks import Tracks
 from cortado.optimisation.fitting.video import Video
 from cortado.optimisation.inverse.measured_tables import MeasuredTable, SensorSeriesTable, TracksTable, VideoTable
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping
-from cortado.runs.sensors.of_scene import sensors_of
+from cortado.runs.sensors.placement import sensors_of
 from cortado.simulation import Simulation
 
 LIGHT = 0.5

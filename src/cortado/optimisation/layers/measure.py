@@ -17,7 +17,7 @@ from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.residual import Residual
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.moment import Moment, row_of
-from cortado.runs.sensors.places import warn_of_places
+from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import QUANTITIES, check_quantity

@@ -18,11 +18,9 @@ from cortado.pictures.shown_run import coloured_by, is_out, shown_places, those
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.liquid_surface import nearest_colours, spheres
-from cortado.runs.frame import Frame
-from cortado.runs.frame_file import fraction_names
-from cortado.runs.marks import SAME, Marks
+from cortado.runs.frame_file import SAME, Marks, fraction_names
 from cortado.runs.solid_motion import SolidMotions, posed, sized
-from cortado.runs.trajectory import Trajectory
+from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation

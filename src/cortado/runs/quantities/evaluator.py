@@ -13,9 +13,8 @@ from cortado.errors import InputError
 from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import Rollout
-from cortado.runs.quantities.formulas import formulas
+from cortado.runs.quantities.formulas import OnDevice, Particles, Pressures, Sums, formulas
 from cortado.runs.quantities.moment import Moment
-from cortado.runs.quantities.particles import OnDevice, Particles, Pressures, Sums
 from cortado.scene.containers import Container
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import LOAD, check_quantity, is_load

@@ -1,22 +1,265 @@
-"""What each quantity is of the sorted particles of a step, with its tangent and its adjoint.
+"""Quantities of the sorted particles of a step, with their tangents and adjoints.
 
 Sums over neighbours are kernels; what is done with the sum of each particle alone is NumPy in float64. n is the number
 density, m a particle's mass over its volume V on the rest lattice, p the pressure that it pushes walls with.
+
+Particle i pushes walls, those of one solid or all, with
+
+    f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i),
+
+where A_i is the sum over wall particles along which its pressure acts (``wall_push`` of
+`cortado.solvers.particles.ParticleSolver`) and a_i the acceleration that they give it by a force such as viscosity. The
+walls so get what momentum the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
-from cortado.particles.arrays import padded
+from cortado.device.launching import Named
+from cortado.particles.arrays import Fields, padded
 from cortado.particles.solid_shares import ALL_WALLS
-from cortado.runs.quantities.loads import SolidLoad, WallLoads
-from cortado.runs.quantities.particles import Particles, Sums
 from cortado.scene.quantities import load_name
+from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
-from cortado.sph.parts import Tangents
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.vorticity import circulation_kernels
+from cortado.sph.wall_sums import WallAction
+
+
+def vectors(array: wp.array) -> NDArray:
+    """(n, 3) in float64."""
+    return np.asarray(array.numpy(), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Pressures:
+    """Of the sorted particles of a step, in float64, off the device: copies."""
+
+    push: NDArray
+    """(n,) with which they push walls [Pa]."""
+    stress: NDArray | None
+    """(n,) what a gauge would read [Pa]; None where nobody asks for it."""
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Numbers of sorted particles in float64, off the device: of a step, their tangents, or adjoints."""
+
+    fields: Mapping[str, NDArray]
+    """By the names of `Fields`: ``x`` and ``v`` (n, 3), ``n`` and ``m`` (n,)."""
+    pressures: Pressures | None
+    """None where none were computed."""
+    on_device: "OnDevice | None" = None
+    """Of adjoints those that kernels add to."""
+
+    @classmethod
+    def of(cls, fields: Fields, pressures: Pressures | None) -> Self:
+        """Those of fields on the device."""
+        return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressures)
+
+    @classmethod
+    def zeros(cls, particles: int, on_device: "OnDevice | None" = None) -> Self:
+        """All 0."""
+        shapes = {"x": (3,), "v": (3,), "n": (), "m": ()}
+        fields = {name: np.zeros((particles, *shape)) for name, shape in shapes.items()}
+        return cls(fields, Pressures(np.zeros(particles), np.zeros(particles)), on_device)
+
+    def __getitem__(self, name: str) -> NDArray:
+        return self.fields[name]
+
+    @property
+    def push(self) -> NDArray:
+        """(n,) what they push walls with [Pa]."""
+        assert self.pressures is not None
+        return self.pressures.push
+
+    @property
+    def stress(self) -> NDArray:
+        """(n,) what a gauge would read [Pa]."""
+        assert self.pressures is not None and self.pressures.stress is not None
+        return self.pressures.stress
+
+    @property
+    def within(self) -> "OnDevice":
+        """What kernels add to."""
+        assert self.on_device is not None
+        return self.on_device
+
+
+@dataclass(frozen=True)
+class OnDevice:
+    """Adjoints of what a step computes, for kernels."""
+
+    bar: Adjoints
+    """Of sorted particles at the start of the step, and of parameters and solids."""
+    v_star: wp.array
+    """(n,) as that of `cortado.solvers.solver.WithinBar`."""
+
+
+class Sums:
+    """The sums over neighbours of a step, on the device."""
+
+    def __init__(self, solver: ParticleSolver, context: StepContext):
+        self._solver, self.context = solver, context
+        self.circulation = circulation_kernels(solver.discretisation)
+
+    def __call__(self, kernel: Any, *named: Named, **given: NDArray) -> NDArray:
+        """(n, 3) what a kernel writes to its last argument, given the step's fields and further vectors."""
+        arrays = {name: self.on_device(value) for name, value in given.items()}
+        found = self._solver.vectors()
+        self.context.launch(kernel, *named, **arrays, **{kernel.adj.args[-1].label: found})
+        return vectors(found)
+
+    def add(self, kernel: Any, bar: Particles, **given: NDArray) -> None:
+        """Have a kernel add to ``x_bar`` and ``v_bar``."""
+        arrays = {name: self.on_device(value) for name, value in given.items()}
+        own = {"x": self._solver.vectors(), "v": self._solver.vectors()}
+        self.context.launch(kernel, **arrays, **{f"{name}_bar": array for name, array in own.items()})
+        for name, array in own.items():
+            bar[name][:] += array.numpy()
+
+    def on_device(self, values: NDArray) -> wp.array:
+        """Vectors (n, 3)."""
+        return wp.array(values, dtype=self._solver.discretisation.precision.vector, device=self._solver.device)
+
+
+@dataclass(frozen=True)
+class _Rubbing:
+    """factor m_i sum a_i over what walls do by forces, (n, 3)."""
+
+    actions: list[WallAction]
+    factor: float
+
+    def value(self, at: Particles, sums: Sums, solid: int) -> NDArray:
+        return self.factor * at["m"][:, None] * self._total(at, sums, solid)
+
+    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
+        found = dot["m"][:, None] * self._total(at, sums, solid)
+        for action in self.actions:
+            found += at["m"][:, None] * vectors(action.tangent(sums.context, along, solid))
+        return self.factor * found
+
+    def adjoint(self, at: Particles, sums: Sums, own_bar: NDArray, bar: Particles, solid: int) -> None:
+        bar["m"][:] += self.factor * (own_bar * self._total(at, sums, solid)).sum(axis=1)
+        total_bar = sums.on_device(self.factor * at["m"][:, None] * own_bar)
+        for action in self.actions:
+            action.adjoint(sums.context, bar.within.bar, solid, total_bar, bar.within.v_star)
+
+    def _total(self, at: Particles, sums: Sums, solid: int) -> NDArray:
+        totals = (vectors(action.total(sums.context, solid)) for action in self.actions)
+        return sum(totals, np.zeros((len(at["m"]), 3)))
+
+
+class WallLoads:
+    """Of a solver's particles, (n, 3) in float64. ``solid`` is the number of a solid's wall particles, or
+    `cortado.particles.solid_shares.ALL_WALLS`."""
+
+    def __init__(self, solver: ParticleSolver):
+        cell, self._power = solver.lattice.cell, solver.density_power
+        self._scale = cell * solver.lattice.volume
+        self._push = solver.wall_push()
+
+        def of(name: str) -> list[WallAction]:
+            return [action for force in solver.forces if (action := getattr(force, name, None)) is not None]
+
+        self._rubbing = _Rubbing(of("wall_action"), -cell)
+        self.couples = _Rubbing(of("wall_couple"), cell)
+        """What f_i that act beneath particles twist walls with [N m]."""
+
+    def forces(self, at: Particles, sums: Sums, solid: int) -> NDArray:
+        """f [N]"""
+        pushed = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
+        return pushed + self._rubbing.value(at, sums, solid)
+
+    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
+        """That of f."""
+        strength_dot = self._scale / at["n"] ** self._power * (dot.push - self._power * at.push * dot["n"] / at["n"])
+        pushed = vectors(self._push.total(sums.context, solid))
+        pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
+        found = strength_dot[:, None] * pushed + self._strength(at)[:, None] * pushed_dot
+        return found + self._rubbing.tangent(at, sums, dot, along, solid)
+
+    def adjoint(self, at: Particles, sums: Sums, forces_bar: NDArray, bar: Particles, solid: int) -> None:
+        """From that of f, add to those of the particles."""
+        step, strength = sums.context, self._strength(at)
+        strength_bar = (forces_bar * vectors(self._push.total(step, solid))).sum(axis=1)
+        bar.push[:] += strength_bar * self._scale / at["n"] ** self._power
+        bar["n"][:] -= self._power * strength_bar * strength / at["n"]
+        within = bar.within
+        self._push.adjoint(step, within.bar, solid, sums.on_device(strength[:, None] * forces_bar), within.v_star)
+        self._rubbing.adjoint(at, sums, forces_bar, bar, solid)
+
+    def _strength(self, at: Particles) -> NDArray:
+        return np.asarray(self._scale * at.push / at["n"] ** self._power)
+
+
+@dataclass(frozen=True)
+class SolidLoadQuantity:
+    """Force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at the end of the
+    step, where its walls are, to particle i; of viscosity as a stress to the surface beneath it, where that acts. Each
+    scene has F and T one behind the other, in the plane the component of T that stands on it."""
+
+    loads: WallLoads
+    solver: ParticleSolver
+    solid: NamedSolid
+    dimension: int
+
+    def value(self, at: Particles, sums: Sums) -> NDArray:
+        forces = self.loads.forces(at, sums, self.solid.number)
+        couples = self.loads.couples.value(at, sums, self.solid.number)
+        return self._joined(forces, np.cross(self._arms(at), forces) + couples)
+
+    def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
+        forces = self.loads.forces(at, sums, self.solid.number)
+        forces_dot = self.loads.tangent(at, sums, dot, along, self.solid.number)
+        moving = self.solver.search.moving
+        shift = self._each(None if moving is None else moving.after_dot.positions, np.zeros(3))
+        turned = np.cross(dot["x"] - shift, forces) + np.cross(self._arms(at), forces_dot)
+        return self._joined(forces_dot, turned + self.loads.couples.tangent(at, sums, dot, along, self.solid.number))
+
+    def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
+        d, members, number = self.dimension, len(own), self.solid.number
+        force_bar = padded(own[:, :d])
+        torque_bar = own[:, d:] if d == 3 else np.pad(own[:, d:], ((0, 0), (2, 0)))
+        force_bar, torque_bar = (self._for_each(array) for array in (force_bar, torque_bar))
+        pulled = np.cross(self.loads.forces(at, sums, number), torque_bar)
+        self.loads.adjoint(at, sums, force_bar + np.cross(torque_bar, self._arms(at)), bar, number)
+        self.loads.couples.adjoint(at, sums, torque_bar, bar, number)
+        bar["x"][:] += pulled
+        if number >= 0:
+            layout = self.solver.layout
+            total = -pulled.reshape(members, -1, 3).sum(axis=1)
+            places = (wp.array(a, dtype=layout.precision.vector, device=layout.device) for a in (total, 0.0 * total))
+            bar.within.bar.solids.add_whole(number, *places)
+
+    def _arms(self, at: Particles) -> NDArray:
+        """(n, 3) [m], along a periodic axis the shorter way."""
+        moving = self.solver.search.moving
+        arms = at["x"] - self._each(None if moving is None else moving.after.positions, self.solid.middle)
+        periods = np.array(self.solver.system.periods)
+        around = np.round(np.divide(arms, periods, out=np.zeros_like(arms), where=periods > 0.0))
+        return np.asarray(arms - periods * around)
+
+    def _each(self, of_moving: wp.array | None, at_rest: NDArray) -> NDArray:
+        """(n, 3) the solid's entry of an array (scenes, solids) of those that move, or what it is of one at rest."""
+        if of_moving is None or self.solid.number < 0:
+            return np.broadcast_to(at_rest, (self.solver.layout.all_particles, 3))
+        return self._for_each(vectors(of_moving)[:, self.solid.number])
+
+    def _for_each(self, of_scenes: NDArray) -> NDArray:
+        """(n, 3) of (scenes, 3)."""
+        return np.repeat(of_scenes, self.solver.layout.particles, axis=0)
+
+    def _joined(self, forces: NDArray, torques: NDArray) -> NDArray:
+        """(scenes, k) the sums over particles."""
+        members = self.solver.layout.members
+        force, torque = (array.reshape(members, -1, 3).sum(axis=1) for array in (forces, torques))
+        return np.concatenate([force[:, : self.dimension], torque if self.dimension == 3 else torque[:, 2:]], axis=1)
 
 
 class QuantityFormula(Protocol):
@@ -107,7 +350,7 @@ class Vorticity:
 
 @dataclass(frozen=True)
 class WallForceQuantity:
-    """What a particle pushes all walls with: see `cortado.runs.quantities.loads`."""
+    """What a particle pushes all walls with: see `cortado.runs.quantities.formulas`."""
 
     loads: WallLoads
     dimension: int
@@ -131,5 +374,8 @@ def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) 
         "speed": SpeedQuantity(),
         "vorticity": Vorticity(circulation_factor, dimension),
         "wall_force": WallForceQuantity(loads, dimension),
-        **{load_name(name): SolidLoad(loads, solver, solid, dimension) for name, solid in solver.system.solids.items()},
+        **{
+            load_name(name): SolidLoadQuantity(loads, solver, solid, dimension)
+            for name, solid in solver.system.solids.items()
+        },
     }

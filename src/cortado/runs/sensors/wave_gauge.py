@@ -1,13 +1,253 @@
-"""The height of the surface at a place."""
+"""The height of the surface of the fluid at a place: up to which level fluid fills a column from its floor on.
 
+Solids take a part of the column. It is a grid of points: so many levels, and in each of them places with weights w_c
+that add up to 1. Of the point x_c a solid takes
+
+    s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
+
+with the signed distance phi from the solid: a flat one takes its own height of every place, wherever it is between the
+levels. Several take what each of them takes, together at most all. Level k has the room 1 - sum_c w_c s_c, and a depth
+of fluid fills level after level. A solid that leaves no room above fluid, as a boat or a ceiling does, is a step in
+that height. Fluid that is pressed together a little is not on the deck: the step is a slope over the next `FILM` of
+depth.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.domain import Domain
+from cortado.discretise.shapes import corners, grid
+from cortado.discretise.solids.solid import Solid
 from cortado.fixed import fixed
-from cortado.runs.sensors.column import Axis, Column, column_of, cut_by
-from cortado.runs.sensors.sensor import ACROSS, Reading, Seen, direction, parts_of, point, positive, reach_of
+from cortado.particles.arrays import padded
+from cortado.runs.sensors.sensor import (
+    ACROSS,
+    Reading,
+    Seen,
+    Weights,
+    direction,
+    in_dimension,
+    parts_of,
+    point,
+    positive,
+    reach_of,
+)
+from cortado.scene.containers import Container
+from cortado.scene.motions import position_name, scale_name
+from cortado.scene.poses import Pose
+from cortado.scene.solids import SolidTable
+
+FINE = 0.5
+"""In spacings: how far apart the points of a column are at most."""
+ACROSS_REACH = 20.0
+"""How many of them there are at least from the axis of a column to its side."""
+LEAST = 1e-3
+"""The part of a level that counts as no room at all."""
+MOST = 4_000_000
+"""Points: where solids go higher they are further apart."""
+NARROW = 0.01
+"""The part of a column that has to be within a container that cuts it."""
+FILM = 1.0
+"""In spacings: so deep a film is above a solid that has fluid below it too, before the height is exactly that of it."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A solid where it is: x is at ``middle + scale turn r``, with the place r in its own frame."""
+
+    own: Solid
+    middle: NDArray[Any]
+    """(d,) [m]"""
+    turn: NDArray[Any]
+    """(d, d)"""
+    scale: float
+    pose: Pose | None
+    """Of one that moves."""
+
+    @classmethod
+    def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
+        """In a state, which one that stays needs not."""
+        if at is None or not table.moves:
+            return cls(table.own_solid(), table.middle(), table.turn(d), 1.0, None)
+        pose = Pose.of(table.name, table.motion == "free", at)
+        return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
+
+    def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
+        """(n, d) the places r of points (n, d) [m], or of those of their images that are nearest to its middle."""
+        return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
+
+    def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
+        """How high it goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite if it has no
+        end."""
+        ends = self.scale * corners(*self.own.extent())
+        high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
+        return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Where a column stands."""
+
+    foot: tuple[float, ...]
+    """(d,) where its axis meets its floor [m]"""
+    up: tuple[float, ...]
+    """(d,) unit vector"""
+    reach: float
+    """Of its weights [m]."""
+    step: float
+    """From point to point [m]."""
+    film: float
+    """`FILM` [m]"""
+
+    @classmethod
+    def of(cls, at: Reading, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
+        """Of a gauge."""
+        in_dimension("position", position, at.dimension)
+        spacing = at.lattice.cell ** (1.0 / at.dimension)
+        foot = position + (floor - position @ up) * up
+        step = min(FINE * spacing, reach / ACROSS_REACH)
+        return cls(tuple(foot.tolist()), tuple(up.tolist()), reach, step, FILM * spacing)
+
+    def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """(c, d) the points of the floor from its foot [m], and their weights (c,)."""
+        d, count = len(self.foot), int(np.ceil(self.reach / self.step))
+        across = np.linalg.svd(np.array([self.up]))[2][1:]
+        along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
+        places = grid([along] * (d - 1))
+        weights = Weights.of(np.linalg.norm(places, axis=1) / self.reach).values
+        return places[weights > 0.0] @ across, weights[weights > 0.0] / weights.sum()
+
+
+@dataclass(frozen=True)
+class Column:
+    """The points of a column, and what solids take of them."""
+
+    axis: Axis
+    points: NDArray[Any]
+    """(levels, c, d) [m]"""
+    weights: NDArray[Any]
+    """(c,), over those that are within the container"""
+    outside: NDArray[Any]
+    """(c,) the part of each place that is behind the sides of the container"""
+    solids: list[tuple[Standing, NDArray[Any]]]
+    """Those in it, and how far its points are from them (levels, c) [m], where that is less than a step."""
+
+    @classmethod
+    def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
+        """None where no solid is in it."""
+        foot, up = np.array(axis.foot), np.array(axis.up)
+        tops, sizes = np.array([one.reach(up, foot) for one in solids]).T
+        ways = domain.shortest(foot - np.array([one.middle for one in solids], dtype=np.float64))
+        aside = np.linalg.norm(ways - (ways @ up)[:, None] * up, axis=1)
+        close = (aside < sizes + axis.reach + axis.step) & (tops > -axis.step)
+        if not close.any():
+            return None
+        levels = int(np.ceil((tops[close].max() + axis.film) / axis.step)) + 1
+        places, weights = axis.places()
+        if levels * len(places) > MOST:
+            wider = (levels * len(places) / MOST) ** (1.0 / len(foot))
+            return cls.of(replace(axis, step=1.01 * wider * axis.step), solids, domain, container)
+        inside = cut_by(axis, container)
+        inside = np.ones(len(places)) if inside is None else inside
+        heights = axis.step * (np.arange(levels) + 0.5)
+        points = foot + places[None] + heights[:, None, None] * up
+        found = []
+        for one in (one for one, is_close in zip(solids, close, strict=True) if is_close):
+            local = one.local(points.reshape(-1, len(foot)), domain)
+            distances = one.scale * one.own.distance_up_to(local, axis.step / one.scale).reshape(points.shape[:2])
+            if distances.min() < 0.5 * axis.step:
+                found.append((one, distances))
+        return cls(axis, points, weights / (weights @ inside), 1.0 - inside, found) if found else None
+
+    @cached_property
+    def _taken(self) -> NDArray[Any]:
+        """(levels, c) what solids and the container take of each point, 1 or more where that is all of it."""
+        return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
+
+    @cached_property
+    def room(self) -> NDArray[Any]:
+        """(levels,) the part of each level that is none of a solid."""
+        return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
+
+    @cached_property
+    def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Which ends of levels the height is linear between, and the depths that fill the room below them [m]."""
+        filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
+        kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
+        kept[: int(np.argmin(blocked))] = False  # what stands on the floor
+        for ceiling in np.flatnonzero(blocked[1:] & ~blocked[:-1]) + 1:
+            kept[ceiling + 1 :] &= filled[ceiling + 1 :] >= filled[ceiling] + self.axis.film
+        ends = np.flatnonzero(kept)
+        return ends, filled[ends]
+
+    def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
+        """How high above its floor fluid stands that has a depth where there are no solids [m]; which part (levels,) of
+        what solids take of each level adds to it; and by how much it grows with the depth."""
+        (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
+        low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
+        if low == len(ends) - 1:  # above all solids
+            return ends[low] * step + (depth - filled[low]), np.ones(len(levels)), 1.0
+        part = (depth - filled[low]) / (filled[low + 1] - filled[low])
+        slope = step * (ends[low + 1] - ends[low]) / (filled[low + 1] - filled[low])
+        below = np.where(levels < ends[low], 1.0, np.where(levels < ends[low + 1], part, 0.0))
+        return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
+
+    def solid_bars(self, depth: float, bar: float, domain: Domain) -> dict[str, NDArray[Any]]:
+        """From the derivative with respect to the level of a depth [m] to those of fields of solids that move."""
+        _, below, slope = self.level(depth)
+        shares, found = bar * slope * below, dict[str, NDArray[Any]]()
+        for one, far in self.solids:
+            if one.pose is None:
+                continue
+            k, c = np.nonzero((np.abs(far) < 0.5 * self.axis.step) & (self._taken < 1.0))
+            local, share = one.local(self.points[k, c], domain), shares[k] * self.weights[c]
+            pushed = share[:, None] * one.own.outward(local)
+            twisted = np.cross(padded(one.scale * local), padded(pushed))
+            name = one.pose.name
+            found[position_name(name)] = (one.turn @ pushed.sum(axis=0))[None]
+            found |= one.pose.turning_bars(one.pose.rotation @ twisted.sum(axis=0))
+            if not one.pose.is_free:
+                grown = (pushed * local).sum() - (share * far[k, c]).sum() / one.scale
+                found[scale_name(name)] = np.array([grown])
+        return found
+
+
+def column_of(axis: Axis, at: Reading) -> Column | None:
+    """A column as solids stand in it in a state; None where none does."""
+    tables, domain = at.solids, at.lattice.domain
+    if not tables:
+        return None
+    if any(table.moves for table in tables):
+        return Column.of(axis, [Standing.of(table, at.dimension, at) for table in tables], domain, at.container)
+    return _at_rest(axis, tables, domain, at.container)
+
+
+@lru_cache(maxsize=64)
+def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
+    """(c,) which part of each place of a column is within a container whose sides are along it; None where all are, and
+    of containers with other sides."""
+    up, foot = np.array(axis.up), np.array(axis.foot)
+    region, periods = container.region(len(up)), container.periods(len(up))[1]
+    along = np.abs(up) > 1.0 - 1e-12
+    if not along.any() or (region.across @ along and region.across.any()):
+        return None
+    sides = region.opened(np.where(along, 1.0, periods))
+    if sides.distance(foot[None])[0] <= -axis.reach - axis.step:
+        return None
+    places, weights = axis.places()
+    inside = sides.cell_shares(foot + places, axis.step)
+    return inside if weights @ inside > NARROW else None
+
+
+@lru_cache(maxsize=64)
+def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
+    """The same of solids that stay, once."""
+    return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
+
 
 FINER = 4.0
 """How many times as many parts a particle has along an axis where solids are in the column of a gauge."""
@@ -22,7 +262,7 @@ class WaveGauge:
 
     where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids take their part of the room,
     where they are in each step: above one that stands on the floor, hangs in the fluid or reaches through its surface h
-    is the level of the surface (`cortado.runs.sensors.column`). Fluid that is in the air counts too, as if it lay on
+    is the level of the surface. Fluid that is in the air counts too, as if it lay on
     the rest, also on a solid with air below. What is behind the sides of a container that stand along ``up`` is none of
     the column.
     """

@@ -1,17 +1,23 @@
-"""Which states of a run become frames of its trajectory: every so many steps, or so many in a simulated second."""
+"""Which states of a run become frames, every so many steps or so many in a second, and the trajectories of them."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Any, Protocol
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import InputError
+from cortado.errors import DivergedError, InputError
 from cortado.rollout.durations import expected_frames
 from cortado.rollout.rollout import Rollout
-from cortado.runs.marks import Marks
+from cortado.runs.frame_file import Marks
+from cortado.runs.solid_motion import solid_motions
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.parameters.values import Arrays
 from cortado.scene.restart import Clock
+from cortado.scene.scene import Scene
+from cortado.words import counted
 
 
 class FrameChoice(Protocol):
@@ -119,3 +125,87 @@ class FramesPerSecond:
 def _clock(rollout: Rollout) -> Clock:
     """Of the first state, as steps of one length go on from it."""
     return Clock(rollout.clocks[0].steps, rollout.clocks[0].time)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryBatch(Sequence[Trajectory]):
+    """What a batch of runs leaves: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single run; of a
+    scene that lost a particle it has the frames before."""
+
+    trajectories: tuple[Trajectory, ...]
+    """One for each scene."""
+    fields: Mapping[str, NDArray[Any]]
+    """(frames, batch, ...) every field that steps change, by its name; NaN behind the last frame of a lost scene."""
+    lost: Mapping[int, DivergedError]
+    """What happened to the scenes that lost a particle, by their number."""
+
+    def __repr__(self) -> str:
+        lost = f", {len(self.lost)} lost" if self.lost else ""
+        frames, _, particles, _ = self.positions.shape
+        sizes = f"{counted(frames, 'frame')} of {counted(particles, 'particle')}"
+        return f"TrajectoryBatch({counted(len(self), 'scene')}{lost}, {sizes})"
+
+    def __len__(self) -> int:
+        """Number of scenes."""
+        return len(self.trajectories)
+
+    @overload
+    def __getitem__(self, b: int) -> Trajectory: ...
+
+    @overload
+    def __getitem__(self, b: slice) -> Sequence[Trajectory]: ...
+
+    def __getitem__(self, b: int | slice) -> Trajectory | Sequence[Trajectory]:
+        return self.trajectories[b]
+
+    @property
+    def positions(self) -> NDArray[Any]:
+        """(frames, batch, n, d) [m]"""
+        return self.fields["positions"]
+
+    @property
+    def velocities(self) -> NDArray[Any]:
+        """(frames, batch, n, d) [m/s]"""
+        return self.fields["velocities"]
+
+    @property
+    def mass_fractions(self) -> NDArray[Any] | None:
+        """(frames, batch, n, phases) [-]; None with one phase"""
+        return self.fields.get("mass_fractions")
+
+
+def recorded(
+    rollout: Rollout, scene: Scene, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
+) -> Trajectory | TrajectoryBatch:
+    """Of a scene, from fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...), and of the
+    fields of the rollout's states that no step changes, with ``quantities`` (frames, ...) of the same frames."""
+
+    def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
+        own = {name: array[kept][at] for name, array in fields.items()}
+        clock = rollout.clocks[number]
+        return Trajectory(
+            times=clock.times(steps[kept], float(rollout.time_steps[number])),
+            steps=clock.steps + steps[kept],
+            positions=own.pop("positions"),
+            velocities=own.pop("velocities"),
+            diagnostics={name: column[at] for name, column in rollout.diagnostics.items()},
+            mass_fractions=own.pop("mass_fractions", None),
+            others=own,
+            solids=solid_motions(scene, own),
+            scene=scene,
+            constants={name: array[at[1:]] for name, array in constants.items()},
+            substeps=rollout.substeps,
+            origin=rollout.origins[number],
+            quantities={name: array[kept][at] for name, array in quantities.items()},
+        )
+
+    batch = rollout.solver.layout.batch
+    if batch is None:
+        return one(0, slice(None), (slice(None),))
+    found = []
+    for b in range(batch):
+        good = np.count_nonzero(steps < rollout.lost[b].step) if b in rollout.lost else len(steps)
+        found.append(one(b, slice(good), (slice(None), b)))
+        for array in fields.values():
+            array[good:, b] = np.nan
+    return TrajectoryBatch(tuple(found), fields, rollout.lost)

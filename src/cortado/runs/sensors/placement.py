@@ -1,20 +1,67 @@
-"""Sensors where no fluid can be: what to warn of before a run, as they read like dry ones."""
+"""The sensors that a scene names, and a warning of each that stands where no fluid can be."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points, corners, grid
 from cortado.errors import warn
-from cortado.runs.sensors.flow_rate import FlowRate
-from cortado.runs.sensors.pressure_probe import PressureProbe
-from cortado.runs.sensors.sensor import Cut, reach_of
-from cortado.runs.sensors.shut_off import is_shut_off
-from cortado.runs.sensors.wall_force import WallForce
+from cortado.runs.sensors.probes import FlowRate, PressureProbe, SolidLoad, WallForce
+from cortado.runs.sensors.sensor import Cut, Sensor, reach_of
 from cortado.runs.sensors.wave_gauge import WaveGauge
 from cortado.scene.scene import Scene
 from cortado.scene.sentences import point_in_words
+
+SENSORS: dict[str, Callable[..., Sensor]] = {
+    "pressure_probe": PressureProbe,
+    "wave_gauge": WaveGauge,
+    "flow_rate": FlowRate,
+    "wall_force": WallForce,
+    "solid_load": SolidLoad,
+}
+"""By their kinds."""
+
+
+def sensors_of(scene: Scene) -> dict[str, Sensor]:
+    """By their names. Up is against gravity."""
+    gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
+    upwards: dict[str, Any] = {"wave_gauge": {"up": -gravity}} if gravity.any() else {}
+    return {
+        table.name: SENSORS[table.kind](**table.model_dump(exclude={"name", "kind"}), **upwards.get(table.kind, {}))
+        for table in scene.sensor
+    }
+
+
+MOST_CELLS = 200_000
+"""Cells of half a spacing that are looked at; a larger container is not judged."""
+
+
+def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
+    """(n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in a
+    container without periods and emitters: solids at rest are in the way, those that move are not."""
+    from scipy.ndimage import label
+
+    nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
+    solids = [table.solid() for table in scene.solid if not table.moves]
+    if ends is None or not solids or scene.emitter is not None or any(scene.container.periods(scene.dimension)[1]):
+        return nowhere
+    lower, upper = np.array(ends, dtype=np.float64)
+    counts = np.maximum(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1.0)
+    if np.prod(counts) > MOST_CELLS:
+        return nowhere
+    shape, cells = tuple(counts.astype(int)), (upper - lower) / counts
+    middles = lower + (np.indices(shape).reshape(len(shape), -1).T + 0.5) * cells
+    taken = np.any([one.distance_up_to(middles, float(cells.max())) <= 0.0 for one in solids], axis=0)
+    names, _ = label(~taken.reshape(shape), np.ones((3,) * len(shape)))
+
+    def named(places: Points) -> NDArray[np.int_]:
+        return np.asarray(names[tuple(np.clip((places - lower) // cells, 0, counts - 1).astype(int).T)])
+
+    found = named(points)
+    return (found > 0) & ~np.isin(found, named(fluid))
+
 
 DEEP = 0.01
 """In spacings: a place that is less deep in a wall or a solid is on its surface."""

@@ -1,4 +1,4 @@
-"""What sensors read in every step of a run."""
+"""Readings of sensors in every step of a run: arrays, a table in a file, a summary, and measured data beside them."""
 
 import csv
 import io
@@ -115,3 +115,95 @@ def from_csv(path: Path) -> dict[str, Readings]:
 def _rows(readings: list[Readings]) -> Iterable[list[str]]:
     for k, time in enumerate(readings[0].times):
         yield [repr(float(number)) for number in (time, *(value for own in readings for value in own.values[k]))]
+
+
+Summary = dict[str, dict[str, dict[str, float]]]
+"""By the sensor, by its number, by what it is: ``last``, ``mean`` and ``greatest``."""
+
+
+def summary(readings: Mapping[str, Readings]) -> Summary:
+    """Of each number of each sensor the last reading, the mean over time, and the greatest: the reading farthest from
+    0, with its sign."""
+    return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
+
+
+def _of(read: Readings, column: str) -> dict[str, float]:
+    values, times = read[column], read.times
+    duration = float(times[-1] - times[0])
+    mean = np.trapezoid(values, times) / duration if duration > 0.0 else values[-1]
+    known = values[np.isfinite(values)]
+    greatest = known[np.abs(known).argmax()] if len(known) else np.nan
+    return {"last": float(values[-1]), "mean": float(mean), "greatest": float(greatest)}
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredColumn:
+    """What was measured of one number of a sensor, at times within the run."""
+
+    name: str
+    """"gauge.height" of the sensor gauge."""
+    unit: str
+    times: NDArray[Any]
+    """(k,) [s], of those that are within the run."""
+    values: NDArray[Any]
+    """(k,)"""
+    simulated: NDArray[Any]
+    """(k,) what the sensor read then: between two steps interpolated linearly."""
+    left_out: int
+    """Measured points that are before or after the run."""
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Of the simulated less the measured values, in the sensor's unit."""
+        off = self.simulated - self.values
+        worst = int(np.abs(off).argmax())
+        return {
+            "root_mean_square": float(np.sqrt(np.mean(off**2))),
+            "mean": float(off.mean()),
+            "greatest": float(abs(off[worst])),
+            "greatest_at_s": float(self.times[worst]),
+        }
+
+
+def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
+    """The columns of a table of measured data, each beside the readings of a run's sensor.
+
+    The table has a column "time" [s] and columns such as "gauge.height", named as in sensors.csv; units in brackets may
+    be left out, and so may entries.
+
+    Raises:
+        InputError: a file that is no such table, columns of no sensor or in another unit, or no point within the run.
+    """
+    columns = read_columns(path)
+    named = {_name_and_unit(head): values for head, values in columns.items()}
+    times = named.get(("time", "s"), named.get(("time", None)))
+    known = {f"{name}.{column}": (own, column) for name, own in readings.items() for column in own.units}
+    if times is None:
+        wanted = f"{TIME}, and some of {', '.join(known)}"
+        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {wanted}.")
+    found = []
+    for (name, unit), values in named.items():
+        if name == "time":
+            continue
+        if name not in known:
+            raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
+        own, column = known[name]
+        if unit is not None and unit != own.units[column]:
+            raise InputError(f"{path} has {name} in {unit}, but must have it in {own.units[column]}.")
+        there = np.isfinite(times) & np.isfinite(values)
+        within = there & (times >= own.times[0]) & (times <= own.times[-1])
+        if not within.any():
+            ends = f"{own.times[0]:g} to {own.times[-1]:g} s"
+            raise InputError(f"{path} has no value of {name} within the run, but must have some from {ends}.")
+        simulated = np.interp(times[within], own.times, own[column])
+        left_out = int(np.count_nonzero(there & ~within))
+        found.append(MeasuredColumn(name, own.units[column], times[within], values[within], simulated, left_out))
+    if not found:
+        raise InputError(f"{path} has times alone, but must have some of {', '.join(known)}.")
+    return found
+
+
+def _name_and_unit(head: str) -> tuple[str, str | None]:
+    """Of a column; None where it has no unit in brackets."""
+    name, bracket, unit = head.partition("[")
+    return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None
