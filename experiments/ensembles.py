@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.files.progress import Advance
+from cortado.files.terminal import Advance
 from cortado.reference import Simulation
 
 CORES = 2

@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-from cortado.files.progress import Advance
+from cortado.files.terminal import Advance
 from cortado.scene import tables
 from cortado.scene.fields import Text, components, quantity
 from cortado.scene.scene import Scene

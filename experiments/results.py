@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import InputError
-from cortado.files.atomic import parsed_json, write_atomically
 from cortado.files.input_files import content
-from cortado.files.progress import track
+from cortado.files.output_files import parsed_json, write_atomically
+from cortado.files.terminal import track
 from experiments.canvas import save
 from experiments.experiment import Experiment
 from experiments.tables import MOST_BYTES, Table

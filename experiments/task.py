@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import ValidationInfo, field_validator
 
 from cortado.errors import InputError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.setup import Setup, setup
 from cortado.optimisation.inverse.task import load_task

@@ -92,7 +92,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 def cortado_command(capfd, monkeypatch):
     """Runs a command in this process: (exit code, stdout, stderr), with what C code writes. There are no lines of
     progress, however slow the machine is."""
-    monkeypatch.setattr("cortado.files.progress.LINE_INTERVAL", math.inf)
+    monkeypatch.setattr("cortado.files.terminal.LINE_INTERVAL", math.inf)
 
     def run(*arguments, program=CORTADO):
         capfd.readouterr()

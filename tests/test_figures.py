@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from cortado.errors import InputError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures import plots
 from cortado.pictures.run_plots import density_errors
 from cortado.runs.trajectory import Trajectory

@@ -6,9 +6,9 @@ import stat
 
 import pytest
 
-import cortado.files.atomic
+import cortado.files.output_files
 from cortado.errors import ComputationError, InputError
-from cortado.files.atomic import unfinished, write_atomically
+from cortado.files.output_files import unfinished, write_atomically
 from full_disk import largest_file
 
 
@@ -36,7 +36,7 @@ def test_a_full_disk_is_told_from_a_wrong_path(tmp_path, monkeypatch):
 
 def test_a_link_under_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
     (tmp_path / "precious").write_text("mine")
-    monkeypatch.setattr(cortado.files.atomic.secrets, "token_hex", lambda count: "guessed")
+    monkeypatch.setattr(cortado.files.output_files.secrets, "token_hex", lambda count: "guessed")
     unfinished(tmp_path / "a").symlink_to(tmp_path / "precious")
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(tmp_path / "a", "theirs")

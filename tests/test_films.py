@@ -9,7 +9,7 @@ from cortado.cli.commands.picture import camera_override
 from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures import Dolly, Follow, Keyframes, Orbit
 from cortado.pictures.labels import Scale
 from cortado.pictures.painter import MOVING, painter, plan

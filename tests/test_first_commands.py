@@ -21,7 +21,7 @@ from cortado.cli.commands.overview import COMMANDS
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.subcommands import app
 from cortado.cli.usage import usage_sentence
-from cortado.files.shipped import SCHEMA, examples_folder
+from cortado.files.input_files import SCHEMA, examples_folder
 from cortado.optimisation.inverse.file_schema import file_schema, file_schema_text
 
 ROOT = Path(__file__).parents[1]
@@ -292,7 +292,7 @@ def test_zsh_has_a_script(cortado_command):
 
 
 def test_quiet_says_nothing_but_what_was_asked_for(cortado_command, monkeypatch, request):
-    monkeypatch.setattr("cortado.files.progress.LINE_INTERVAL", 0.0)
+    monkeypatch.setattr("cortado.files.terminal.LINE_INTERVAL", 0.0)
     Path("scene.toml").write_text(TINY_SCENE)
     assert cortado_command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
     assert Path("runs/run/report.html").exists()

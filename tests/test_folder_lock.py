@@ -11,13 +11,13 @@ import sys
 import pytest
 
 from cortado.errors import InputError
-from cortado.files import file_lock
-from cortado.files.folder_lock import LOCK, locked
+from cortado.files import output_files
+from cortado.files.output_files import LOCK, locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from cortado.files.folder_lock import locked
+from cortado.files.output_files import locked
 
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
@@ -96,7 +96,7 @@ def test_a_lock_on_windows_is_one_byte_that_others_need_not_read(tmp_path, monke
 
     monkeypatch.setitem(sys.modules, "msvcrt", Msvcrt)
     monkeypatch.setattr(sys, "platform", "win32")
-    found = runpy.run_path(file_lock.__file__)
+    found = runpy.run_path(output_files.__file__)
     with open(tmp_path / LOCK, "w+b") as file:
         found["lock"](file.fileno())
         assert asked == [(found["BEYOND"], 2, 1)] and file.tell() == 0

@@ -12,7 +12,7 @@ from PIL import Image
 from bad_scenes import assert_one_sentence
 from cortado import CortadoWarning
 from cortado.errors import InputError
-from cortado.files.srgb import from_srgb, to_srgb
+from cortado.files.image_encoding import from_srgb, to_srgb
 from cortado.pictures.image_files import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
 
 DRAWINGS = [heart, rosetta]

@@ -19,8 +19,8 @@ from bad_tasks import TINY_SCENE
 from cortado import Scene
 from cortado.cli import main
 from cortado.errors import InputError
-from cortado.files.atomic import unfinished
-from cortado.files.progress import track
+from cortado.files.output_files import unfinished
+from cortado.files.terminal import track
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.pictures.report import Section, write_report, written
 from cortado.runs.run_folder import RunFolder

@@ -15,7 +15,7 @@ from cortado.device.launching import BandLauncher, launch
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import corners
 from cortado.errors import CortadoWarning, InputError, SceneError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.losses import FinalPositions
 from cortado.pictures import film as shading_film
 from cortado.pictures import stage as stage_module

@@ -58,7 +58,7 @@ def test_limits_of_a_shell(tmp_path, limit, word):
 
 
 def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
-    from cortado.files.video import pyav
+    from cortado.files.image_encoding import pyav
 
     real = builtins.__import__
 

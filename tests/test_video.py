@@ -8,9 +8,7 @@ import pytest
 from PIL import Image
 
 from cortado.errors import ComputationError, InputError
-from cortado.files.animation import moving_picture
-from cortado.files.srgb import to_srgb
-from cortado.files.video import BITS, write_video, writing
+from cortado.files.image_encoding import BITS, moving_picture, to_srgb, write_video, writing
 from cortado.pictures.image_files import COFFEE, MILK, heart
 from full_disk import largest_file
 

@@ -17,7 +17,7 @@ from cortado.cli.viewer.quantities import AHEAD, upwards
 from cortado.cli.viewer.recorded import RecordedView
 from cortado.cli.viewer.task import TaskView
 from cortado.cli.viewer.window import LONGEST_ARROW, PULL
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
 from cortado.pictures.shown_solids import solid_outline
 from cortado.runs.trajectory import Trajectory

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from cortado import Problem, Scene, Simulation, gradients, losses
-from cortado.files.progress import track
+from cortado.files.terminal import track
 from cortado.losses.image_losses import Pyramid
 from cortado.pictures.plots import INK, PALETTE, drawing
 from cortado.render.scene_renderer import scene_renderer

@@ -29,7 +29,7 @@ from gradients import GRAVITY, POSITION_NOISE, SCENES, SPACING, SPREAD, TILT, TR
 
 from cortado import Problem, Simulation, gradients, losses
 from cortado.errors import DivergedError
-from cortado.files.progress import track
+from cortado.files.terminal import track
 from cortado.gradients import Estimate
 
 BLOCKS, HALF_SAMPLES, TOGETHER = 4, 6, 1024

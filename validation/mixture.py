@@ -18,7 +18,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import test_validation_mixture as validation
-from cortado.files.progress import track
+from cortado.files.terminal import track
 
 COLOURS = np.array([to_rgb(name) for name in ("#20364b", "#f0e2c4", "#b5523b", "#5b8a5a")])
 """Of pure phases."""

@@ -15,7 +15,7 @@ from benchmarks.bench.environment import environment
 from benchmarks.bench.scene import dam_break
 from cortado.device.launching import watched
 from cortado.discretise.shapes import Points
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import painter
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene

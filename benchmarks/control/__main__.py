@@ -12,8 +12,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from cortado.errors import CortadoError, InputError
-from cortado.files.folder_lock import locked
-from cortado.files.progress import track
+from cortado.files.output_files import locked
+from cortado.files.terminal import track
 
 from .catalogue import SIZES, TASKS, task
 from .contenders import CONTENDERS, contender

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado import DivergedError, InputError, Problem
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.losses import Image
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing
 

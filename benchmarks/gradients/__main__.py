@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.bench.environment import environment
 from cortado import CortadoError, InputError, __version__
 from cortado.executors import InProcess, local_workers
-from cortado.files.progress import track
+from cortado.files.terminal import track
 
 from .cells import HORIZONS, TRUTH, Bench, Cell
 from .controls import CONTROLS

@@ -20,7 +20,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.calibration import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
-from cortado.files.srgb import ShadedPicture
+from cortado.files.image_encoding import ShadedPicture
 from cortado.fixed import fixed
 from cortado.on_top import on_top
 from cortado.particles.state import State

@@ -9,7 +9,7 @@ from cortado.arrays import as_numbers, require_table
 from cortado.environments.gym import gymnasium
 from cortado.environments.scenes import Scenes
 from cortado.errors import InputError, shown
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.runs.trajectory import Frame
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}

@@ -1,9 +1,15 @@
-"""Files of users: only regular ones of a modest size are read, as a pipe may wait and a device may go on for ever."""
+"""Files that are read: of users only regular ones of a modest size, as a pipe may wait and a device may go on for ever;
+and those that come with Cortado."""
 
+import csv
 import errno
+import io
 import os
 import stat
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from cortado.errors import InputError, shown
 
@@ -14,7 +20,7 @@ OTHERS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-"""What a path may lead to that is no regular file."""
+"""Kinds of files that are no regular ones, with their names in a sentence."""
 
 
 def as_path(what: str, value: Any) -> str:
@@ -28,7 +34,7 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """What is known of a file that may be read; links are followed.
+    """The size and times of a file that may be read; links are followed.
 
     Raises `OSError`, whose ``strerror`` says why in words, if it is no regular file, or has more bytes than ``most``.
     """
@@ -62,3 +68,50 @@ def reason(problem: BaseException) -> str:
 
 def _too_large(size: int, most: int) -> OSError:
     return OSError(errno.EFBIG, f"it has {size:,} bytes, but must have at most {most:,}")
+
+
+MOST_BYTES = 2**28
+"""The largest table in CSV that is read."""
+
+
+def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """The columns of a table in CSV, (lines,) by the names in its first line; an entry that is left out is NaN. Raises
+    `InputError` for a file that is no such table."""
+    try:
+        text = content(path, MOST_BYTES).decode("utf-8-sig")
+        lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from None
+    names = [name.strip() for name in lines[0]] if lines else []
+    if len(names) == 1 and ";" in names[0]:
+        raise InputError(f"{path} has semicolons between its columns, but must have commas, and points in numbers.")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path} has {names.count(name)} columns {name!r}, but must have each of them once.")
+    if len(lines) < 2 or not all(names):
+        raise InputError(f"{path} must have a line of different names, such as time,force_x, and lines of numbers.")
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if len(line) != len(names):
+            raise InputError(f"{path}: line {number} has {len(line)} entries, but must have {len(names)}.")
+        rows.append([_number(entry, f"{path}: line {number}, {name}") for entry, name in zip(line, names, strict=True)])
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def _number(entry: str, where: str) -> float:
+    if not entry.strip():
+        return np.nan
+    try:
+        return float(entry)
+    except ValueError:
+        raise InputError(f"{where} is {shown(entry)}, but must be a number, or left out.") from None
+
+
+_PACKAGE = Path(__file__).parents[1]
+SCHEMA = _PACKAGE / "scene.schema.json"
+
+
+def examples_folder() -> Path:
+    """The folder of examples, in the package where a wheel was installed, or in the repository."""
+    installed = _PACKAGE / "examples"
+    return installed if installed.is_dir() else _PACKAGE.parents[1] / "examples"

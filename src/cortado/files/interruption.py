@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do to a command: a sentence and the exit code that shells expect, at any moment.
+"""Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect, at any moment.
 
 As long as there is nothing to keep, the process ends on the spot: an exception would come out of the import of some
 library, or get lost in it. Within `keeping` it is a `KeyboardInterrupt`, so that files are closed on the way out.
@@ -18,11 +18,11 @@ AGAIN = 0.01
 """[s] after which an interruption is tried again that came where Python drops exceptions, such as in a finaliser."""
 
 _stderr = 2
-"""A copy of its own, as stderr is silenced for a while when Warp starts."""
+"""A copy of the descriptor, as stderr is silenced for a while when Warp starts."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal; takes its number and what is kept, the rest of the sentence."""
+    """A signal that interrupts a command; takes its number and the end of the sentence, which says what is kept."""
 
     def __init__(self, number: int, kept: str = ""):
         super().__init__(number, kept)
@@ -35,7 +35,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def leave_at_once() -> None:
-    """From now on, end the process on the spot; a signal that is ignored stays so (nohup, background jobs)."""
+    """From now on end the process at a signal; one that is ignored stays so (nohup, background jobs)."""
     global _stderr
     with suppress(OSError):  # it may be closed
         _stderr = os.dup(2)
@@ -46,7 +46,7 @@ def leave_at_once() -> None:
 
 
 def finish() -> None:
-    """There is nothing left to interrupt."""
+    """From now on ignore signals, as the command has ended."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
@@ -70,8 +70,8 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """Lets signals wait for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal
-    sends to all of them."""
+    """Delays signals for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal sends
+    to all of them."""
 
     def __init__(self) -> None:
         self._late: list[int] = []
@@ -79,14 +79,14 @@ class Hold:
         self._handler: Any = None
 
     def begin(self) -> None:
-        """From now on they wait."""
+        """Delay signals from now on."""
         if hasattr(signal, "pthread_sigmask"):  # not on Windows
             self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         if signal.getsignal(signal.SIGTERM) in (_leave, _raise):  # a process that inherited a mask could not be ended
             self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
 
     def end(self) -> None:
-        """Those that came are delivered; it may be called again."""
+        """Deliver the signals that came; it may be called again."""
         if self._handler is not None:
             signal.signal(signal.SIGTERM, self._handler)
             self._handler = None
@@ -114,7 +114,7 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """What is kept, as an interruption says, or one that it came upon on its way out."""
+    """The end of the sentence of an interruption, or of the one that was being handled as it came."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

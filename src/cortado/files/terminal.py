@@ -1,4 +1,6 @@
-"""Messages to the user, whatever stands at the other end of stdout and stderr."""
+"""Messages to the user, whatever stands at the other end of stdout and stderr; how far a long computation is."""
+
+from __future__ import annotations
 
 import io
 import os
@@ -6,6 +8,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from typing import Any, Protocol, TextIO
 
 from cortado.errors import ComputationError
 
@@ -19,19 +23,19 @@ def printable(text: str) -> str:
 
 
 def say(sentence: str, end: str = "\n") -> None:
-    """One line on stderr: a mistake or a warning; the beginning of one with another ``end``."""
+    """Print one line on stderr, such as an error or a warning; the beginning of one with another ``end``."""
     print(printable(sentence), end=end, file=sys.stderr, flush=True)
 
 
 def note(sentence: str, end: str = "\n") -> None:
-    """What is good to know, on stderr, unless `quietly`: what is being done, how far it is."""
+    """Print what is being done on stderr, unless `quietly`."""
     if not is_quiet():
         say(sentence, end)
 
 
 @contextmanager
 def timed_note(what: str) -> Iterator[None]:
-    """One line as of `note`: what is done within, and at the end how long it took."""
+    """Print one line on stderr, unless `quietly`: what is done within, and at the end how long it took."""
     begun = time.monotonic()
     note(what, end="")
     try:
@@ -64,14 +68,14 @@ class _Quiet:
 
 
 def tell(result: str) -> None:
-    """A result, of one line or several, on stdout."""
+    """Print a result, of one line or several, on stdout."""
     with to_stdout():
         print("\n".join(map(printable, result.split("\n"))))
 
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """What is printed within it arrives; else raises `ComputationError`, or `BrokenPipeError` if nobody reads it."""
+    """Within it, prints that do not arrive raise `ComputationError`, or `BrokenPipeError` if nobody reads them."""
     try:
         try:
             yield
@@ -86,9 +90,9 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr of this process usable: streams that are closed go nowhere, but a
-    result that is written to a closed stdout fails, characters that the terminal
-    cannot show are escaped, and a stderr that nobody reads any more is no reason to stop."""
+    """Make stdout and stderr of this process usable: streams that are closed go nowhere, but a result that is written
+    to a closed stdout fails; characters that the terminal cannot show are escaped; and a stderr that nobody reads any
+    more is no reason to stop."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
@@ -122,3 +126,110 @@ def _point_nowhere(descriptor: int, mode: int = os.O_RDWR) -> None:
 def _escape(letter: str) -> str:
     code = ord(letter)
     return f"\\x{code - 0xDC00:02x}" if 0xDC80 <= code <= 0xDCFF else letter.encode("unicode_escape").decode()
+
+
+LINE_INTERVAL = 10.0
+"""[s] between two lines when the stream is no terminal."""
+
+
+def announce(result: str) -> None:
+    """Print a result on stdout before the work has ended, unless progress is not shown."""
+    if not _hidden.get() and not is_quiet():
+        tell(result)
+
+
+class Advance(Protocol):
+    """Reports `n` more steps done, with the latest values of anything worth seeing (loss=0.1)."""
+
+    def __call__(self, n: int = 1, **fields: Any) -> None: ...
+
+
+_hidden: ContextVar[bool] = ContextVar("hidden", default=False)
+
+
+@contextmanager
+def untracked() -> Iterator[None]:
+    """Within it no computation of this thread shows its progress, as each is a part of a larger one."""
+    token = _hidden.set(True)
+    try:
+        yield
+    finally:
+        _hidden.reset(token)
+
+
+@contextmanager
+def track(
+    total: int, description: str, *, stream: TextIO | None = None, interval: float | None = None
+) -> Iterator[Advance]:
+    """Shows the progress of `total` steps on a stream, stderr when none is given; where that is no terminal, by a line
+    every `interval` seconds, `LINE_INTERVAL` when none is given.
+
+    Use:
+        with track(120, "optimise") as advance:
+            for loss in ...:
+                advance(loss=loss)
+    """
+    stream = sys.stderr if stream is None else stream
+    if _hidden.get() or is_quiet():
+        yield lambda n=1, **fields: None
+    elif stream.isatty():
+        with _bar(total, description, stream) as advance:
+            yield advance
+    else:
+        yield _Lines(total, description, stream, LINE_INTERVAL if interval is None else interval)
+
+
+@contextmanager
+def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        TextColumn("{task.fields[shown]}", style="dim"),
+    )
+    with Progress(*columns, console=Console(file=stream)) as progress:
+        task = progress.add_task(description, total=total, shown="")
+
+        def advance(n: int = 1, **fields: Any) -> None:
+            shown: dict[str, Any] = {"shown": _text(fields)} if fields else {}
+            progress.update(task, advance=n, **shown)
+
+        yield advance
+
+
+class _Lines:
+    """Writes at most one line every `interval` seconds, and one for the last step. The time left follows from the steps
+    after the first report, before which kernels are compiled, or what an earlier process has done is skipped."""
+
+    def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
+        self._total, self._description, self._stream, self._interval = total, description, stream, interval
+        self._done = 0
+        self._first: tuple[int, float] | None = None
+        self._started = self._last_line = time.monotonic()
+
+    def __call__(self, n: int = 1, **fields: Any) -> None:
+        self._done += n
+        now = time.monotonic()
+        skipped, begun = self._first = self._first or (self._done, now)
+        is_last = self._done - n < self._total <= self._done
+        finished_late = is_last and now - self._started >= self._interval
+        if now - self._last_line < self._interval and not finished_late:
+            return
+        self._last_line = now
+        known = self._done <= self._total  # else there was more to do than was thought
+        words = [f"{self._description} {self._done}{f'/{self._total}' if known else ''}"]
+        if known and self._done > skipped:
+            left = (now - begun) * (self._total - self._done) / (self._done - skipped)
+            minutes, seconds = divmod(round(left), 60)
+            words.append(f"{minutes // 60}:{minutes % 60:02}:{seconds:02} left")
+        print(", ".join([*words, *filter(None, [_text(fields)])]), file=self._stream, flush=True)
+
+
+def _text(fields: dict[str, Any]) -> str:
+    """Fields as words: loss 0.1235, step 7."""
+    words = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in fields.items()}
+    return ", ".join(f"{name} {word}" for name, word in words.items())

@@ -14,7 +14,7 @@ from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction, sum_of
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
-from cortado.files.srgb import LIGHT, check_light
+from cortado.files.image_encoding import LIGHT, check_light
 from cortado.fixed import fixed
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Adjoint, Snapshot, SnapshotAdjoint, SnapshotBatch

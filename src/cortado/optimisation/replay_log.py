@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cortado.errors import ComputationError, InputError
-from cortado.files.atomic import parsed_json, sentences, write_atomically, write_fully
+from cortado.files.output_files import parsed_json, sentences, write_atomically, write_fully
 from cortado.runs.run_folder import REPLAY_LOG
 
 Vector = npt.NDArray[np.float64]

@@ -15,8 +15,8 @@ import numpy as np
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError
-from cortado.files.animation import moving_picture
-from cortado.files.progress import track
+from cortado.files.image_encoding import moving_picture
+from cortado.files.terminal import track
 from cortado.pictures.plane import PlanePainter, PlaneStage
 from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.space import SpacePainter, State

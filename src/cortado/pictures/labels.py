@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-from cortado.files.srgb import from_srgb
+from cortado.files.image_encoding import from_srgb
 from cortado.scene.quantities import QUANTITIES
 
 FINER = 3

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.discretise.shapes import Points, corners
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.stage import upright

@@ -12,9 +12,9 @@ from cortado.arrays import whole_number
 from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.shapes import Points, corners
 from cortado.errors import InputError, SceneError, shown
+from cortado.files.image_encoding import ShadedPicture
 from cortado.files.input_files import as_path
-from cortado.files.progress import announce
-from cortado.files.srgb import ShadedPicture
+from cortado.files.terminal import announce
 from cortado.particles.fields import Entry
 from cortado.pictures.film import LEAST, Page, alone, film, lacking
 from cortado.pictures.image_files import write_picture

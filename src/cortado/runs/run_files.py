@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import LONGEST, InputError, shown
-from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
+from cortado.files.output_files import parsed_json
 from cortado.version import __version__
 
 FORMER_FRAMES = 120

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from cortado.errors import CortadoWarning, InputError, SceneError
-from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.files.output_files import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.runs.run_files import (
     as_json,
     bytes_of,

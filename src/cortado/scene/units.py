@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-from cortado.files.shipped import SCHEMA
+from cortado.files.input_files import SCHEMA
 
 Schema = dict[str, Any]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.files.atomic import parsed_json
 from cortado.files.input_files import content, reason
+from cortado.files.output_files import parsed_json
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory

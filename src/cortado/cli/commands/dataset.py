@@ -10,10 +10,9 @@ from typing import Any
 
 from cortado.cli.commands.executor import HERE, Where
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, shown, warn
-from cortado.files.atomic import UNFINISHED, sentences, write_atomically
-from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import keeping
-from cortado.files.progress import track, untracked
+from cortado.files.output_files import LOCK, UNFINISHED, locked, sentences, write_atomically
+from cortado.files.terminal import track, untracked
 from cortado.optimisation.datasets.layout import METADATA, Parts, assemble, metadata, remove_parts, write_metadata
 from cortado.optimisation.datasets.one_run import one_run
 from cortado.optimisation.datasets.sample import Sample

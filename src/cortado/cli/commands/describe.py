@@ -18,7 +18,7 @@ from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.cli.commands.run_length import RunLength
 from cortado.device.memory import step_parts
 from cortado.errors import DivergedError, InputError
-from cortado.files.atomic import sentences
+from cortado.files.output_files import sentences
 from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task

@@ -6,8 +6,8 @@ import tomllib
 from pathlib import Path
 
 from cortado.errors import InputError, shown
-from cortado.files.atomic import is_taken, sentences, write_atomically
-from cortado.files.shipped import examples_folder
+from cortado.files.input_files import examples_folder
+from cortado.files.output_files import is_taken, sentences, write_atomically
 from cortado.files.terminal import is_quiet
 
 ALL = "all"

@@ -5,8 +5,8 @@ from typing import Any
 
 from cortado.cli.commands.fit_report import for_machines, sections
 from cortado.errors import ComputationError
-from cortado.files.folder_lock import locked
-from cortado.files.progress import announce, track
+from cortado.files.output_files import locked
+from cortado.files.terminal import announce, track
 from cortado.optimisation.fitting.fit import fit
 from cortado.optimisation.fitting.fitted import Fit, Profile
 from cortado.optimisation.inverse.fit_task import FitTask, load_fit

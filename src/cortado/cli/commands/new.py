@@ -4,8 +4,8 @@ from pathlib import Path
 from string import Template
 
 from cortado.errors import InputError, shown
-from cortado.files.atomic import is_taken, sentences, write_atomically
-from cortado.files.shipped import SCHEMA
+from cortado.files.input_files import SCHEMA
+from cortado.files.output_files import is_taken, sentences, write_atomically
 
 _SCENE = Template("""\
 #:schema ./scene.schema.json

@@ -13,10 +13,9 @@ from cortado.cli.commands.optimise_report import asked, for_machines, sections
 from cortado.cli.commands.verdict import MOST_ERROR, Verdict, found_in_words, judge
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
-from cortado.files.folder_lock import locked
 from cortado.files.interruption import keeping
-from cortado.files.progress import announce, track
-from cortado.files.terminal import say
+from cortado.files.output_files import locked
+from cortado.files.terminal import announce, say, track
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.figures import task_figures
 from cortado.optimisation.inverse.knots import knot_values

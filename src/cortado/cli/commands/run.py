@@ -15,9 +15,9 @@ from cortado.cli.commands.run_summary import RunSummary
 from cortado.device.compiling import compile_ahead
 from cortado.device.memory import frame_parts, require
 from cortado.errors import DivergedError, InputError, warn
-from cortado.files.folder_lock import locked
 from cortado.files.interruption import keeping
-from cortado.files.progress import announce
+from cortado.files.output_files import locked
+from cortado.files.terminal import announce
 from cortado.pictures.report import Section
 from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Rollout

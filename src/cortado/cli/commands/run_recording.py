@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.files.progress import track
+from cortado.files.terminal import track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
 from cortado.rollout.durations import done_of, ends_at_a_time

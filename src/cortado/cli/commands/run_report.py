@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from cortado.cli.commands.run_summary import simulated, sizes_in_words
+from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
-from cortado.files.video import write_video
 from cortado.pictures.film import lacking
 from cortado.pictures.plots import images, particles
 from cortado.pictures.report import Figures, Section, write_report

@@ -12,9 +12,9 @@ from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, warn
-from cortado.files.folder_lock import LOCK, locked
 from cortado.files.interruption import Interrupted, keeping
-from cortado.files.progress import track, untracked
+from cortado.files.output_files import LOCK, locked
+from cortado.files.terminal import track, untracked
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.sweep.combinations import Combination, combinations
 from cortado.optimisation.sweep.table import NAME, failed, write_table

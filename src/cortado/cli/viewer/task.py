@@ -13,7 +13,7 @@ from cortado.cli.viewer.quantities import UNITS
 from cortado.cli.viewer.recorded import RecordedView
 from cortado.cli.viewer.window import PULL, in_words
 from cortado.errors import CortadoError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.optimisation.inverse.figures import component_names
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.optimise import optimise

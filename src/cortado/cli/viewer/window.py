@@ -9,7 +9,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.errors import CortadoError, InputError
-from cortado.files.srgb import to_srgb
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import container_outline, outline
 from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
 from cortado.pictures.stage import upright

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import ComputationError
-from cortado.files.atomic import sentences, unfinished, write_atomically
+from cortado.files.output_files import sentences, unfinished, write_atomically
 from cortado.optimisation.datasets.one_run import OneRun, periods_of
 from cortado.optimisation.datasets.table import DatasetTable
 from cortado.scene.scene import Scene

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.files.video import write_video
+from cortado.files.image_encoding import write_video
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.shaded import step_pace
 from cortado.optimisation.inverse.task import Task

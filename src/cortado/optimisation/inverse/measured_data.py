@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.files.csv_columns import read_columns
+from cortado.files.input_files import read_columns
 from cortado.optimisation.fitting.observation import Observation
 from cortado.optimisation.fitting.sensor_series import SensorSeries
 from cortado.optimisation.fitting.tracks import Tracks

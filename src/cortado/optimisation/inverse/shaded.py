@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.device.compiling import compile_meanwhile
 from cortado.discretise.shapes import Points
-from cortado.files.progress import announce
+from cortado.files.terminal import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task_figures import TaskFigures

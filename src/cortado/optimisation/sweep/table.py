@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cortado.files.atomic import write_atomically
+from cortado.files.output_files import write_atomically
 from cortado.optimisation.sweep.combinations import Combination
 
 NAME = "sweep.csv"

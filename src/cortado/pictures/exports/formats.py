@@ -11,10 +11,10 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError, ExtraMissingError, InputError, shown
-from cortado.files.atomic import sentences, unfinished, write_atomically
+from cortado.files.image_encoding import to_srgb
 from cortado.files.input_files import as_path
-from cortado.files.progress import announce, track
-from cortado.files.srgb import to_srgb
+from cortado.files.output_files import sentences, unfinished, write_atomically
+from cortado.files.terminal import announce, track
 from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pose, in_space
 from cortado.runs.frame_file import FRACTION
 from cortado.runs.solid_motion import SolidMotion

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import DivergedError, InputError, shown
-from cortado.files.csv_columns import read_columns
+from cortado.files.input_files import read_columns
 from cortado.runs.sensors.sensor import Reading, Sensor, value_of
 
 TIME = "time [s]"

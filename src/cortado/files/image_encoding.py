@@ -1,0 +1,340 @@
+"""Linear images as files and screens hold them: eight bits of sRGB (IEC 61966-2-1), videos that every browser plays
+(H.264 in an mp4), and animated WebPs, which pages of text show moving without a player."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from fractions import Fraction
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.arrays import as_numbers
+from cortado.errors import InputError
+from cortado.files.interruption import held
+from cortado.files.output_files import sentences, unfinished, write_atomically
+
+ROWS = 32
+"""Rows of a picture that are converted at a time, so that they stay in the processor's cache."""
+MOST_LIGHT = 2.0
+"""The largest value of a picture of a user, as noise may leave 0 to 1: more is taken for values of a file, to 255."""
+STEPS = 1 << 14
+"""Equal parts of the light from 0 to 1, each much shorter than the light that has one of 256 values."""
+LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
+
+
+def check_light(what: str, image: ArrayLike) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, for a picture with values of a file, up to 255."""
+    if np.asarray(image).dtype.kind in "iu":
+        raise InputError(f"{what} is made of whole numbers, but must be {LIGHT}.")
+    light = as_numbers(what, image)
+    furthest = light.flat[np.abs(light).argmax()]
+    if abs(furthest) > MOST_LIGHT:
+        raise InputError(f"{what} has a value of {furthest:g}, but must be {LIGHT}.")
+
+
+def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
+    """The values (rows, columns, 3) in 0..255 of a linear image of that shape; light below 0 and above 1 is clipped.
+    ``each`` maps a function over parts of it, such as ``map`` of an executor, whose threads share them.
+
+    Raises:
+        InputError: another shape, or values that are not finite.
+    """
+    light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
+    if light.ndim != 3 or light.shape[2] != 3 or not light.size:
+        raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
+    found = np.empty(light.shape, dtype=np.uint8)
+
+    def convert(row: int) -> None:
+        found[row : row + ROWS] = _values(light[row : row + ROWS])
+
+    for _ in each(convert, range(0, len(light), ROWS)):
+        pass
+    return found
+
+
+def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
+    if not np.isfinite(light).all():
+        raise InputError("The image has values that are not finite; look where it was computed.")
+    light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
+    bounds, values = _steps(light.dtype)
+    steps = (light.dtype.type(STEPS) * light).astype(np.uint16)
+    found = values.take(steps, mode="clip")  # all are there, and unchecked
+    found += light >= bounds.take(found, mode="clip")  # at most one value begins within a step
+    return found
+
+
+@cache
+def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """(256,) the least light of each value but 0, and (STEPS + 1,) the value at the beginning of each step."""
+    middles = (np.arange(1, 257) - 0.5) / 255.0
+    exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
+    rounded = exact.astype(dtype)
+    bounds = np.where(rounded < exact, np.nextafter(rounded, dtype.type(2.0)), rounded)
+    return bounds, np.searchsorted(bounds, np.arange(STEPS + 1) / STEPS, side="right").astype(np.uint8)
+
+
+def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Linear light from 0 to 1, from values in 0..255 of any shape."""
+    curved = values / 255.0
+    return np.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)
+
+
+def png(image: ArrayLike) -> bytes:
+    """The bytes of a PNG file with 8 bits of sRGB, of a linear image (rows, columns, 3), clipped to 0..1; errors as of
+    `to_srgb` and `check_light`."""
+    from PIL import Image
+
+    pixels, content = to_srgb(image), BytesIO()
+    check_light("The image", image)
+    Image.fromarray(pixels).save(content, format="PNG")
+    return content.getvalue()
+
+
+class ShadedPicture(np.ndarray):
+    """A picture (rows, columns, 3), linear from 0 to 1: an array that a notebook shows as a picture."""
+
+    @classmethod
+    def of(cls, image: ArrayLike) -> Self:
+        """A view of the same numbers."""
+        return np.asarray(image).view(cls)
+
+    def _repr_png_(self) -> bytes | None:
+        """The PNG of it; None for a part of another shape, such as one row."""
+        return png(self) if self.ndim == 3 and self.shape[2] == 3 else None
+
+
+VIDEO_QUALITY = "18"
+"""Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
+BITS = 1.2e6
+"""A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
+THREADS = 8
+"""Threads of the encoder, each at a frame of its own while others are drawn; however many cores there are, as the file
+depends on it."""
+HELPERS = 4
+"""Threads that convert the parts of a frame."""
+TICKS = 90_000
+"""Parts of a second in which times of frames are counted."""
+
+
+class MovingPicture(Protocol):
+    """A film that grows by a frame at a time."""
+
+    frames: int
+    """The number of frames so far."""
+
+    def add(self, image: ArrayLike, time: float) -> None:
+        """Add a frame, a linear image (rows, columns, 3), shown from a time [s] on."""
+
+
+class Video:
+    """A video that grows by a frame at a time; see `writing`."""
+
+    def __init__(self, container: Any, frames_per_second: float):
+        from av.video.reformatter import VideoReformatter
+
+        self._container, self._rate, self._reformatter = container, frames_per_second, VideoReformatter()
+        self._helpers = ThreadPoolExecutor(HELPERS, thread_name_prefix="cortado-video")
+        self._stream: Any = None
+        self._shape: tuple[int, ...] | None = None
+        self.frames = 0
+        """The number of frames so far."""
+
+    def add(self, image: ArrayLike, time: float) -> None:
+        """See `MovingPicture`. The last row or column is repeated where a side is odd."""
+        from av import VideoFrame
+
+        pixels = to_srgb(image, self._helpers.map)
+        self._shape = self._shape or pixels.shape
+        if pixels.shape != self._shape:
+            found = f"Frame {self.frames} of the video has shape {pixels.shape}"
+            raise InputError(f"{found}, but those before it {self._shape}.")
+        rows, columns = (side % 2 for side in pixels.shape[:2])
+        if rows or columns:  # yuv420p has a colour for 2 x 2 pixels
+            pixels = np.pad(pixels, ((0, rows), (0, columns), (0, 0)), mode="edge")
+        stream = self._stream_of(pixels.shape[1], pixels.shape[0])
+        colours: dict[str, Any] = {"format": "yuv420p", "dst_colorspace": "ITU709", "dst_color_range": "MPEG"}
+        whole = VideoFrame.from_ndarray(pixels, format="rgb24")
+        frame = self._reformatter.reformat(whole, **colours, threads=HELPERS)
+        frame.pts, frame.duration, frame.time_base = round(time * TICKS), round(TICKS / self._rate), stream.time_base
+        with held():
+            self._container.mux(stream.encode(frame))
+            self.frames += 1
+
+    def copy(self, other: Any) -> None:
+        """Copy the frames of an open video that was written by this class, before others are added."""
+        from av.bitstream import BitStreamFilterContext
+
+        source = other.streams.video[0]
+        own, plain = self._stream_of(source.width, source.height), BitStreamFilterContext("h264_mp4toannexb", source)
+        for packet in other.demux(source):
+            for part in plain.filter(None if packet.dts is None else packet):
+                part.stream = own
+                self._container.mux(part)
+        self.frames = source.frames
+
+    def finish(self) -> None:
+        """Write what the encoder still holds."""
+        self._helpers.shutdown()
+        if self._stream is not None:
+            self._container.mux(self._stream.encode())
+
+    def _stream_of(self, width: int, height: int) -> Any:
+        """The stream, made for the first frame. No frame depends on a later one, so that others can follow a copy."""
+        if self._stream is None:
+            most = BITS * (width * height / (1920 * 1080)) ** 0.75
+            options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
+            rate = Fraction(self._rate).limit_denominator(1001)
+            self._stream = self._container.add_stream("libx264", rate=rate, options=options)
+            self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+            context = self._stream.codec_context
+            self._stream.time_base = context.time_base = Fraction(1, TICKS)
+            context.thread_count, context.thread_type = THREADS, "FRAME"
+            # Primaries and matrix of BT.709, curve of sRGB, 16 to 235: the numbers of ITU-T H.273.
+            context.color_primaries, context.colorspace, context.color_trc, context.color_range = 1, 1, 13, 1
+        return self._stream
+
+
+@contextmanager
+def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
+    """A video that appears under its path when the block ends. Where it is interrupted, the frames so far appear, and
+    the next call with the same ``note`` and ``count`` begins with them.
+
+    Args:
+        path: ends in .mp4.
+        frames_per_second: about; each frame has a time of its own.
+        note: what the video is made of, which is written into it.
+        count: how many frames it will have.
+
+    Raises:
+        InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
+        ComputationError: the disk is full.
+    """
+    av, path = pyav(), Path(path)
+    if path.suffix.lower() != ".mp4":
+        raise InputError(f"The film {path} must end in .mp4, or in .webp.")
+    if not 0.0 < frames_per_second < np.inf:
+        raise InputError(f"frames_per_second is {frames_per_second}, but must be a positive number.")
+    temporary = unfinished(path)
+    with sentences(path):
+        try:
+            with open(temporary, "xb") as file:
+                container = av.open(file, "w", format="mp4", options={"movflags": "+faststart"})
+                container.metadata["comment"] = note
+                video = Video(container, frames_per_second)
+                _copy_interrupted(av, video, path, note, count)
+                try:
+                    yield video
+                except KeyboardInterrupt:
+                    if video.frames:
+                        _end(video, container, file)
+                        os.replace(temporary, path)
+                    raise
+                if not video.frames:
+                    raise InputError(f"The video {path} has no frames; give one at least.")
+                _end(video, container, file)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25.0) -> Path:
+    """Write a video of linear images (rows, columns, 3) of one size, taken one at a time, and return its path; errors
+    as of `writing`."""
+    with writing(path, frames_per_second) as video:
+        for k, frame in enumerate(frames):
+            video.add(frame, k / frames_per_second)
+    return Path(path)
+
+
+def _copy_interrupted(av: Any, video: Video, path: Path, note: str, count: int) -> None:
+    """Copy the frames of the video that is there, if it was interrupted and has the same note."""
+    if not note or not path.is_file():
+        return
+    try:
+        former = av.open(str(path))
+    except (av.error.FFmpegError, OSError):
+        return  # it is no video
+    with former:
+        ours = former.metadata.get("comment") == note and len(former.streams.video) == 1
+        if ours and 0 < former.streams.video[0].frames < count:
+            video.copy(former)
+
+
+def _end(video: Video, container: Any, file: Any) -> None:
+    with held():
+        video.finish()
+        container.close()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def pyav() -> Any:
+    """The library; raises `InputError` where it is missing."""
+    try:
+        import av
+    except ModuleNotFoundError as problem:
+        raise InputError("Videos need PyAV, which is not installed: pip install av.") from problem
+    return av
+
+
+# ---- animations --------------------------------------------------------------------------------------------------
+
+ANIMATION_QUALITY = 80
+"""Quality of lossy WebP, from 0 to 100."""
+REST = 1.5
+"""Seconds that the last frame is shown before the first one comes again."""
+
+
+class Animation:
+    """The frames of an animated WebP, in memory until all of them are there."""
+
+    def __init__(self) -> None:
+        self._images: list[NDArray[np.uint8]] = []
+        self._times: list[float] = []
+        self.frames = 0
+        """The number of frames so far."""
+
+    def add(self, image: ArrayLike, time: float) -> None:
+        """See `MovingPicture`."""
+        self._images.append(to_srgb(image))
+        self._times.append(time)
+        self.frames += 1
+
+    def encoded(self) -> bytes:
+        """The content of the file, which repeats for ever."""
+        from PIL import Image
+
+        first, *others = [Image.fromarray(pixels) for pixels in self._images]
+        durations = [*np.diff(self._times), REST]
+        content, milliseconds = BytesIO(), [max(round(1e3 * float(seconds)), 1) for seconds in durations]
+        own = {"duration": milliseconds, "loop": 0, "quality": ANIMATION_QUALITY, "method": 4}
+        first.save(content, format="WEBP", save_all=True, append_images=others, **own)
+        return content.getvalue()
+
+
+@contextmanager
+def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[MovingPicture]:
+    """An animation of a path that ends in .webp, and else a video: see `writing`. An animation appears under its path
+    when the block ends; where it is interrupted, with the frames so far."""
+    if path.suffix.lower() != ".webp":
+        with writing(path, frames_per_second, note, count) as video:
+            yield video
+        return
+    animation = Animation()
+    try:
+        yield animation
+    except KeyboardInterrupt:
+        if animation.frames:
+            write_atomically(path, animation.encoded())
+        raise
+    if not animation.frames:
+        raise InputError(f"The animation {path} has no frames; give one at least.")
+    write_atomically(path, animation.encoded())

@@ -1,0 +1,181 @@
+"""Files that appear whole or not at all, and folders that one process at a time writes; one sentence where a disk
+refuses."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from cortado.errors import ComputationError, InputError
+
+UNFINISHED = ".cortado-*.tmp"
+"""Pattern of the names under which files are written before they appear; a killed process leaves them behind."""
+_REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""Errors of a disk that is full, has a quota or a limit, or is broken."""
+
+
+def unfinished(path: Path) -> Path:
+    """A name beside `path` that nobody can guess; open it with "x", which follows no links."""
+    return path.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Writes a whole file under a temporary name and then renames it, so that no reader meets half of it.
+
+    Raises:
+        ComputationError: the disk is full.
+        InputError: there can be no such file, or something of that name is no file, such as a device.
+    """
+    temporary = unfinished(path)
+    with sentences(path):
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path} is a device or a pipe, which would be replaced; choose the name of a file.")
+        try:
+            with open(temporary, "xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def is_taken(path: Path) -> bool:
+    """Whether something of that name is there, also a link that leads nowhere. Raises `InputError` where nothing can be
+    looked for, as with a name that is too long."""
+    with sentences(path):
+        try:
+            path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
+
+
+def write_fully(file: Any, content: bytes) -> None:
+    """Writes to a file without a buffer, which may take a part at a time."""
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
+
+
+def parsed_json(text: bytes) -> Any:
+    """The value of a text in JSON; raises `ValueError`, also for one that is nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+@contextmanager
+def sentences(path: Path) -> Iterator[None]:
+    """Within it, errors of the disk become errors with a sentence about this file or folder.
+
+    Raises:
+        ComputationError: the disk is full or broken.
+        InputError: any other `OSError`, such as a folder that may not be written.
+    """
+    try:
+        yield
+    except OSError as problem:
+        reason = problem.strerror or problem
+        if problem.errno in _REFUSALS:
+            raise ComputationError(
+                f"{path} cannot be written: {reason}; free some space, or choose another place."
+            ) from problem
+        raise InputError(f"{path} cannot be written: {reason}; choose another place.") from problem
+
+
+BEYOND = 2**30
+"""The byte that Windows locks, far behind what the file holds, which others may then read."""
+
+
+def lock(file: int) -> None:
+    """Lock a file by its descriptor, until it is closed or its process dies; raises `BlockingIOError` where another
+    process has it. The package filelock does not tell who has a lock, which `locked` reads in the file."""
+    if sys.platform != "win32":
+        import fcntl
+
+        return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    import msvcrt
+
+    os.lseek(file, BEYOND, os.SEEK_SET)
+    try:
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    except OSError as error:  # of a kind that is the same for every reason
+        raise BlockingIOError(*error.args) from error
+    finally:
+        os.lseek(file, 0, os.SEEK_SET)
+
+
+LOCK = ".lock"
+"""Name of the file that is locked; it is there while a process writes the folder, or was killed."""
+_NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes the folder, and refuses it to every other process until the block ends.
+
+    The system takes the lock from a process that dies, so that none is left behind. On file systems without
+    locks, as some networks have them, folders are not protected.
+
+    Raises:
+        InputError: another process has it, or it cannot be written.
+        ComputationError: the disk is full.
+    """
+    path = folder / LOCK
+    with sentences(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = _open_locked(path)
+    try:
+        yield
+    finally:
+        with suppress(PermissionError):  # on Windows no open file can be removed: it stays, unlocked
+            path.unlink(missing_ok=True)
+        os.close(file)
+
+
+def _open_locked(path: Path) -> int:
+    """The file descriptor of the locked file, which names this process."""
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        try:
+            _lock(file, path.parent)
+            if _is_at(path, file):
+                with suppress(OSError):  # a full disk: the lock holds without the name
+                    os.ftruncate(file, 0)
+                    os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
+                return file
+        except BaseException:
+            os.close(file)
+            raise
+        os.close(file)
+
+
+def _lock(file: int, folder: Path) -> None:
+    try:
+        lock(file)
+    except BlockingIOError:
+        owner = os.read(file, 200).decode(errors="replace") or "another process"
+        raise InputError(
+            f"{folder} is being written by {owner}; wait until that has ended, or choose another --out."
+        ) from None
+    except OSError as problem:
+        if problem.errno not in _NOT_SUPPORTED:
+            raise
+
+
+def _is_at(path: Path, file: int) -> bool:
+    """Whether a path still names the open file, which another process may have removed as it ended."""
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(file))
+    except FileNotFoundError:
+        return False
