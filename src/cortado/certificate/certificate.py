@@ -32,8 +32,7 @@ from cortado.gradients import AdjointNorms
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
-from cortado.runs.run_environment import as_json
-from cortado.runs.run_files import finite
+from cortado.runs.run_files import as_json, finite
 from cortado.scene.parameters.parameter import Range, Role
 from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.scene import Scene
