@@ -12,9 +12,8 @@ import cortado
 from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
 from cortado.discretise.smoothing import KERNELS
 from cortado.scene.stability import stability_limits
-from cortado.sph.curvature_constants import CurvatureConstants
-from cortado.sph.curvature_tension import CurvatureTension
-from cortado.sph.surface_tension import SurfaceTension
+from cortado.sph.curvature import CurvatureConstants
+from cortado.sph.surface_tension import CurvatureTension, SurfaceTension
 from oscillating_drops import C2, C4, CUBIC
 from reference_curvature import Curvature
 from scenes import plane

@@ -13,14 +13,12 @@ import test_kernels
 from cortado.forces import Body, Pair
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Layout
-from cortado.sph.curvature_derivatives import curvature_adjoints, curvature_tangents
-from cortado.sph.curvature_kernels import curvature_kernels, entries
-from cortado.sph.emitter import Nozzle
-from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
-from cortado.sph.surface_normals import normal_kernels
+from cortado.sph.curvature_kernels import curvature_adjoints, curvature_kernels, curvature_tangents, entries
+from cortado.sph.emitter import Nozzle, emitter_kernels, nozzle_type
 from cortado.sph.surface_stress import surface_tension_kernels
+from cortado.sph.surface_tension import normal_kernels
 from cortado.sph.vorticity import circulation_kernels
-from cortado.sph.wall_slope import wall_slope_term
+from cortado.sph.walls import wall_slope_term
 from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros
 
 VECTORS = np.zeros((N, 3))

@@ -12,7 +12,7 @@ from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.solid_motion import posed
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.solid_shapes import AnySolid
-from cortado.solvers.contact_strength import STIFFNESS
+from cortado.solvers.contact_kernels import STIFFNESS
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
 from scenes import thrown

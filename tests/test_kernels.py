@@ -28,17 +28,15 @@ from cortado.scene.parameters.reference_density import (
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.solvers.pcisph.begin_adjoint import begin_adjoint_kernel
-from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
-from cortado.solvers.pcisph.pressure import pressure_kernels
-from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
-from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.relaxation import density_ratio_kernels, wall_kernels
+from cortado.solvers.pcisph.steps import begin_adjoint_kernel
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.gravity import gravity_kernels
 from cortado.sph.integration import integration_kernels
-from cortado.sph.materials import mixture_kernels
+from cortado.sph.mixture import mixture_kernels
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from cortado.sph.viscosity_law import newtonian_law

@@ -17,18 +17,16 @@ from cortado.errors import InputError
 from cortado.gradients.adjoint_filters import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import fill_kernel
-from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
-from cortado.solvers.pcisph.pressure import pressure_kernels
-from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
-from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.relaxation import density_ratio_kernels, wall_kernels
 from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
 from cortado.sph.stress_kernels import stress_kernels
-from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
+from cortado.sph.surface_tension import normal_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from cortado.sph.viscosity_law import newtonian_law
 from scenes import scene

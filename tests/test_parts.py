@@ -8,9 +8,8 @@ from cortado import Problem, Simulation, gradients
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.parameter import Axis
-from cortado.sph.carried import Carried
 from cortado.sph.gravity import Gravity
-from cortado.sph.part import Part
+from cortado.sph.parts import Carried, Part
 from remembering_force import TAU, Memory, MemoryForce, U
 from scenes import jet, plane, two_layers
 

@@ -18,34 +18,35 @@ ROOT = Path(cortado.__file__).parent
 
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
-    "sph.emitter_kernels": {"emitter_kernels.collect"},
-    "sph.curvature_functions": {"curvature_functions.normal_back"},
-    "sph.curvature_sums": {
+    "sph.emitter": {"emitter_kernels.collect"},
+    "sph.curvature": {
+        "curvature_functions.normal_back",
         *("curvature_sums.colour_back", "curvature_sums.average_back"),
         *("curvature_sums.bend_back", "curvature_sums.mean_back"),
     },
     "sph.surface_stress": {"tension_functions.stress_derivative"},
-    "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
-    "solvers.projection.shifting": {"shift_functions.back"},
+    "sph.implicit_viscosity": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.images": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
-    "solvers.projection.coarse_sums": {"coarse_sums.push_back"},
-    "solvers.projection.following": {"change_functions.back"},
+    "solvers.projection.coarse_residual": {"coarse_sums.push_back"},
+    "solvers.projection.motion": {"shift_functions.back", "change_functions.back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),
         *("projection_sums.divergence_back", "projection_sums.velocity_gradient_back", "projection_sums.push_back"),
     },
-    "solvers.projection.beside": {"beside_sums.beside_back", "_work.beside_work"},
+    "solvers.projection.walls": {"beside_sums.beside_back", "_work.beside_work"},
     "solvers.projection.body_kernels": {"body_kernels.push_back"},
     "solvers.projection.body_motion": {"motion_kernels.slower"},
-    "solvers.pcisph.pressure_force": {"_work.pressure_work"},
+    "solvers.pcisph.pressure": {"_work.pressure_work"},
     "particles.solid_shares": {"solid_kernel.share"},
     "sph.rotations": {"rotations.back", "rotations.back_about_z"},
     "sph.density": {"_density_work.density_work"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
-    "sph.wall_slope": {"_work.wall_slope_work"},
-    "sph.packed": {"packing_kernels.add_number"},
-    "sph.stress_functions": {"stress_functions.back"},
-    "sph.stress_moments": {"moment_sums.moments_back", "moment_sums.wall_moments_back", "moments_work.moments_work"},
+    "sph.walls": {"_work.wall_slope_work"},
+    "sph.formula": {"packing_kernels.add_number"},
+    "sph.stress_functions": {
+        *("stress_functions.back", "moments_work.moments_work"),
+        *("moment_sums.moments_back", "moment_sums.wall_moments_back"),
+    },
     "sph.stress_forces": {
         *("stress_sums.traction_back", "stress_sums.wall_traction_back"),
         *("stress_sums.force_back", "stress_sums.wall_force_back", "stress_work.stress_work"),
@@ -59,16 +60,16 @@ SHARED = {
     "losses.distances": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
-    "solvers.contact_strength": {"strength_kernels.part"},
-    "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
+    "solvers.contact_kernels": {"strength_kernels.part"},
+    "solvers.pcisph.relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
-    "sph.curvature_functions": {"curvature_functions.rise", "curvature_functions.curvature_back"},
-    "sph.free_functions": {"free_functions.twist", "free_functions.write_twist"},
+    "sph.curvature": {"curvature_functions.rise", "curvature_functions.curvature_back"},
+    "sph.free_kernels": {"free_functions.twist", "free_functions.write_twist"},
     "sph.rotations": {"rotations.further_about_z"},
-    "sph.surface_normals": {"normal_kernels.change"},
+    "sph.surface_tension": {"normal_kernels.change"},
     "sph.surface_stress": {"tension_functions.pull_derivative"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
-    "sph.wall_contact": {"contact_functions.hold_gradient"},
+    "sph.stress_forces": {"contact_functions.hold_gradient"},
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
@@ -76,11 +77,9 @@ ELSEWHERE = {
     "particles.by_hand": "it notes adjoints and has none",
     "device.compiling": "it compiles adjoints and has none",
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
-    "sph.body": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
-    "sph.pair": "the same",
+    "sph.own_force": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
-    "solvers.projection.pressed": "of a quantity too: tests/test_quantities.py",
     "solvers.projection.mean_stress": "of a quantity too: tests/test_mean_stress.py",
     "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
     "sph.stress_wall_kernels": "of loads too",
@@ -283,7 +282,7 @@ SCENES = {
 }
 
 
-IN_EVERY_RUN = ("sph.density", "sph.viscosity", "solvers.pcisph.pressure_force")
+IN_EVERY_RUN = ("sph.density", "sph.viscosity", "solvers.pcisph.pressure")
 """Modules of adjoints whose plants are looked for in the scene "one phase" alone, but for those of solids' work."""
 
 

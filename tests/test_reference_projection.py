@@ -10,7 +10,7 @@ from cortado import InputError, Problem, Simulation, losses, reference
 from cortado.reference import Terms
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.walls import mirrors_of
-from cortado.solvers.projection.coarse_grid import coarse_grid
+from cortado.solvers.projection.lattice import coarse_grid
 from reference_projection import Projection
 from scenes import plane, scene
 from test_projection import C2, CASES, HURLED, PERIODIC, SOLVER, begun, thrown

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cortado.sph.curvature_constants import CurvatureConstants
+from cortado.sph.curvature import CurvatureConstants
 from oscillating_drops import C2, C4, Drop, exact_mode, packed_disc
 
 pytestmark = pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")

@@ -4,10 +4,9 @@ import numpy as np
 
 import reference
 from cortado.discretise.calibration import stress_control
-from cortado.sph.curvature_constants import CurvatureConstants
-from cortado.sph.curvature_tension import CurvatureTension
+from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.emitter import Nozzle
-from cortado.sph.surface_tension import SurfaceTension, tension_constants
+from cortado.sph.surface_tension import CurvatureTension, SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
 from reference_curvature import Curvature
 from reference_stress import Stress

@@ -48,12 +48,11 @@ from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
 from cortado.solvers.build import first_capacity
-from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
-from cortado.solvers.named import forces_named, solver_named
+from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver, forces_named, solver_named
 from cortado.solvers.solver import Solver
+from cortado.sph.diffusion import stable_substeps
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
-from cortado.sph.substeps import stable_substeps
 from cortado.watching import Watch
 from cortado.words import counted
 
@@ -382,7 +381,7 @@ class Simulation(Stepping):
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
         """Explicit steps of diffusion within a time step that are stable under these parameters; raises `InputError`
-        where there would be more than `cortado.sph.substeps.MOST_SUBSTEPS`."""
+        where there would be more than `cortado.sph.diffusion.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)

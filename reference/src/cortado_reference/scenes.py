@@ -12,8 +12,7 @@ from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
 from cortado.scene.walls import mirrors_of
-from cortado.solvers.projection.coarse_grid import coarse_grid, endless
-from cortado.solvers.projection.constants import lattice_constants
+from cortado.solvers.projection.lattice import coarse_grid, endless, lattice_constants
 from cortado_reference.engine import extension
 
 CLOSEST = 0.25

@@ -50,7 +50,7 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.wall_relaxation`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.relaxation`."""
     laplacian_correction: float
     """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
     domain: Domain

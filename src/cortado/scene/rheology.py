@@ -1,4 +1,4 @@
-"""The key ``rheology`` of a phase: how its viscosity follows from the shear rate. The laws: `cortado.sph.laws`."""
+"""The key ``rheology`` of a phase: how its viscosity follows from the shear rate (`cortado.sph.viscosity_law`)."""
 
 from typing import Annotated, Any, Literal
 

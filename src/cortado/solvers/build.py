@@ -38,8 +38,7 @@ from cortado.sph.free_solids import FreeSolids, FreeTable
 from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
-from cortado.sph.part import Part, PartMaker
-from cortado.sph.parts import Force, Setting
+from cortado.sph.parts import Force, Part, PartMaker, Setting
 
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
 """Of a `Force`."""
@@ -138,7 +137,7 @@ def _check_force(force: Force, maker: Any) -> None:
         if found:
             raise InputError(
                 f"the force {name} has the methods {', '.join(found)} of a part, but is none: let its class be a "
-                "cortado.sph.part.Part too."
+                "cortado.sph.parts.Part too."
             )
     elif type(force).end is Part.end and not all(field.is_constant for field in force.fields):
         raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")

@@ -14,8 +14,7 @@ from cortado.particles.arrays import padded
 from cortado.particles.solid_shares import WHOLE
 from cortado.particles.state import Layout
 from cortado.scene.motions import density_name
-from cortado.solvers.contact_kernels import contact_kernels
-from cortado.solvers.contact_strength import strength_kernels
+from cortado.solvers.contact_kernels import contact_kernels, strength_kernels
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents

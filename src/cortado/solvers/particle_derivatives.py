@@ -11,8 +11,7 @@ from cortado.particles.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
-from cortado.sph.carried import Carried
-from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
 
 class ParticleTangent:

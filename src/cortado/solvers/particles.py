@@ -26,17 +26,13 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
-from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.density import Density
-from cortado.solvers.loop import IterationLog, Loop
+from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
-from cortado.sph.carried import Carried
 from cortado.sph.integration import integration_kernels
-from cortado.sph.part import Part, PartMaker
-from cortado.sph.parts import Force, StepContext
-from cortado.sph.wall_slope import wall_slope_term
-from cortado.sph.wall_sums import WallAction, WallSums
+from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext
+from cortado.sph.walls import WallAction, WallSums, wall_slope_term
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,17 @@
-"""A force that is one Python function, as Warp compiles it: in either precision, with numbers of that precision."""
+"""The parameters of a function of one's own as one vector, theta: time, numbers and vectors, one behind the other.
+
+A force that is one Python function, as Warp compiles it: in either precision, with numbers of that precision.
+
+What kernels of a force call that is one function f of a user's: f itself, and its derivatives.
+"""
 
 import ast
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from tempfile import TemporaryFile
 from types import FunctionType, MappingProxyType
 from typing import Any
@@ -15,12 +21,159 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
-from cortado.sph.frozen import Frozen
-from cortado.sph.function_source import definition
-from cortado.sph.function_text import DerivativeCheck, check_names, check_returns
-from cortado.sph.in_precision import REAL, VECTOR, InPrecision
-from cortado.sph.meaning_checks import check_calls, check_helper, check_truths
-from cortado.sph.python_meaning import meanings
+from cortado.particles.state import Layout, Parameters
+from cortado.scene.parameters.parameter import Parameter
+from cortado.sph.function_meaning import REAL, VECTOR, InPrecision, check_calls, check_helper, check_truths, meanings
+from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, definition
+from cortado.sph.integration import integration_module
+from cortado.sph.parts import Adjoints, StepContext
+
+WIDTH = (1, 3)
+"""How many numbers of theta a parameter takes, by its rank."""
+
+
+@dataclass(frozen=True)
+class PackingKernels:
+    """By the rank of a parameter: of its value in a step into theta, and of the adjoint of theta into its own."""
+
+    pack: tuple[Any, Any]
+    add: tuple[Any, Any]
+
+
+@cache
+def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
+    """Parameters are (members, steps), or (members, 1) where they are constant."""
+    real, vector = precision.real, precision.vector
+    forward, backward = integration_module(precision, True, taped), integration_module(precision, False)
+
+    @wp.kernel(module=forward)
+    def pack_number(
+        first: int,
+        step: wp.array(dtype=wp.int32),
+        values: wp.array2d(dtype=real),
+        # out
+        theta: wp.array2d(dtype=real),
+    ):
+        member = wp.tid()
+        theta[member, first] = values[member, wp.min(step[member], values.shape[1] - 1)]
+
+    @wp.kernel(module=forward)
+    def pack_vector(
+        first: int,
+        step: wp.array(dtype=wp.int32),
+        values: wp.array2d(dtype=vector),
+        # out
+        theta: wp.array2d(dtype=real),
+    ):
+        member = wp.tid()
+        value = values[member, wp.min(step[member], values.shape[1] - 1)]
+        theta[member, first] = value[0]
+        theta[member, first + 1] = value[1]
+        theta[member, first + 2] = value[2]
+
+    @wp.kernel(module=backward, enable_backward=False)
+    def add_number(
+        first: int,
+        step: wp.array(dtype=wp.int32),
+        total: wp.array2d(dtype=real),
+        # in and out
+        values_bar: wp.array2d(dtype=real),
+    ):
+        member = wp.tid()
+        row = wp.min(step[member], values_bar.shape[1] - 1)
+        values_bar[member, row] = values_bar[member, row] + total[member, first]
+
+    @wp.kernel(module=backward, enable_backward=False)
+    def add_vector(
+        first: int,
+        step: wp.array(dtype=wp.int32),
+        total: wp.array2d(dtype=real),
+        # in and out
+        values_bar: wp.array2d(dtype=vector),
+    ):
+        member = wp.tid()
+        row = wp.min(step[member], values_bar.shape[1] - 1)
+        bar = vector(total[member, first], total[member, first + 1], total[member, first + 2])
+        values_bar[member, row] = values_bar[member, row] + bar
+
+    return PackingKernels((pack_number, pack_vector), (add_number, add_vector))
+
+
+class Packed:
+    """Theta of every scene, its tangent, and its adjoint, for the force of one solver."""
+
+    def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
+        self._parameters, self._layout = tuple(parameters), layout
+        self._kernels = packing_kernels(layout.precision, taped)
+        self.dtype = theta_of(layout.precision, [p.rank for p in self._parameters])
+        """A Warp vector."""
+        self._size = self.dtype._length_
+        self._flat, self._flat_dot = self._numbers(taped), self._numbers(False)
+        self._theta, self._theta_dot = self._vectors(self._flat), self._vectors(self._flat_dot)
+        self.shares = wp.zeros(layout.all_particles, dtype=self.dtype, device=layout.device)
+        """(n,) for what every particle adds to the adjoint of theta in a step."""
+        self._sum = layout.sum_of(self.dtype) if self._parameters else None
+
+    def theta(self, step: StepContext) -> wp.array:
+        """(members,) in a step."""
+        return self._pack(step, step.parameters, self._flat, self._theta)
+
+    def theta_dot(self, step: StepContext, parameters_dot: Parameters) -> wp.array:
+        """(members,) its tangent."""
+        return self._pack(step, parameters_dot, self._flat_dot, self._theta_dot)
+
+    def collect(self, step: StepContext, bar: Adjoints) -> None:
+        """Add up the `shares`, into the adjoints of the parameters."""
+        if self._sum is None:
+            return
+        total = self._sum(self.shares)
+        flat = self._view(total, self._layout.precision.real, (self._layout.members, self._size))
+        for first, parameter in self._places():
+            values_bar = self._rows(bar.parameters[parameter.name])
+            given = {"first": first, "total": flat, "values_bar": values_bar}
+            step.launch(self._kernels.add[parameter.rank], **given, threads=self._layout.members)
+
+    def _pack(self, step: StepContext, values: Parameters, flat: wp.array, vectors: wp.array) -> wp.array:
+        for first, parameter in self._places():
+            given = {"first": first, "values": self._rows(values[parameter.name]), "theta": flat}
+            step.launch(self._kernels.pack[parameter.rank], **given, threads=self._layout.members)
+        return vectors
+
+    def _places(self) -> list[tuple[int, Parameter]]:
+        """Where in theta each parameter begins."""
+        places, first = [], 0
+        for parameter in self._parameters:
+            places.append((first, parameter))
+            first += WIDTH[parameter.rank]
+        return places
+
+    def _rows(self, array: wp.array) -> wp.array:
+        """A parameter with an axis of steps, which has one entry where it is constant."""
+        return array if array.ndim == 2 else array.reshape((self._layout.members, 1))
+
+    def _numbers(self, requires_grad: bool) -> wp.array:
+        layout = self._layout
+        options = {"device": layout.device, "requires_grad": requires_grad}
+        return wp.zeros((layout.members, self._size), dtype=layout.precision.real, **options)
+
+    def _vectors(self, flat: wp.array) -> wp.array:
+        """The same memory as vectors, that of its adjoint included."""
+        shape = (self._layout.members,)
+        vectors = self._view(flat, self.dtype, shape)
+        if flat.requires_grad:
+            vectors.grad = self._view(flat.grad, self.dtype, shape)
+        return vectors
+
+    @staticmethod
+    def _view(array: wp.array, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+        view = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
+        view._ref = array  # keeps the memory
+        return view
+
+
+def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
+    """The Warp vector of as many numbers as parameters of these ranks have; of one, where there are none."""
+    return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
 @dataclass(frozen=True)
@@ -153,3 +306,63 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
             raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error
         said.seek(0)
         sys.stderr.write(said.read().decode(errors="replace"))
+
+
+def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
+    """The Warp function of two vectors or numbers and theta that a user's function is; in 2-D without what a vector has
+    along z."""
+    timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
+    types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
+    terms, first = [], 0
+    for rank in ranks:
+        at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
+        terms.append(f"vector({at})" if rank else at)
+        first += 3 if rank else 1
+    called = f"own({', '.join(['x', 'v', *terms])})"
+    result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
+    source = f"def applied(x: own_type, v: own_type, theta: numbers):\n    return {result}\n"
+    scope = {
+        "vector": precision.vector,
+        "own_type": precision.real if of_numbers else precision.vector,
+        "one": wp.constant(precision.real(1.0)),
+        "zero": wp.constant(precision.real(0.0)),
+        "wp": wp,
+        "numbers": theta_of(precision, ranks),
+        "own": text.function(precision, types, module),
+    }
+    exec(source, scope)
+    made: Any = scope["applied"]
+    return wp.Function(func=made, key="applied", namespace="", module=module, source=source)
+
+
+def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
+    """The Warp function f . bar, whose gradient a user's function f is differentiated by."""
+    vector, theta_type = precision.vector, theta_of(precision, ranks)
+    force = applied(text, precision, ranks, dimension, module)
+
+    @wp.func(module=module)
+    def work(x: vector, v: vector, theta: theta_type, bar: vector):
+        return wp.dot(force(x, v, theta), bar)
+
+    return work
+
+
+def change_along(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
+    """The Warp function that is the derivative of a user's function along a direction, put together of the gradients of
+    its components."""
+    real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
+    work = work_of(text, precision, ranks, dimension, module)
+
+    @wp.func(module=module)
+    def change_of(
+        x: vector, v: vector, theta: theta_type, x_dot: vector, v_dot: vector, theta_dot: theta_type
+    ) -> vector:
+        change = vector()
+        for axis in range(3):
+            along = vector()
+            along[axis] = real(1.0)
+            x_bar, v_bar, theta_bar, _along_bar = wp.grad(work)(x, v, theta, along)
+            change[axis] = wp.dot(x_bar, x_dot) + wp.dot(v_bar, v_dot) + wp.dot(theta_bar, theta_dot)
+        return change
+
+    return change_of

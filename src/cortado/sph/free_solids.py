@@ -28,8 +28,7 @@ from cortado.scene.motions import (
 )
 from cortado.scene.parameters.parameter import Axis
 from cortado.sph.free_kernels import free_kernels
-from cortado.sph.part import Part, PartAdjoint, PartTangent
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 NAMES = {
     "position": position_name,

@@ -1,18 +1,199 @@
-"""The text of a user's function: what Warp can differentiate, and its numbers in a precision."""
+"""The text of a user's function, which is what Warp compiles: it must be what the function was made from.
+
+What a user's function names that is not its own: as it is when the force is made, and in words.
+
+The text of a user's function: what Warp can differentiate, and its numbers in a precision.
+"""
 
 import ast
 import builtins
+import dis
+import inspect
+import textwrap
+from bisect import bisect_left
 from collections.abc import Mapping
+from copy import deepcopy
+from inspect import isclass, ismodule
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
 
-from cortado.errors import InputError
+from cortado.code_words import KEPT, SNIPPETS, names_in, package_of, read_by, words
+from cortado.device.modules import kernel_module
+from cortado.errors import InputError, shown
+
+_SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
+"""Texts of functions that came from other processes."""
+_LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
+"""Instructions that say nothing of what a code does."""
+
+
+def plain_function(kind: str, function: Any) -> FunctionType:
+    """What a user gives as the function of a force, which may be one of Warp; raises `InputError`."""
+    plain = function.func if isinstance(function, wp.Function) else function
+    if not isinstance(plain, FunctionType):
+        raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
+    check_bare(f"{kind} function {plain.__name__}", plain)
+    if plain.__code__.co_flags & (inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR):
+        raise InputError(f"{kind} function {plain.__name__} waits or yields, but must be made by def, and return.")
+    return plain
+
+
+def check_bare(what: str, function: Any) -> None:
+    """Raises `InputError` for a function that a decorator has put around another one."""
+    if hasattr(function, "__wrapped__"):
+        found = f"{what} is one that a decorator has put around another, which Warp would compile without it"
+        raise InputError(f"{found}, but must have no decorator other than wp.func.")
+
+
+def source_of(what: str, function: FunctionType) -> str:
+    """The text of a function; raises `InputError`."""
+    if function in _SENT:
+        return _SENT[function]
+    try:
+        return textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError) as error:
+        found = f"the text of {what} is not to be found"
+        raise InputError(f"{found}, but must stand in a file or a notebook.") from error
+
+
+def keep_source(function: FunctionType, source: str) -> None:
+    """Keep the text that a function came with from another process, where it may stand in no file."""
+    _SENT[function] = source
+
+
+def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
+    """What the text of a function defines, without annotations, defaults and decorators. Raises `InputError` where that
+    is another function, as where its file has changed since it was imported."""
+    try:
+        found: ast.AST = ast.parse(source).body[0]
+    except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
+        found = ast.Pass()
+    if function.__code__.co_name == "<lambda>":
+        raise InputError(f"{what} is no definition, but must be made by def.")
+    if isinstance(found, ast.FunctionDef):
+        found.decorator_list, found.returns = [], None
+        found.args.defaults, found.args.kw_defaults = [], [None] * len(found.args.kwonlyargs)
+        for argument in found.args.args:
+            argument.annotation = None
+        if any(isinstance(one, ast.Call) and ast.unparse(one.func) == found.name for one in ast.walk(found)):
+            raise InputError(f"{what} calls itself, which Warp cannot, but must have its result without that.")
+        if found.name == function.__code__.co_name and _same(_compiled(found, function.__code__), function.__code__):
+            return found
+    raise InputError(
+        f"the text of {what} in {function.__code__.co_filename} is not what runs where Python calls it, as the file or "
+        "the function has changed since it was imported, but must be the same: import it again."
+    )
+
+
+def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
+    """The code of a definition within one that has the names from around it; None where Python has none."""
+    doc = found.body[0]
+    if isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
+        doc.value.value = of.co_consts[0] if of.co_consts else None  # its indentation is no matter
+    around = ast.parse(f"def around({', '.join(of.co_freevars)}): pass")
+    around.body[0].body = [found]
+    try:
+        made = compile(ast.fix_missing_locations(around), of.co_filename, "exec", dont_inherit=True)
+    except (SyntaxError, ValueError, TypeError):
+        return None
+    outer = next(one for one in made.co_consts if isinstance(one, CodeType))
+    return next(one for one in outer.co_consts if isinstance(one, CodeType))
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two codes or constants are the same."""
+    if not isinstance(one, CodeType) or not isinstance(other, CodeType):
+        return type(one) is type(other) and repr(one) == repr(other)
+    found, wanted = _instructions(one), _instructions(other)
+    return one.co_varnames == other.co_varnames and len(found) == len(wanted) and all(map(_alike, found, wanted))
+
+
+def _alike(one: tuple[str, Any], other: tuple[str, Any]) -> bool:
+    return one[0] == other[0] and _same(one[1], other[1])
+
+
+def _instructions(code: CodeType) -> list[tuple[str, Any]]:
+    """What a code does, step by step, without what depends on which names are those of imported modules."""
+    steps = [step for step in dis.get_instructions(code) if step.opname not in _LEFT_OUT]
+    places = [step.offset for step in steps]
+    found = []
+    for step in steps:
+        jumps = step.opcode in dis.hasjrel or step.opcode in dis.hasjabs
+        name = step.opname.replace("LOAD_METHOD", "LOAD_ATTR")
+        found.append((name, bisect_left(places, step.argval) if jumps else step.argval))
+    return found
+
+
+class Frozen:
+    """The scope of a function and of all that it calls: numbers, vectors, and what modules and objects have of the
+    attributes that it reads, are copies. So are functions under ``@wp.func``, whose scopes are frozen too."""
+
+    def __init__(self, what: str, function: FunctionType):
+        """Raises `InputError` where a function that it calls is not what its text says."""
+        self._what, self._made = what, dict[Any, Any]()
+        self.helpers: list[Any] = []
+        """The copies of functions of Warp's users, in each of their forms."""
+        self.scope = self._scope(function)
+        """What names stand for."""
+        self.words = "\n".join(words(self.scope))
+        """All of it as a text, which other processes have too."""
+
+    def _scope(self, function: FunctionType) -> dict[str, Any]:
+        return {name: self._value(value, names_in(function)) for name, value in read_by(function).items()}
+
+    def _value(self, value: Any, names: tuple[str, ...]) -> Any:
+        if isinstance(value, wp.Function):
+            return self._helper(value) if value.func else value
+        if package_of(value) in KEPT:
+            return value if ismodule(value) or callable(value) else deepcopy(value)
+        if callable(value) and not isclass(value):
+            return value
+        if (key := (id(value), names)) not in self._made:
+            made = self._made[key] = ModuleType("frozen")  # whose attributes Warp looks up
+            for name in names:
+                if hasattr(value, name):
+                    setattr(made, name, self._value(getattr(value, name), names))
+        return self._made[key]
+
+    def _helper(self, helper: Any) -> Any:
+        if id(helper) not in self._made:
+            self._made[id(helper)] = helper  # where it calls itself
+            forms = [*helper.user_overloads.values(), *helper.user_templates.values()]
+            made = [self._copy(one) for one in forms if one.generic_parent is None]
+            for one in made[1:]:
+                made[0].add_overload(one)
+            self._made[id(helper)] = made[0]
+        return self._made[id(helper)]
+
+    def _copy(self, helper: Any) -> Any:
+        own = self._function(helper)
+        snippets = {name: getattr(helper, name) for name in SNIPPETS}
+        known = {"module": kernel_module("helpers"), "source": helper.adj.source, "inline_hint": helper.inline_hint}
+        made = wp.Function(func=own, key=helper.key, namespace="", **known, **snippets, scope_locals={})
+        for other, decorate in ((helper.custom_grad_func, wp.func_grad), (helper.custom_replay_func, wp.func_replay)):
+            if other is not None:
+                decorate(made)(self._function(other))
+        self.helpers.append(made)
+        return made
+
+    def _function(self, helper: Any) -> FunctionType:
+        """The function of Python, with a scope that is frozen."""
+        function, what = helper.func, f"the function {helper.func.__name__} that {self._what} calls"
+        check_bare(what, function)
+        definition(what, function, helper.adj.source)
+        code, scope = function.__code__, self._scope(function)
+        cells = tuple(CellType(scope[name]) if name in scope else CellType() for name in code.co_freevars)
+        made: Any = FunctionType(code, scope, function.__name__, function.__defaults__, cells)
+        made.__annotations__, made.__module__ = dict(helper.adj.arg_types), function.__module__
+        return made
+
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
 """What the compiled text calls the types of a number and of a vector."""
-_TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 
 
 class DerivativeCheck(ast.NodeVisitor):

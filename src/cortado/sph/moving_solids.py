@@ -24,8 +24,7 @@ from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters.parameter import Axis
 from cortado.sph.integration import integration_module
-from cortado.sph.part import Part, PartAdjoint, PartTangent
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 from cortado.sph.rotations import rotations
 
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}

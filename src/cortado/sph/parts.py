@@ -1,9 +1,24 @@
 """What a part of a step is given, and what it gives: forces, the mixture, the nozzle.
 
 A part reads the sorted particles and the parameters, and adds to adjoints: nothing that it is given is overwritten.
+
+What a part of a step may do besides accelerating particles: keep fields from step to step, and work at the beginning
+and at the end of a step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
+
+A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
+order in reverse mode. A method that a part has not does nothing. Of what a step knows, kernels find at the `begin` of a
+part the parameters and the number of the step; at `sort` also the order of particles and x, v and m; from `settle` on
+neighbours and n as well, and at `end` everything.
+
+A derivative takes a step again from its state, but not its end. So what a tangent or an adjoint needs of a step has to
+stand in arrays that `begin`, `sort` or `settle` write.
+
+Fields of particles that a solver carries from step to step: a pressure that the next step begins with, say.
+
+A state has them in the scene's order of particles, a step works on sorted ones. The adjoint of sorting is the way back.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,16 +27,20 @@ from typing import Any, Protocol
 import warp as wp
 
 from cortado.device.launching import KernelLauncher, Named
-from cortado.device.reduction import add
+from cortado.device.modules import kernel_module, kind_of
+from cortado.device.reduction import add, type_name
 from cortado.discretise.walls.layers import WallLayers
+from cortado.errors import MissingDerivativeError
 from cortado.particles.arrays import Arrays, Fields, zeros
+from cortado.particles.fields import StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.solid_shares import SolidShares
-from cortado.particles.state import Layout, Parameters
+from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters.known import argument
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.scene import Scene
+from cortado.sph.integration import OrderKernels, order_kernels
 
 
 @dataclass(frozen=True)
@@ -151,7 +170,120 @@ class Force(Protocol):
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
         """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for. A force whose own acceleration
         depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes after all others.
-        One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.solve_record`. One
-        with which walls act on fluid has what they do, a `cortado.sph.wall_sums.WallAction`, as ``wall_action``, or
+        One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.loop`. One
+        with which walls act on fluid has what they do, a `cortado.sph.walls.WallAction`, as ``wall_action``, or
         loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is another one, of the sum of
         y x a, with which a acts at x_i - y."""
+
+
+class PartTangent:
+    """Forward mode of a part."""
+
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.begin`, from the tangent of the state before the step; ``dot`` has those of the parameters."""
+
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.sort` and `Part.settle`: from the tangent of the state before the step; ``dot`` has those of the
+        sorted particles."""
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the step, and becomes
+        that of the state there."""
+
+
+class PartAdjoint:
+    """Reverse mode of a part."""
+
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        """Of a part that has a `Part.target`: from the adjoint of the positions and velocities that it left to that of
+        those that it found, which is returned. It adds to ``bar``; sorted particles have no adjoints yet."""
+        return moved_bar
+
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        """Of `Part.settle` and `Part.sort`, and of what `Part.end` wrote of sorted particles: ``state_bar`` has the
+        adjoint of the part's fields after the step, and becomes that of those before it."""
+
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        """Of `Part.begin`, after all others; a part whose fields it has left as they were lets `sort` be."""
+
+
+class Part:
+    """A part of a step, in one solver. A `Force` may be one too."""
+
+    fields: tuple[StateField, ...] = ()
+    """What it keeps from step to step, as arrays of the state."""
+    shares: tuple[str, ...] = ()
+    """Parameters to whose adjoints every particle adds a share, as those of a `Force`."""
+
+    def set_substeps(self, substeps: int) -> None:
+        """Take so many explicit substeps of diffusion in each step from now on."""
+
+    def begin(self, step: StepContext, state: State) -> None:
+        """Before anything else, with the state that the step begins from, which stays as it is. What `end` needs of it
+        is kept here, as the state at the end of the step may have the same arrays."""
+
+    def sort(self, step: StepContext, state: State) -> None:
+        """Once the order of the sorted particles is known."""
+
+    def settle(self, step: StepContext) -> None:
+        """Once neighbours and densities are known."""
+
+    def target(self, moved: State) -> State:
+        """Where the part finds positions and velocities at its `end`, given where it leaves them: a part that changes
+        some has room of its own for them, as nothing is changed in place."""
+        return moved
+
+    def end(self, step: StepContext, state: State, moved: State) -> None:
+        """Write the part's fields of ``state``, that at the end of the step, and, if it has a `target` of its own, all
+        positions and velocities of ``moved``, from those that it finds in its target."""
+
+    def new_tangent(self) -> PartTangent:
+        """Forward mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        raise MissingDerivativeError(f"{type(self).__name__} has no forward mode: let it have a method new_tangent.")
+
+    def new_adjoint(self) -> PartAdjoint:
+        """Reverse mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        raise MissingDerivativeError(f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint.")
+
+
+class PartMaker(Protocol):
+    """Makes a part for a solver."""
+
+    def part(self, layout: Layout, requires_grad: bool) -> Part:
+        """The part; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
+
+
+class Carried:
+    """Sorted fields of a step, or their tangents or adjoints."""
+
+    def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
+        """Raises `TypeError` for a field that has not an entry for each particle."""
+        fields = tuple(fields)
+        for field in fields:
+            if field.axis is not Axis.PARTICLE:
+                raise TypeError(
+                    f"field {field.name!r} has one entry, but must have one for each particle to be sorted."
+                )
+        self._arrays = layout.state(fields, requires_grad)
+
+    def __getitem__(self, name: str) -> wp.array:
+        """(n,) sorted, as they were at the start of the step."""
+        return self._arrays[name]
+
+    def sort(self, step: StepContext, state: State) -> None:
+        """Take them from a state."""
+        for name in self._arrays.names:
+            a = self._arrays[name]
+            step.launch(_kernels(a).sort, a_scene=state[name], a=a)
+
+    def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
+        """Write sorted values, one for each field, to a state."""
+        if values.keys() != set(self._arrays.names):
+            raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
+        for name, a in values.items():
+            step.launch(_kernels(a).unsort, a=a, a_scene=state[name])
+
+
+def _kernels(a: wp.array) -> OrderKernels:
+    module = kernel_module(f"order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}", a.requires_grad)
+    return order_kernels(a.dtype, module)

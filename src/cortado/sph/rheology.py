@@ -10,10 +10,9 @@ from cortado.particles.arrays import padded
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import stress_of
-from cortado.sph.law_trial import check_law
 from cortado.sph.own_force import OverTime, OwnFunction, topic
 from cortado.sph.parts import Setting
-from cortado.sph.viscosity_law import Law
+from cortado.sph.viscosity_law import Law, check_law
 from cortado.sph.viscous_stress import ViscousStress
 
 

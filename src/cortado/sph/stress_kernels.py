@@ -19,7 +19,7 @@ of s_ij along k: C = 4 / (3 m_2) takes the second term out, in every direction a
 mu_i is the harmonic mean of the viscosities between i and its neighbours (`cortado.sph.stress_functions`): it keeps the
 shear stress the same on both sides of a layer.
 
-Walls without slip: `cortado.sph.wall_contact`.
+Walls without slip: `cortado.sph.stress_forces`.
 """
 
 from collections.abc import Callable
@@ -33,10 +33,9 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.solid_shares import solid_kernel
-from cortado.sph.packed import theta_of
+from cortado.sph.formula import theta_of
 from cortado.sph.stress_forces import stress_sums, stress_work
-from cortado.sph.stress_functions import stress_functions
-from cortado.sph.stress_moments import moment_sums, moments_work
+from cortado.sph.stress_functions import moment_sums, moments_work, stress_functions
 from cortado.sph.viscosity_law import Law
 
 

@@ -10,10 +10,9 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import matrix_type
-from cortado.sph.packed import theta_of
-from cortado.sph.stress_functions import stress_functions
-from cortado.sph.stress_moments import moment_sums
+from cortado.sph.stress_functions import moment_sums, stress_functions
 from cortado.sph.viscosity_law import Law
 
 

@@ -12,11 +12,11 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.particles.solid_shares import WorkMaker
 from cortado.particles.wall_terms import WallTerm
+from cortado.sph.formula import Packed
 from cortado.sph.moment_functions import matrix_type
-from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_wall_kernels import stress_wall_kernels
-from cortado.sph.wall_sums import WallSums
+from cortado.sph.walls import WallSums
 
 
 class Resisting(Protocol):
@@ -36,7 +36,7 @@ class Resisting(Protocol):
 
 
 class StressWalls:
-    """The `cortado.sph.wall_sums.WallAction` of a viscous stress."""
+    """The `cortado.sph.walls.WallAction` of a viscous stress."""
 
     def __init__(
         self,

@@ -1,4 +1,8 @@
-"""Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
+"""The normals n of a fluid's surface that surface tension works with: see `cortado.sph.surface_stress`.
+
+The force of surface tension by curvature: its kernels (`cortado.sph.curvature_kernels`) and their arrays.
+
+Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
 (`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
 Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis,
@@ -10,21 +14,138 @@ takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, 
 meets them at 180 degrees.
 """
 
+from functools import cache
 from math import pi, sqrt
 
 import numpy as np
 import warp as wp
 
+from cortado.device.lanes import lane_functions
+from cortado.device.modules import Kernels
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
-from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.arrays import zeros
+from cortado.particles.by_hand import adjoint_of, tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.pair_sums import fluid_sum
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.sph.curvature_constants import CurvatureConstants
-from cortado.sph.curvature_tension import CurvatureTension
+from cortado.sph.curvature import CurvatureConstants
+from cortado.sph.curvature_kernels import curvature_kernels, entries
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
-from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
+
+
+@cache
+def normal_kernels(discretisation: Discretisation) -> Kernels:
+    """The kernels of n; ``inverse`` is 1 / N."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    one = wp.constant(real(1.0))
+    LANES = discretisation.lanes
+    lane = lane_functions(discretisation.precision, LANES).lane
+
+    @fluid_sum(discretisation)
+    def arrows(x_ij: vector, s: neighbourhood) -> vector:
+        """(1 - s)^2 x"""
+        d = wp.max(one - wp.dot(x_ij, x_ij) / (s.support * s.support), real(0.0))
+        return (d * d) * x_ij
+
+    @adjoint_of(arrows)
+    @tangent_of(arrows)
+    @fluid_sum(discretisation)
+    def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
+        """Its tangent along v, and likewise what the adjoint of positions is for an adjoint v of every n, as the
+        derivative of a pair is symmetric."""
+        h2 = s.support * s.support
+        d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
+        return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
+
+    @wp.kernel(module=discretisation.module(True, "surface_tension"))
+    def normal(
+        s: neighbourhood,
+        inverse: real,
+        x: wp.array(dtype=vector),
+        # out
+        normals: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = arrows(i, x, s)
+        if lane() > 0:
+            return
+        normals[i] = inverse * total
+
+    @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
+    def normal_tangent(
+        s: neighbourhood,
+        inverse: real,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        # out
+        normals_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = change(i, x, x_dot, s)
+        if lane() > 0:
+            return
+        normals_dot[i] = inverse * total
+
+    @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
+    def normal_adjoint(
+        s: neighbourhood,
+        inverse: real,
+        x: wp.array(dtype=vector),
+        normals_bar: wp.array(dtype=vector),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = change(i, x, normals_bar, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + inverse * total
+
+    return Kernels(normal, normal_tangent, normal_adjoint)
+
+
+class CurvatureTension:
+    """Surface tension by curvature; its arrays are those of the last step."""
+
+    shares: tuple[str, ...] = ("surface_tension",)
+    batches = True
+
+    def __init__(self, discretisation: Discretisation, dimension: int, constants: CurvatureConstants, layout: Layout):
+        self._kernels = curvature_kernels(discretisation, dimension)
+        self._constants = {
+            "spacing": constants.spacing,
+            "depth": constants.depth,
+            "per_width": 1.0 / constants.width,
+        }
+        kinds = {name: (layout.all_particles, kind) for name, kind in entries(layout.precision).items()}
+        self._of = zeros(kinds, layout.device, discretisation.taped)
+        self._change = zeros({**kinds, "r": kinds["g"]}, layout.device)
+        """Tangents or adjoints, and r."""
+        self._dot, self._bar = ({f"{name}_{kind}": self._change[name] for name in kinds} for kind in ("dot", "bar"))
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        known = self._constants, self._of
+        for kernels in self._kernels.colour, self._kernels.normal, self._kernels.bend:
+            step.launch(kernels.forward, *known)
+        step.launch(self._kernels.mean.forward, *known, acceleration_in=before, acceleration=after)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        known = *dot.named, self._constants, self._of, self._dot
+        for kernels in self._kernels.colour, self._kernels.normal, self._kernels.bend:
+            step.launch(kernels.tangent, *known)
+        step.launch(self._kernels.mean.tangent, *known, acceleration_in_dot=before, acceleration_dot=after)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
+        known = *bar.named, self._constants, self._of, self._bar, {"r": self._change["r"]}
+        force, mean = self._kernels.mean.adjoint
+        step.launch(force, *known, acceleration_bar=acceleration_bar)
+        for kernel in mean, self._kernels.bend.adjoint, self._kernels.normal.adjoint, self._kernels.colour.adjoint:
+            step.launch(kernel, *known)
+
 
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see

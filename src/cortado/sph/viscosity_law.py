@@ -1,14 +1,25 @@
-"""How the viscosity of a fluid follows from its shear rate: a function of one's own, or that of a Newtonian fluid."""
+"""How the viscosity of a fluid follows from its shear rate: a function of one's own, or that of a Newtonian fluid.
+
+The laws of viscosity that scenes name (`cortado.scene.rheology`), each a function that Warp compiles.
+
+A law of viscosity is tried where fluids are sheared before a run begins: as it is compiled, in its precision.
+"""
 
 import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
+import warp as wp
+
+from cortado.device.launching import launch
+from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.sph.formula import Formula, formula
-from cortado.sph.formula_kernels import applied
-from cortado.sph.function_source import plain_function
+from cortado.errors import InputError
+from cortado.sph.formula import Formula, applied, formula, theta_of
+from cortado.sph.function_text import plain_function
 
 
 @dataclass(frozen=True)
@@ -40,3 +51,86 @@ def newtonian(shear_rate, viscosity):
 def newtonian_law() -> Law:
     """That of fluids without another one."""
     return Law(formula("Rheology", plain_function("Rheology", newtonian), inspect.getsource(newtonian), {})[0], (), "")
+
+
+def power_law(shear_rate, viscosity, flow_index, least_shear_rate):
+    """Of Ostwald and de Waele."""
+    return viscosity * wp.pow(shear_rate * shear_rate + least_shear_rate * least_shear_rate, 0.5 * (flow_index - 1.0))
+
+
+def carreau(shear_rate, viscosity, relaxation_time, flow_index, infinite_viscosity):
+    """Of Carreau (1972)."""
+    turned = relaxation_time * shear_rate
+    return infinite_viscosity + (viscosity - infinite_viscosity) * wp.pow(
+        1.0 + turned * turned, 0.5 * (flow_index - 1.0)
+    )
+
+
+def bingham(shear_rate, viscosity, yield_stress, regularisation):
+    """Of Bingham, made smooth by Papanastasiou (1987); for small m g, (1 - exp(-m g)) / (m g) as a series."""
+    x = regularisation * shear_rate
+    part = 1.0 - x / 2.0 + x * x / 6.0
+    if x > 0.01:
+        part = (1.0 - wp.exp(-x)) / x
+    return viscosity + yield_stress * regularisation * part
+
+
+def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_index, least_shear_rate):
+    """The same with a power law in the place of the viscosity."""
+    x = regularisation * shear_rate
+    part = 1.0 - x / 2.0 + x * x / 6.0
+    if x > 0.01:
+        part = (1.0 - wp.exp(-x)) / x
+    square = shear_rate * shear_rate + least_shear_rate * least_shear_rate
+    return viscosity * wp.pow(square, 0.5 * (flow_index - 1.0)) + yield_stress * regularisation * part
+
+
+LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, carreau, bingham, herschel_bulkley)}
+"""By the ``kind`` of the key ``rheology``."""
+
+
+SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
+"""[1/s]: no particle has a lower one (`cortado.sph.stress_functions.SLOWEST`)."""
+
+
+@cache
+def trial_kernel(precision: Precision, law: Law) -> Any:
+    """Of the law at each shear rate, for each viscosity and each theta."""
+    module = kernel_module(f"{law.topic}trial_{precision.name}")
+    real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), law.applied(precision, module)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def trial(
+        shear_rates: wp.array(dtype=real),
+        viscosities: wp.array(dtype=real),
+        thetas: wp.array(dtype=theta_type),
+        # out
+        found: wp.array3d(dtype=real),
+    ):
+        k, p, t = wp.tid()
+        found[k, p, t] = apparent(shear_rates[k], viscosities[p], thetas[t])
+
+    return trial
+
+
+def check_law(
+    what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
+) -> None:
+    """``viscosities`` [Pa s] by the names of phases, ``thetas`` (k, numbers) as the law has them. Raises `InputError`
+    where the law returns what is no viscosity."""
+    kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
+    rows[:, : thetas.shape[1]] = thetas
+    given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}
+    arrays = {name: wp.array(values, dtype=precision.real, device=device) for name, values in given.items()}
+    arrays["thetas"] = wp.array(rows, dtype=theta_of(precision, law.ranks), device=device)
+    shape = len(SHEAR_RATES), len(viscosities), len(rows)
+    found = wp.zeros(shape, dtype=precision.real, device=device)
+    launch(kernel, shape, device, **arrays, found=found)
+    values = found.numpy()
+    wrong = np.argwhere(~(np.isfinite(values) & (values >= 0.0)))
+    if len(wrong):
+        k, phase, theta = wrong[0]
+        name, viscosity = list(viscosities.items())[phase]
+        found = f"{what} returns {values[k, phase, theta]:g} Pa s at a shear rate of {SHEAR_RATES[k]:.3g} 1/s"
+        wanted = "but must return a finite number that is at least 0 from 1e-06 to 1e+06 1/s"
+        raise InputError(f"{found}, for the viscosity of {name}, {viscosity:g} Pa s, {wanted}.")

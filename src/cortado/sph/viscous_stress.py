@@ -9,9 +9,8 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
 from cortado.scene.parameters.parameter import Parameter
-from cortado.sph.formula import compiled
+from cortado.sph.formula import Packed, compiled
 from cortado.sph.moment_functions import matrix_type
-from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import stress_couple_work, stress_work
 from cortado.sph.stress_kernels import stress_kernels, stress_solid_kernels
@@ -19,7 +18,7 @@ from cortado.sph.stress_walls import StressWalls
 from cortado.sph.viscosity_law import Law, newtonian_law
 
 CLOSEST = 0.25
-"""In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.wall_contact`."""
+"""In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.stress_forces`."""
 
 
 class ViscousStress:

@@ -19,7 +19,7 @@ from cortado.scene.sentences import sentences
 from cortado.scene.tables import Table
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
-from cortado.solvers.named import known_in
+from cortado.solvers.makers import known_in
 
 
 class ExperimentTables(Table):

@@ -20,7 +20,7 @@ from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.sentences import sentences
 from cortado.scene.toml import read_toml
-from cortado.solvers.named import known_in
+from cortado.solvers.makers import known_in
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.vorticity import circulation_kernels
-from cortado.sph.wall_sums import WallAction
+from cortado.sph.walls import WallAction
 
 
 def vectors(array: wp.array) -> NDArray:

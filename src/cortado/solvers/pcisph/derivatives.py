@@ -11,12 +11,12 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
-from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel
+from cortado.solvers.pcisph.pressure import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import StepContext
-from cortado.sph.wall_slope import wall_slope_term
+from cortado.sph.walls import wall_slope_term
 
 
 class PcisphAdjoint(ParticleAdjoint):

@@ -6,20 +6,26 @@
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
 n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
-y the relaxation beside walls (`cortado.solvers.pcisph.wall_relaxation`). G is taken at x(t), n* at the predicted
+y the relaxation beside walls (`cortado.solvers.pcisph.relaxation`). G is taken at x(t), n* at the predicted
 positions over the neighbours of x(t). The force is the transpose of the derivative of n with respect to positions,
 that of walls included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*)
 is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+
+The pressure force of an iteration, and the prediction that follows it: see `cortado.solvers.pcisph.pressure`.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.by_hand import adjoint_of, tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import pair_sum
+from cortado.particles.solid_shares import solid_kernel
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
 
@@ -151,3 +157,175 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         time_step_bar[i] = time_step_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
     return Kernels(pressure, pressure_tangent, pressure_adjoint)
+
+
+def pressure_solid_kernel(discretisation: Discretisation) -> Any:
+    """The kernel of what the pressure force of an iteration gives to solids that move, for its adjoint ``scaled_bar``
+    (`cortado.particles.solid_shares.solid_kernel`)."""
+    return solid_kernel(discretisation, "pcisph", _work, looped=True)
+
+
+def _work(d: Discretisation) -> Any:
+    real, vector, slope = d.precision.real, d.precision.vector, pair_functions(d).slope
+
+    def pressure_work(x_ij: vector, c_i: real, scaled_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
+        return -s.volume * c_i * slope(x_ij, s) * wp.dot(x_ij, scaled_bar_i)
+
+    return pressure_work
+
+
+@cache
+def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
+    """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    slope, slope_change = pair.slope, pair.slope_change
+    gradient, hessian_product = pair.gradient, pair.hessian_product
+    LANES = discretisation.lanes
+    lane = lane_functions(discretisation.precision, LANES).lane
+    moved = bundle(m=real, x=vector, v=vector, acceleration=vector, c=real)
+    values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
+    adjoints = bundle(m=real, rho_0=real, y=real, p=real, time_step=real)
+
+    @wp.func
+    def adjoin_pressure(
+        i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
+    ) -> real:
+        """Add to the adjoints of a pressure's inputs, and return r, the adjoint of n*."""
+        n_i = at.n[i]
+        m_i = at.m[i]
+        p_i = at.p_out[i]
+        delta = at.y[i] * stiffness / (dt * dt)
+        p_bar_i = real(0.0)
+        if p_i > real(0.0):
+            p_bar_i = bar.p[i] - volume * divergence / (n_i * n_i)
+        excess_bar = delta * p_bar_i
+        excess = (p_i - at.p_in[i]) / delta
+        bar.m[i] = bar.m[i] + (volume * work + excess_bar * (excess + at.rho_0[i])) / m_i
+        bar.rho_0[i] = bar.rho_0[i] - excess_bar
+        bar.y[i] = bar.y[i] + excess_bar * excess / at.y[i]
+        bar.p[i] = p_bar_i
+        bar.time_step[i] = bar.time_step[i] - real(2.0) * excess_bar * excess / dt
+        return m_i * excess_bar
+
+    @pair_sum(discretisation)
+    def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
+        return ((c_i + c_j) * slope(x_ij, s)) * x_ij
+
+    @tangent_of(force)
+    @pair_sum(discretisation, ahead=False, grows=force)
+    def force_tangent(
+        x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
+    ) -> vector:
+        return (c_dot_i + c_dot_j) * gradient(x_ij, s) + (c_i + c_j) * hessian_product(x_ij, x_dot_ij, s)
+
+    @adjoint_of(force)
+    @pair_sum(discretisation)
+    def force_adjoint(
+        x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
+    ) -> tuple[vector, real, real]:
+        """Hessian products, divergence, and the work of the own share."""
+        a = slope(x_ij, s)
+        c_ij = c_i + c_j
+        change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
+        return change, a * wp.dot(x_ij, scaled_bar_ij), (c_ij * a) * wp.dot(x_ij, scaled_bar_i)
+
+    @wp.kernel(module=discretisation.module(True, "pcisph"))
+    def pressure_force(
+        s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
+        time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        x_before: wp.array(dtype=vector),
+        v_before: wp.array(dtype=vector),
+        # out
+        x_star: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            if lane() == 0:
+                x_star[i] = x_before[i]
+                v_star[i] = v_before[i]
+            return
+        dt = time_step[member]  # all that is needed is loaded before the sum, so that the loads do not wait for it
+        x_i = x[i]
+        v_i = v[i]
+        a_i = acceleration[i]
+        scale = -s.volume / m[i]
+        total = force(i, x, c, s)
+        if lane() > 0:
+            return
+        velocity = v_i + dt * (a_i + scale * total)
+        v_star[i] = velocity
+        x_star[i] = x_i + dt * velocity
+
+    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
+    def pressure_force_tangent(
+        s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        at: moved,
+        dot: moved,
+        v_star: wp.array(dtype=vector),
+        # out
+        x_star_dot: wp.array(dtype=vector),
+        v_star_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
+        total_dot = force_tangent(i, at.x, dot.x, at.c, dot.c, s)
+        if lane() > 0:
+            return
+        dt = time_step[member]
+        accelerated = (v_star[i] - at.v[i]) / dt
+        push = accelerated - at.acceleration[i]
+        push_dot = (-s.volume / at.m[i]) * total_dot - (dot.m[i] / at.m[i]) * push
+        velocity_dot = dot.v[i] + dt * (dot.acceleration[i] + push_dot) + time_step_dot[member] * accelerated
+        v_star_dot[i] = velocity_dot
+        x_star_dot[i] = dot.x[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
+
+    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    def pressure_force_adjoint(
+        s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
+        stiffness: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        at: values,
+        c: wp.array(dtype=real),
+        scaled_bar: wp.array(dtype=vector),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        n_bar: wp.array(dtype=real),
+        bar: adjoints,
+        # out
+        r: wp.array(dtype=real),
+    ):
+        """From ``scaled_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
+        sum a gather."""
+        i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
+        hessian_products, divergence, work = force_adjoint(i, x, c, scaled_bar, s)
+        if lane() > 0:
+            return
+        n_i = at.n[i]
+        x_bar[i] = x_bar[i] - s.volume * hessian_products
+        n_bar[i] = n_bar[i] + real(2.0) * c[i] / n_i * s.volume * divergence
+        r[i] = adjoin_pressure(i, stiffness, time_step[member], s.volume, divergence, work, at, bar)
+
+    return Kernels(pressure_force, pressure_force_tangent, pressure_force_adjoint)

@@ -1,11 +1,19 @@
-"""PCISPH as a `Solver`: its steps, forward, and their derivatives."""
+"""PCISPH as a `Solver`: its steps, forward, and their derivatives.
 
+The PCISPH solver of a scene.
+"""
+
+from math import inf
 from typing import Self
 
 from cortado.particles.state import Parameters
+from cortado.scene.solvers import PcisphSolver
+from cortado.solvers.build import particle_system
+from cortado.solvers.loop import LoopLimits
+from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.steps import PcisphSteps
-from cortado.solvers.solver import StepAdjoint, StepTangent
+from cortado.solvers.solver import Solver, StepAdjoint, StepTangent
 
 
 class Pcisph(PcisphSteps):
@@ -20,3 +28,31 @@ class Pcisph(PcisphSteps):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         return PcisphAdjoint(self, steps)
+
+
+class PcisphMaker:
+    """Makes the solver as the table [solver] of a scene says."""
+
+    batches = True
+
+    def __init__(self, table: PcisphSolver):
+        self._table = table
+
+    def build(self, setting: SolverSetting) -> Solver:
+        """The solver of a scene that is cut into particles, on a device."""
+        limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
+        return Pcisph(particle_system(setting), limits)
+
+
+maker = PcisphMaker
+
+
+def pressure_limits(table: PcisphSolver) -> LoopLimits:
+    """When the pressure loop may stop."""
+    greatest = table.maximum_density_tolerance
+    return LoopLimits(
+        table.minimum_iterations,
+        table.maximum_iterations,
+        table.density_tolerance,
+        inf if greatest is None else greatest,
+    )

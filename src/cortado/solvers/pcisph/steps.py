@@ -1,17 +1,122 @@
-"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009).
+"""How the way back through a PCISPH step begins: with the adjoints of its last prediction and of the pressure.
+
+What a PCISPH solver is made of: kernels, and room for its iterates.
+
+Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009).
 
 `PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
 iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
 from numpy.typing import NDArray
 
+from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
+from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
-from cortado.solvers.pcisph.parts import Iterates, PcisphKernels
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.relaxation import DensityRatioKernels, density_ratio_kernels, wall_kernels
 from cortado.solvers.solver import Counts
+from cortado.sph.integration import new_state_adjoint
 from cortado.sph.parts import StepContext
+
+
+@cache
+def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
+    """Does in one launch what that of `cortado.sph.begin_adjoint` does, and begins the adjoints of PCISPH's own."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    from_zero = bundle(n=real, m=real, rho_0=real, mu=real, y=real, p=real)
+    adjoin_new_state = new_state_adjoint(discretisation.precision)
+
+    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    def begin_adjoint(
+        particles: int,
+        order: wp.array(dtype=wp.int32),
+        time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        v: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        x_scene_bar: wp.array(dtype=vector),
+        v_scene_bar: wp.array(dtype=vector),
+        # in and out
+        time_step_bar: wp.array(dtype=real),
+        # out
+        x_bar: wp.array(dtype=vector),
+        v_bar: wp.array(dtype=vector),
+        scaled_bar: wp.array(dtype=vector),
+        bar: from_zero,
+    ):
+        i = wp.tid()
+        dt = time_step[i // particles]
+        x_i_bar, v_i_bar, dt_bar = adjoin_new_state(
+            x_scene_bar[order[i]], v_scene_bar[order[i]], time_step_bar[i], v[i], v_star[i], dt
+        )
+        x_bar[i] = x_i_bar
+        v_bar[i] = v_i_bar
+        scaled_bar[i] = (dt / m[i]) * v_i_bar
+        bar.n[i] = real(0.0)
+        bar.m[i] = real(0.0)
+        bar.rho_0[i] = real(0.0)
+        bar.mu[i] = real(0.0)
+        bar.y[i] = real(0.0)
+        bar.p[i] = real(0.0)
+        time_step_bar[i] = dt_bar
+
+    return begin_adjoint
+
+
+@dataclass(frozen=True)
+class PcisphKernels:
+    """The kernels that only PCISPH needs, each topic with its forward, tangent and adjoint."""
+
+    wall_relaxation: Kernels
+    density_ratio: DensityRatioKernels | None
+    """Only where there are several phases."""
+    pressure: Kernels
+    force: Kernels
+    begin_adjoint: wp.Kernel
+    """With which the way back through a step begins."""
+
+    @classmethod
+    def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
+        """Those for a smoothing kernel, a precision and a number of phases."""
+        return cls(
+            wall_kernels(discretisation),
+            density_ratio_kernels(discretisation) if phases > 1 else None,
+            pressure_kernels(discretisation),
+            pressure_force_kernels(discretisation),
+            begin_adjoint_kernel(discretisation),
+        )
+
+
+class Iterates:
+    """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
+
+    def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
+        """Both make arrays (n,) of zeros."""
+        self._numbers, self._vectors = numbers, vectors
+        self.x_star: list[wp.array] = []
+        self.v_star: list[wp.array] = []
+        self.p: list[wp.array] = [numbers()]
+        """``p[k]`` before iteration k; ``p[0]`` is 0 and never written."""
+        self.c: list[wp.array] = []
+        self.reserve(1)
+
+    def reserve(self, iterations: int) -> None:
+        """Room for every value of so many iterations."""
+        while len(self.x_star) <= iterations:
+            self.x_star.append(self._vectors())
+            self.v_star.append(self._vectors())
+            self.p.append(self._numbers())
+            self.c.append(self._numbers())
 
 
 class PcisphSteps(ParticleSolver):

@@ -10,7 +10,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
-from cortado.sph.free_functions import free_module, rate_function
+from cortado.sph.free_kernels import free_module, rate_function
 
 
 @dataclass(frozen=True)

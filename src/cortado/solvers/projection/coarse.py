@@ -19,13 +19,11 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_bodies import CoarseBodies, CoarseBodiesAdjoint, CoarseBodiesTangent
-from cortado.solvers.projection.coarse_grid import SPACING
-from cortado.solvers.projection.coarse_length import length_kernels
 from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
-from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels
-from cortado.solvers.projection.coarse_residual import residual_kernels
-from cortado.solvers.projection.coarse_sums import coarse_push_kernels
+from cortado.solvers.projection.coarse_pressure import coarse_pressure_kernels, length_kernels
+from cortado.solvers.projection.coarse_residual import coarse_push_kernels, residual_kernels
+from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.velocity import velocity_kernels
 from cortado.sph.conjugate_gradients import round_off
 from cortado.sph.moment_functions import matrix_type, symmetric
@@ -83,7 +81,7 @@ class Coarse:
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
         """Of alpha."""
         self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
-        """Whether scenes are (`cortado.solvers.projection.beginning`)."""
+        """Whether scenes are (`cortado.solvers.projection.pressure`)."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
         """Nothing: what a correction left may not be finite, if its run was lost."""

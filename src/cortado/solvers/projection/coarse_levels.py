@@ -16,7 +16,7 @@ import warp as wp
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.solvers.projection.coarse_hats import node_functions
+from cortado.solvers.projection.coarse_nodes import node_functions
 from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_type
 from cortado.sph.parts import StepContext
 

@@ -1,4 +1,9 @@
-"""The kernels of the nodes of the coarse grid: the matrix A of `cortado.solvers.projection.coarse_pressure` and sums
+"""Hat functions at the nodes of a grid, as a particle sees them and as a node sees its particles.
+
+A node's hat phi is 1 there and falls to 0 at the nodes next to it, linearly along each axis. The cells of the grid are
+those of a `CellSort`; the node of the same number is at the lower corner of a cell.
+
+The kernels of the nodes of the coarse grid: the matrix A of `cortado.solvers.projection.coarse_pressure` and sums
 over the particles around a node.
 """
 
@@ -8,11 +13,171 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.cells import cell_grid_type
+from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.solvers.projection.coarse_hats import hat_functions, node_functions, source_type
 from cortado.sph.moment_functions import matrix_type
+
+ALONE = 0.01
+"""Of h^2, in what holds the nodes around a particle."""
+
+
+def source_type(precision: Precision) -> Any:
+    """The bundle of what is spread."""
+    return bundle(s_value=precision.real, s_slope=precision.vector, s_bent=precision.vector, s_own=precision.real)
+
+
+@dataclass(frozen=True)
+class NodeFunctions:
+    """Warp functions of the nodes of a grid of some shape, which wraps around."""
+
+    number_of: Any
+    """Of a node, which may be as far outside as the grid is wide."""
+    node_of: Any
+    """Of a number."""
+    step_of: Any
+    """From a node to one of those around it, itself among them."""
+    offset_of: Any
+    """The number of such a step."""
+
+
+@cache
+def node_functions(dimension: int) -> NodeFunctions:
+    """In 2 or 3 dimensions."""
+    flat = wp.constant(dimension == 2)
+
+    @wp.func
+    def number_of(node: wp.vec3i, shape: wp.vec3i) -> int:
+        x, y, z = (node[0] + shape[0]) % shape[0], (node[1] + shape[1]) % shape[1], (node[2] + shape[2]) % shape[2]
+        return (z * shape[1] + y) * shape[0] + x
+
+    @wp.func
+    def node_of(number: int, shape: wp.vec3i) -> wp.vec3i:
+        row = number // shape[0]
+        return wp.vec3i(number % shape[0], row % shape[1], row // shape[1])
+
+    @wp.func
+    def step_of(offset: int) -> wp.vec3i:
+        if flat:
+            return wp.vec3i(offset % 3 - 1, offset // 3 - 1, 0)
+        return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
+
+    @wp.func
+    def offset_of(step: wp.vec3i) -> int:
+        if flat:
+            return 3 * step[1] + step[0] + 4
+        return 9 * step[2] + 3 * step[1] + step[0] + 13
+
+    return NodeFunctions(number_of, node_of, step_of, offset_of)
+
+
+@dataclass(frozen=True)
+class HatFunctions:
+    """Warp functions."""
+
+    hat: Any
+    """phi, its gradient and its mixed second derivatives, of one of the nodes at the corners of a position's cell."""
+    at: Any
+    """The same of a sum of hats at a particle: E, G and H of values e at nodes."""
+    products: Any
+    """The sum of e u over the nodes that a particle touches."""
+    bend: Any
+    """H v"""
+    corner_step: Any
+    """To one of the corners of a cell."""
+    held: Any
+    """eps + h^2 / 100, by which a particle holds the nodes around it."""
+
+
+@cache
+def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
+    """In 2 or 3 dimensions."""
+    real, vector = precision.real, precision.vector
+    grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
+    number_of = node_functions(dimension).number_of
+    CORNERS = wp.constant(2**dimension)
+    flat = wp.constant(dimension == 2)
+    alone = wp.constant(real(ALONE))
+
+    @wp.struct
+    class Hat:
+        """phi, its gradient and its mixed second derivatives yz, xz and xy."""
+
+        value: real
+        slope: vector
+        bent: vector
+
+    @wp.func
+    def side(t: real, upper: int) -> real:
+        return wp.where(upper == 1, t, real(1.0) - t)
+
+    @wp.func
+    def bit(corner: int, axis: int) -> int:
+        return (corner >> axis) & 1
+
+    @wp.func
+    def hat(x: vector, corner: int, grid: grid_type) -> Hat:
+        """That of one of the nodes at the corners of a position's cell."""
+        s = wp.cw_mul(x - grid.origin, grid.frequency)
+        t = s - vector(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
+        f, found = grid.frequency, Hat()
+        a, b = side(t[0], bit(corner, 0)), side(t[1], bit(corner, 1))
+        p = wp.where(bit(corner, 0) == 1, f[0], -f[0])
+        q = wp.where(bit(corner, 1) == 1, f[1], -f[1])
+        c, r = real(1.0), real(0.0)
+        if not flat:
+            c = side(t[2], bit(corner, 2))
+            r = wp.where(bit(corner, 2) == 1, f[2], -f[2])
+        found.value = a * b * c
+        found.slope = vector(p * b * c, a * q * c, a * b * r)
+        found.bent = vector(a * q * r, p * b * r, p * q * c)
+        return found
+
+    @wp.func
+    def corner_step(corner: int) -> wp.vec3i:
+        return wp.vec3i(bit(corner, 0), bit(corner, 1), bit(corner, 2))
+
+    @wp.func
+    def first_corner(i: int, particles: int, x: vector, grid: grid_type):
+        """The cell of a particle, and the first node of its scene."""
+        return cell_of(x, grid), (i // particles) * (grid.shape[0] * grid.shape[1] * grid.shape[2])
+
+    @wp.func
+    def at(i: int, particles: int, x: vector, e: wp.array(dtype=real), grid: grid_type) -> Hat:
+        """E, G and H of particle i."""
+        own, first = first_corner(i, particles, x, grid)
+        found = Hat()
+        for corner in range(CORNERS):
+            phi = hat(x, corner, grid)
+            value = e[first + number_of(own + corner_step(corner), grid.shape)]
+            found.value += value * phi.value
+            found.slope += value * phi.slope
+            found.bent += value * phi.bent
+        return found
+
+    @wp.func
+    def products(
+        i: int, particles: int, x: vector, e: wp.array(dtype=real), u: wp.array(dtype=real), grid: grid_type
+    ) -> real:
+        """The sum of e u over the nodes that particle i touches."""
+        own, first = first_corner(i, particles, x, grid)
+        total = real(0.0)
+        for corner in range(CORNERS):
+            node = first + number_of(own + corner_step(corner), grid.shape)
+            total += e[node] * u[node]
+        return total
+
+    @wp.func
+    def bend(bent: vector, v: vector) -> vector:
+        """H v"""
+        return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
+
+    @wp.func
+    def held(eps: real, h: vector) -> real:
+        return eps + alone * wp.dot(h, h)
+
+    return HatFunctions(hat, at, products, bend, corner_step, held)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse import CoarseAdjoint, CoarseTangent
-from cortado.solvers.projection.measured import SurroundingsAdjoint, SurroundingsTangent
-from cortado.solvers.projection.pressed import pressed_adjoint_kernel
+from cortado.solvers.projection.mean_stress import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, KICK, ProjectionSteps
+from cortado.solvers.projection.surroundings import SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.solver import Counts, WithinBar
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent

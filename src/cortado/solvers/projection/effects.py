@@ -1,6 +1,6 @@
 """What a particle's neighbourhood lets the projection do, from the moments of its neighbours.
 
-With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.beside`,
+With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.walls`,
 the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 +
 ((nu + 9 q nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror and q, which is 0 beside others
 (`cortado.solvers.projection.images`):
@@ -25,7 +25,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.solvers.projection.beside import DIRECTION
+from cortado.solvers.projection.walls import DIRECTION
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)

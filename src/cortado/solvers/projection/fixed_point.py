@@ -25,18 +25,17 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import Named, bundle
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Parameters, State
-from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.derivatives import ProjectionAdjoint
 from cortado.solvers.projection.images import image_sums
+from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
-from cortado.solvers.projection.velocity_gradient import velocity_gradient_kernels
+from cortado.solvers.projection.velocity import velocity_gradient_kernels
 from cortado.solvers.solver import Counts
-from cortado.sph.carried import Carried
 from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
 from cortado.sph.moment_functions import matrix_type, symmetric
-from cortado.sph.parts import StepContext
+from cortado.sph.parts import Carried, StepContext
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import image_sum, solid_sum
-from cortado.solvers.projection.beside import normal_part
 from cortado.solvers.projection.effects import APART, away_function
+from cortado.solvers.projection.walls import normal_part
 from cortado.sph.moment_functions import moment_functions
 
 CONTAINER = -1

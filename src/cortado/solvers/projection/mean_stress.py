@@ -9,6 +9,8 @@ particle, and to the point s_b of the wall's surface (the virial of Irving and K
 in d dimensions, where images and walls that mirror (`cortado.solvers.projection.images`) count h and 1 - h times.
 The multiplier k / dt is no stress beside a wall, where neighbours are missing, and scatters where they
 are uneven, so that the forces do not.
+
+Pressures of the projection are impulses, k or `cortado.solvers.projection.mean_stress`, over dt.
 """
 
 from functools import cache
@@ -21,17 +23,19 @@ from numpy.typing import NDArray
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
+from cortado.device.precision import Precision
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import WallTerm
-from cortado.solvers.projection.beside import normal_part
 from cortado.solvers.projection.images import CONTAINER
+from cortado.solvers.projection.walls import normal_part
+from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
-from cortado.sph.wall_sums import WallSums
+from cortado.sph.walls import WallSums
 
 TOPIC = "mean_stress"
 """Of its Warp modules, with the dimension behind it where that counts."""
@@ -260,3 +264,26 @@ def _mirror_work(d: Discretisation) -> Any:
         return -wp.dot(s.volume * normal(gradient(x_ij, s), foot), x_ij - foot) * image_i * reach_bar_i[0]
 
     return mirror_work
+
+
+@cache
+def pressed_adjoint_kernel(precision: Precision) -> Any:
+    """From the adjoint of a pressure to those of its impulse and of dt."""
+    real = precision.real
+
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    def pressed_adjoint(
+        particles: int,
+        time_step: wp.array(dtype=real),
+        impulse: wp.array(dtype=real),
+        p_bar: wp.array(dtype=real),
+        # in and out
+        impulse_bar: wp.array(dtype=real),
+        time_step_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        dt = time_step[i // particles]
+        impulse_bar[i] = impulse_bar[i] + p_bar[i] / dt
+        time_step_bar[i] = time_step_bar[i] - impulse[i] / (dt * dt) * p_bar[i]
+
+    return pressed_adjoint

@@ -1,4 +1,7 @@
-"""The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
+"""What an iteration of the pressure wants of a particle, and which of its slopes it has: see
+`cortado.solvers.projection.pressure`.
+
+The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
 
 With k = dt p, the divergence D, in which walls that move have velocities v_b, and the transpose, which is the force,
 
@@ -13,8 +16,22 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
 b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are those
-of `cortado.solvers.projection.beginning`. Tension is let through by sigma, where particles are surrounded. Slopes of
+of `cortado.solvers.projection.pressure`. Tension is let through by sigma, where particles are surrounded. Slopes of
 the clamp and of the maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
+
+What a step begins with of the pressure of the step before: k is f times as large as it was, and v is v* + f w, with
+the kick w = -D^T k / m that it gave.
+
+Not so for a particle that its kick would take towards a wall, gamma . w > 0, by more than a tenth of a spacing in the
+step. Between walls that are nearer to one another than a spacing it has come from one to the other, and what held it
+off the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure;
+of that choice there is no derivative.
+
+In a shut scene, where every particle has a share c of the coarse pressure, tension is let through beside walls too,
+sigma = 1: fluid that fills a container cannot leave its walls. Of that choice there is no derivative either.
+
+A scene is warm in which a particle begins with a pressure. In a cold one, as in the first step of a run, the coarse
+correction comes before the first iteration too (`cortado.solvers.projection.steps`).
 """
 
 from collections.abc import Callable
@@ -27,13 +44,62 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
+from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.solvers.projection.clamp import clamp_functions
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, symmetric
+
+
+@dataclass(frozen=True)
+class ClampFunctions:
+    """Warp functions of one particle."""
+
+    wanted: Any
+    """b of n, f and dt."""
+    wanted_tangent: Any
+    """Its tangent, given each of them with its own."""
+    parts: Any
+    """The parts of two slopes that k' has."""
+
+
+@cache
+def clamp_functions(precision: Precision) -> ClampFunctions:
+    """In a precision."""
+    real = precision.real
+
+    @wp.func
+    def wanted(n: real, full: real, dt: real) -> real:
+        """b"""
+        return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
+
+    @wp.func
+    def wanted_tangent(n: real, n_dot: real, full: real, full_dot: real, dt: real, dt_dot: real) -> real:
+        found = -wanted(n, full, dt) * dt_dot / dt
+        if n < real(1.0):
+            found -= ((real(1.0) - full) * n_dot + full_dot * (real(1.0) - n)) / dt
+        return found
+
+    @wp.func
+    def parts(up: real, down: real):
+        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or at a corner the mean of both
+        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that
+        there is no corner but in this formula."""
+        rise, fall = real(0.0), real(0.0)
+        if up > real(0.0):
+            rise = real(1.0)
+        elif up == real(0.0):
+            rise = real(0.5)
+        if up <= real(0.0):
+            if down < real(0.0):
+                fall = real(1.0)
+            elif down == real(0.0):
+                fall = real(0.5)
+        return rise, fall
+
+    return ClampFunctions(wanted, wanted_tangent, parts)
 
 
 @dataclass(frozen=True)
@@ -256,3 +322,116 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         Kernels(update, update_tangent, (clamp_adjoint, even, uneven)),
         whole_adjoint,
     )
+
+
+TOWARDS = 0.1
+"""In spacings: how far the kick of the step before may take a particle towards a wall in a step. In dams, jets, a beach
+and a fountain it took none further than that, but those that wait in a nozzle."""
+
+
+@cache
+def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """In 2 or 3 dimensions."""
+    precision = discretisation.precision
+    real, vector, weights4 = precision.real, precision.vector, weights_type(precision)
+    topic = f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    towards = wp.constant(real(TOWARDS))
+
+    @wp.func
+    def taken(kick: vector, gamma: vector, dt: real, spacing: real) -> real:
+        """1, or 0 where nothing is."""
+        if wp.dot(kick, gamma) > real(0.0) and dt * wp.length(kick) > towards * spacing:
+            return real(0.0)
+        return real(1.0)
+
+    @wp.kernel(module=module)
+    def begin(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        k_before: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
+        beside: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        surfaced: wp.array(dtype=int),
+        # in and out
+        weights: wp.array(dtype=weights4),
+        # out
+        k: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        u: wp.array(dtype=vector),
+        warm: wp.array(dtype=int),
+    ):
+        """``warm`` is 0 for each scene before."""
+        i = wp.tid()
+        if surfaced[i // particles] == 0:
+            weights[i][0] = real(1.0)
+        full = weights[i][1] * taken(kick_before[i], beside[i], time_step[i // particles], spacing)
+        first = full * k_before[i]
+        k[i] = first
+        y[i] = first
+        u[i] = v_star[i] + full * kick_before[i]
+        if not (first <= real(0.0)) and warm[i // particles] == 0:
+            warm[i // particles] = 1
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def begin_tangent(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        k_before: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
+        weights: wp.array(dtype=weights4),
+        beside: wp.array(dtype=vector),
+        surfaced: wp.array(dtype=int),
+        dot: bundle(k_before=real, kick_before=vector, v_star=vector),
+        # in and out
+        weights_dot: wp.array(dtype=weights4),
+        # out
+        k_dot: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
+        u_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        if surfaced[i // particles] == 0:
+            weights_dot[i][0] = real(0.0)
+        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
+        full, full_dot = part * weights[i][1], part * weights_dot[i][1]
+        first = full_dot * k_before[i] + full * dot.k_before[i]
+        k_dot[i] = first
+        y_dot[i] = first
+        u_dot[i] = dot.v_star[i] + full_dot * kick_before[i] + full * dot.kick_before[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def begin_adjoint(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        k_before: wp.array(dtype=real),
+        kick_before: wp.array(dtype=vector),
+        weights: wp.array(dtype=weights4),
+        beside: wp.array(dtype=vector),
+        surfaced: wp.array(dtype=int),
+        bar: bundle(k=real, y=real, u=vector),
+        # in and out
+        weights_bar: wp.array(dtype=weights4),
+        v_bar: wp.array(dtype=vector),
+        # out
+        k_before_bar: wp.array(dtype=real),
+        kick_before_bar: wp.array(dtype=vector),
+    ):
+        """``v_bar`` is the adjoint of v*."""
+        i = wp.tid()
+        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
+        y_bar, full, no = bar.k[i] + bar.y[i], part * weights[i][1], real(0.0)
+        k_before_bar[i] = full * y_bar
+        kick_before_bar[i] = full * bar.u[i]
+        full_bar = part * (k_before[i] * y_bar + wp.dot(kick_before[i], bar.u[i]))
+        weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
+        if surfaced[i // particles] == 0:
+            weights_bar[i][0] = no
+        v_bar[i] = v_bar[i] + bar.u[i]
+
+    return Kernels(begin, begin_tangent, begin_adjoint)

@@ -8,7 +8,7 @@ with images in n and d (`cortado.solvers.projection.images`).
 No repair takes a particle further than a sixth of a spacing s: where walls leave no room, or where they press on what
 is in them, densities cannot be right, and a particle would be thrown through a wall.
 
-omega_k is another one in each (`cortado.solvers.projection.constants`). Velocities stay as they are: in them a repair
+omega_k is another one in each (`cortado.solvers.projection.lattice`). Velocities stay as they are: in them a repair
 would be a force that acts once more in the next step. r of `cortado.solvers.projection.effects` lets low densities
 be repaired in the interior alone. g and a are those of the start of the step, n is that of the positions, over the
 neighbours of the start.

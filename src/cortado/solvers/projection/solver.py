@@ -1,11 +1,22 @@
-"""The velocity projection as a `Solver`: its steps, forward, and their derivatives."""
+"""The velocity projection as a `Solver`: its steps, forward, and their derivatives.
 
-from cortado.errors import MissingDerivativeError
+The projection as the solver of a scene.
+"""
+
+from math import inf
+
+from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.state import Parameters
+from cortado.scene.solvers import ProjectionSolver
+from cortado.solvers.build import particle_system
+from cortado.solvers.loop import LoopLimits
+from cortado.solvers.makers import SolverSetting
+from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
 from cortado.solvers.projection.fixed_point import FixedPointAdjoint
+from cortado.solvers.projection.lattice import coarse_grid, endless, lattice_constants
 from cortado.solvers.projection.steps import ProjectionSteps
-from cortado.solvers.solver import ResumingAdjoint, StepAdjoint, StepTangent
+from cortado.solvers.solver import ResumingAdjoint, Solver, StepAdjoint, StepTangent
 
 
 class Projection(ProjectionSteps):
@@ -21,3 +32,37 @@ class Projection(ProjectionSteps):
         if self.bodies is not None:
             raise MissingDerivativeError("bodies that are free have no implicit adjoint: try gradients.Exact.")
         return FixedPointAdjoint(self, steps, tolerance, iterations)
+
+
+class ProjectionMaker:
+    """Makes the solver as the table [solver] of a scene says."""
+
+    batches = True
+
+    def __init__(self, table: ProjectionSolver):
+        self._table = table
+
+    def build(self, setting: SolverSetting) -> Solver:
+        """The solver of a scene that is cut into particles, on a device. Without pressure nothing is projected, and all
+        solvers take the same step."""
+        system, table = particle_system(setting), self._table
+        if not setting.scene.forces.pressure:
+            return Pcisph(system, None)
+        if setting.batch is not None and table.tolerance is not None:
+            raise InputError(
+                f"batch is {setting.batch}, but must be left out, as solver.tolerance is that of one scene."
+            )
+        grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
+        constants = lattice_constants(setting.scene, setting.discrete)
+        own = table.repairs, table.velocities_follow, grid, endless(setting.discrete)
+        return Projection(system, constants, pressure_limits(table), *own)
+
+
+maker = ProjectionMaker
+
+
+def pressure_limits(table: ProjectionSolver) -> LoopLimits:
+    """When the pressure loop may stop."""
+    if table.tolerance is None:
+        return LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
+    return LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)

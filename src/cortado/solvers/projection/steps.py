@@ -15,22 +15,18 @@ from cortado.device.grid import Grid
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
-from cortado.solvers.convergence import ROOT_MEAN_SQUARE
-from cortado.solvers.loop import IterationLog, Loop, LoopLimits
+from cortado.solvers.loop import ROOT_MEAN_SQUARE, IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
-from cortado.solvers.projection.beginning import beginning_kernels
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
-from cortado.solvers.projection.constants import ProjectionConstants
-from cortado.solvers.projection.following import following_kernels
+from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.mean_stress import MeanStress
-from cortado.solvers.projection.measured import Surroundings
-from cortado.solvers.projection.moving import moving_kernels
-from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
+from cortado.solvers.projection.motion import following_kernels, moving_kernels, shift_kernels
+from cortado.solvers.projection.pressure import PressureKernels, beginning_kernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
-from cortado.solvers.projection.shifting import shift_kernels
+from cortado.solvers.projection.surroundings import Surroundings
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
-from cortado.solvers.projection.wall_push import ProjectionPush
+from cortado.solvers.projection.walls import ProjectionPush
 from cortado.solvers.solver import Counts
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.moment_functions import matrix_type, symmetric

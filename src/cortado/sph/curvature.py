@@ -1,0 +1,349 @@
+"""Constants of surface tension by curvature (`cortado.sph.curvature_kernels`), from surfaces whose curvature is known.
+
+J is that of flat surfaces: a lattice is cut across an axis and across a diagonal of a plane. In a layer all particles
+are alike, so that the sums of a few layers are all that it takes.
+
+What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a
+spacing apart (in spacings, for every kernel with a support of 2.5 spacings or more within 0.05): the curvature is found
+`DEEP` below the surface, where it is greater, and w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds
+a particle is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of curvatures in
+the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a wave of the
+surface moves less: the square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
+ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the curvature makes.
+So ACTS d / (3 (d - 1)) is taken off: pressure and squared frequency of the mode 2 then err by as much, one to this side
+and one to that, by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
+
+What surface tension by curvature makes of the sums over a particle's neighbours, see
+`cortado.sph.curvature_kernels`.
+
+The sums of surface tension by curvature over the neighbours of a particle, see `cortado.sph.curvature_kernels`.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.discretise.calibration import lattice_offsets, rest_volume
+from cortado.discretise.smoothing import SmoothingKernel
+from cortado.particles.by_hand import tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
+from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
+
+DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
+"""In spacings, see above."""
+
+
+@dataclass(frozen=True)
+class CurvatureConstants:
+    """Of a smoothing kernel and a spacing."""
+
+    spacing: float
+    """[m]"""
+    width: float
+    """J [-]"""
+    depth: float
+    """delta [m]"""
+
+    @classmethod
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
+        """On a lattice with a spacing [m], for a support radius [m]."""
+        width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
+        shared = ACTS * dimension / (3.0 * (dimension - 1))
+        return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
+
+
+def _indicator(size: np.ndarray) -> np.ndarray:
+    """w of s |q|."""
+    t = np.clip((size - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@cache
+def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[int, int]) -> float:
+    """J of a flat surface across a direction in the plane of the first two axes, for a support in spacings."""
+    offsets, volume = lattice_offsets(1.0, support, dimension), rest_volume(kernel, 1.0, support, dimension)
+    apart = 1.0 / float(np.linalg.norm(cut))
+    weights = volume * kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
+    upwards = offsets[:, :2] @ np.array(cut)
+    slopes = volume * kernel.gradient(offsets, support)[:, :2] @ np.array(cut) * apart
+    layers = 2 * int(support / apart) + 3
+    above = np.arange(layers)[:, None] - np.rint(upwards).astype(int)[None, :]  # layer of each neighbour of a layer
+    inside, place = above >= 0, np.clip(above, 0, 2 * layers)
+    g = np.append((inside * slopes).sum(axis=1), np.zeros(layers + 1))
+    q = (inside * weights * g[place]).sum(axis=1) / (inside * weights).sum(axis=1)
+    return float((_indicator(np.abs(q)) * np.abs(q)).sum() * apart)
+
+
+FAINT, CLEAR = 0.03, 0.1
+"""s |q| below which a particle is no part of the surface, and above which all of it is."""
+SINGULAR = {2: 1e-3, 3: 1e-4}
+"""By dimension, what is added to det B: neighbours may lie on a line, or be missing. There kappa is 0."""
+LONE = 1e-6
+"""What is added to sum V W w: where no neighbour is part of the surface, the mean curvature is 0."""
+HOLLOW = 0.25
+"""delta kappa below which the depth of a hollow surface counts less, in a parabola, until it counts no more: bubbles of
+a radius below 3 delta, which the divisor 1 + delta kappa would be 0 in."""
+
+
+@dataclass(frozen=True)
+class CurvatureFunctions:
+    """Warp functions of one particle."""
+
+    normal: Any
+    """w and e of q and the spacing."""
+    normal_tangent: Any
+    """Their tangents, of q, the spacing and the tangent of q."""
+    normal_back: Any
+    """The adjoint of q, of q, the spacing and the adjoints of w and e."""
+    curvature: Any
+    """kappa of B and D."""
+    curvature_back: Any
+    """kappa and the symmetric adjoints of B and D, for that of kappa; a tangent follows from those for 1."""
+    outermost: Any
+    """k of a, b and delta."""
+    outermost_back: Any
+    """The derivatives of k by a and b."""
+
+
+@cache
+def curvature_functions(precision: Precision, dimension: int, module: Any) -> CurvatureFunctions:
+    """In 2 or 3 dimensions, in a Warp module."""
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    smoothstep = moment_functions(precision, dimension).smoothstep
+    faint, clear = wp.constant(real(FAINT)), wp.constant(real(CLEAR))
+    singular, lone, hollow = wp.constant(real(SINGULAR[dimension])), wp.constant(real(LONE)), wp.constant(real(HOLLOW))
+
+    @wp.func
+    def rise(size: real) -> real:
+        """The derivative of w by s |q|."""
+        t = wp.clamp((size - faint) / (clear - faint), real(0.0), real(1.0))
+        return real(6.0) * t * (real(1.0) - t) / (clear - faint)
+
+    @wp.func
+    def normal(q: vector, spacing: real):
+        """Where w is 0, e is 0, as nothing depends on it."""
+        size, w, e = wp.length(q), real(0.0), vector()
+        if size * spacing > faint:
+            w = smoothstep(size * spacing, faint, clear)
+            e = q / size
+        return w, e
+
+    @wp.func
+    def normal_tangent(q: vector, spacing: real, q_dot: vector):
+        size, w_dot, e_dot = wp.length(q), real(0.0), vector()
+        if size * spacing > faint:
+            along = wp.dot(q, q_dot) / size
+            w_dot = rise(size * spacing) * spacing * along
+            e_dot = (q_dot - (along / size) * q) / size
+        return w_dot, e_dot
+
+    @wp.func
+    def normal_back(q: vector, spacing: real, w_bar: real, e_bar: vector) -> vector:
+        size, q_bar = wp.length(q), vector()
+        if size * spacing > faint:
+            along = rise(size * spacing) * spacing * w_bar - wp.dot(q, e_bar) / (size * size)
+            q_bar = (e_bar + along * q) / size
+        return q_bar
+
+    @wp.func(module=module)
+    def curvature(B: matrix, D: matrix) -> real:
+        """-tr(B^-1 D), by cofactors."""
+        a = B[1, 1] * B[2, 2] - B[1, 2] * B[2, 1]
+        b = B[0, 2] * B[2, 1] - B[0, 1] * B[2, 2]
+        c = B[0, 1] * B[1, 2] - B[0, 2] * B[1, 1]
+        e = B[0, 0] * B[2, 2] - B[0, 2] * B[2, 0]
+        f = B[0, 2] * B[1, 0] - B[0, 0] * B[1, 2]
+        h = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+        part = a * D[0, 0] + e * D[1, 1] + h * D[2, 2] + b * (D[0, 1] + D[1, 0])
+        part += c * (D[0, 2] + D[2, 0]) + f * (D[1, 2] + D[2, 1])
+        return -part / (B[0, 0] * a + B[1, 0] * b + B[2, 0] * c + singular)
+
+    @wp.func(module=module)
+    def curvature_back(B: matrix, D: matrix, bar: real):
+        by_B, by_D = wp.grad(curvature)(B, D)
+        return (
+            curvature(B, D),
+            (real(0.5) * bar) * (by_B + wp.transpose(by_B)),
+            (real(0.5) * bar) * (by_D + wp.transpose(by_D)),
+        )
+
+    @wp.func(module=module)
+    def outermost(a: real, b: real, depth: real) -> real:
+        mean = a / (b + lone)
+        more = depth * mean
+        rest = wp.clamp(real(3.0) * hollow + more, real(0.0), real(2.0) * hollow)
+        divisor = real(1.0) - real(2.0) * hollow + rest * rest / (real(4.0) * hollow) + wp.max(more + hollow, real(0.0))
+        return mean / divisor
+
+    @wp.func(module=module)
+    def outermost_back(a: real, b: real, depth: real):
+        by_a, by_b, _by_depth = wp.grad(outermost)(a, b, depth)
+        return by_a, by_b
+
+    return CurvatureFunctions(
+        *(normal, normal_tangent, normal_back), *(curvature, curvature_back), *(outermost, outermost_back)
+    )
+
+
+@dataclass(frozen=True)
+class CurvatureSums:
+    """Warp functions of sums over the fluid. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
+
+    colour: Any
+    """g and z, without W(0)."""
+    colour_tangent: Any
+    colour_back: Any
+    """What adjoints of g and z give to x."""
+    average: Any
+    """V sum W_ij g_j"""
+    average_tangent: Any
+    average_back: Any
+    """For adjoints r of it: V sum W_ij r_j, and what x is given."""
+    bend: Any
+    """B and the symmetric part of D."""
+    bend_tangent: Any
+    bend_back: Any
+    """For symmetric adjoints of B and D: what e, w and x are given."""
+    mean: Any
+    """V sum W_ij c_j and V sum W_ij w_j"""
+    mean_tangent: Any
+    mean_back: Any
+    """For adjoints a and b of the two: V sum W_ij a_j, V sum W_ij b_j, and what x is given."""
+
+
+@cache
+def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
+    """Of a discretisation."""
+    precision = discretisation.precision
+    real, vector = precision.real, precision.vector
+    neighbourhood, matrix = neighbourhood_type(precision), matrix_type(precision)
+    pair, cross_terms = pair_functions(discretisation), cross_terms_function(precision)
+    weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
+
+    @wp.func
+    def even_terms(a: vector, b: vector) -> vector:
+        """Entries yz, xz and xy of (a b^T + b a^T) / 2."""
+        return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
+
+    @fluid_sum(discretisation)
+    def colour(x_ij: vector, s: neighbourhood) -> tuple[vector, real]:
+        return s.volume * gradient(x_ij, s), s.volume * weight(x_ij, s)
+
+    @tangent_of(colour)
+    @fluid_sum(discretisation, ahead=False)
+    def colour_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> tuple[vector, real]:
+        return s.volume * hessian_product(x_ij, x_dot_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+
+    @fluid_sum(discretisation)
+    def colour_back(x_ij: vector, g_bar_ij: vector, z_bar_i: real, z_bar_j: real, s: neighbourhood) -> vector:
+        return s.volume * (hessian_product(x_ij, g_bar_ij, s) + (z_bar_i + z_bar_j) * gradient(x_ij, s))
+
+    @fluid_sum(discretisation)
+    def average(x_ij: vector, g_j: vector, s: neighbourhood) -> vector:
+        return (s.volume * weight(x_ij, s)) * g_j
+
+    @tangent_of(average)
+    @fluid_sum(discretisation, ahead=False)
+    def average_tangent(x_ij: vector, x_dot_ij: vector, g_j: vector, g_dot_j: vector, s: neighbourhood) -> vector:
+        return s.volume * (weight(x_ij, s) * g_dot_j + wp.dot(gradient(x_ij, s), x_dot_ij) * g_j)
+
+    @fluid_sum(discretisation)
+    def average_back(
+        x_ij: vector, g_i: vector, g_j: vector, r_i: vector, r_j: vector, s: neighbourhood
+    ) -> tuple[vector, vector]:
+        both = wp.dot(r_i, g_j) + wp.dot(r_j, g_i)
+        return (s.volume * weight(x_ij, s)) * r_j, (s.volume * both) * gradient(x_ij, s)
+
+    @fluid_sum(discretisation)
+    def bend(
+        x_ij: vector, e_i: vector, e_j: vector, w_j: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector]:
+        g = (s.volume * w_j) * gradient(x_ij, s)
+        turn = e_j - e_i
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(turn, g), even_terms(turn, g)
+
+    @tangent_of(bend)
+    @fluid_sum(discretisation, ahead=False)
+    def bend_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        e_i: vector,
+        e_j: vector,
+        e_dot_i: vector,
+        e_dot_j: vector,
+        w_j: real,
+        w_dot_j: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, vector]:
+        """g x^T is symmetric, and so are the two terms together that its tangent has."""
+        g = (s.volume * w_j) * gradient(x_ij, s)
+        g_dot = s.volume * (w_dot_j * gradient(x_ij, s) + w_j * hessian_product(x_ij, x_dot_ij, s))
+        turn, turn_dot = e_j - e_i, e_dot_j - e_dot_i
+        return (
+            -wp.cw_mul(g_dot, x_ij) - wp.cw_mul(g, x_dot_ij),
+            -cross_terms(g_dot, x_ij) - cross_terms(g, x_dot_ij),
+            wp.cw_mul(turn_dot, g) + wp.cw_mul(turn, g_dot),
+            even_terms(turn_dot, g) + even_terms(turn, g_dot),
+        )
+
+    @fluid_sum(discretisation)
+    def bend_back(
+        x_ij: vector,
+        e_i: vector,
+        e_j: vector,
+        w_i: real,
+        w_j: real,
+        B_bar_i: matrix,
+        B_bar_j: matrix,
+        D_bar_i: matrix,
+        D_bar_j: matrix,
+        s: neighbourhood,
+    ) -> tuple[vector, real, vector]:
+        """A pair adds w_j times something to the sums of i, and w_i times the same to those of j."""
+        g, turn = s.volume * gradient(x_ij, s), e_j - e_i
+        moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
+        turned = w_j * D_bar_i + w_i * D_bar_j
+        w_part = wp.dot(g, D_bar_j * turn - B_bar_j * x_ij)
+        x_part = hessian_product(x_ij, turned * turn - moved, s) - slope(x_ij, s) * moved
+        return -(turned * g), w_part, s.volume * x_part
+
+    @fluid_sum(discretisation)
+    def mean(x_ij: vector, c_j: real, w_j: real, s: neighbourhood) -> tuple[real, real]:
+        W = s.volume * weight(x_ij, s)
+        return W * c_j, W * w_j
+
+    @tangent_of(mean)
+    @fluid_sum(discretisation, ahead=False)
+    def mean_tangent(
+        x_ij: vector, x_dot_ij: vector, c_j: real, c_dot_j: real, w_j: real, w_dot_j: real, s: neighbourhood
+    ) -> tuple[real, real]:
+        W, W_dot = s.volume * weight(x_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+        return W_dot * c_j + W * c_dot_j, W_dot * w_j + W * w_dot_j
+
+    @fluid_sum(discretisation)
+    def mean_back(
+        x_ij: vector,
+        c_i: real,
+        c_j: real,
+        w_i: real,
+        w_j: real,
+        a_i: real,
+        a_j: real,
+        b_i: real,
+        b_j: real,
+        s: neighbourhood,
+    ) -> tuple[real, real, vector]:
+        W, both = s.volume * weight(x_ij, s), a_i * c_j + a_j * c_i + b_i * w_j + b_j * w_i
+        return W * a_j, W * b_j, (s.volume * both) * gradient(x_ij, s)
+
+    return CurvatureSums(
+        *(colour, colour_tangent, colour_back),
+        *(average, average_tangent, average_back),
+        *(bend, bend_tangent, bend_back),
+        *(mean, mean_tangent, mean_back),
+    )

@@ -1,0 +1,305 @@
+"""What Python's operators mean that Warp has another meaning for, as functions of Warp, in a precision.
+
+A user's text as Warp compiles it: with numbers of a precision, and with what Python means by its operators.
+
+Refuses what Warp takes in a user's function for something else than Python does.
+"""
+
+import ast
+import builtins
+from collections.abc import Mapping
+from copy import deepcopy
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.errors import InputError
+from cortado.sph.function_text import counts_of
+
+REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "cortado_nearest", "cortado_whole"
+"""What compiled texts call a % b, a // b, round(a) and int(a)."""
+
+
+@cache
+def meanings(precision: Precision) -> dict[str, Any]:
+    """By these names. Of a % b, which has the sign of b, and of a // b the bits are those of CPython."""
+    real, module = precision.real, kernel_module(f"python_{precision.name}")
+    none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
+
+    @wp.func(module=module)
+    def quotient(a: real, b: real) -> real:
+        left = wp.mod(a, b)
+        ratio = (a - left) / b
+        if left != none and (left < none) != (b < none):
+            ratio = ratio - one
+        whole = wp.floor(ratio)
+        if ratio - whole > half:
+            whole = whole + one
+        return whole
+
+    @wp.func(module=module)
+    def remainder(a: real, b: real) -> real:
+        left = wp.mod(a, b)
+        if left != none and (left < none) != (b < none):
+            left = left + b
+        return left
+
+    @wp.func_grad(remainder)
+    def adjoint_of_remainder(a: real, b: real, left_bar: real):
+        wp.adjoint[a] += left_bar
+        wp.adjoint[b] -= quotient(a, b) * left_bar
+
+    return {REMAINDER: remainder, QUOTIENT: quotient, NEAREST: wp.rint, WHOLE: wp.trunc}
+
+
+REAL, VECTOR = "cortado_real", "cortado_vector"
+"""What the compiled text calls the types of a number and of a vector."""
+_TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
+_OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
+_CALLS = {"round": NEAREST, "int": WHOLE}
+Lines = ast.AST | list[ast.stmt]
+
+
+class InPrecision(ast.NodeTransformer):
+    """Numbers, and types of numbers and vectors, become those of the precision; what numbers and vectors from outside
+    are is written out, so that the text says all that the function does. Whole numbers are left as indices alone:
+    loops are written out too, and with them what each index is."""
+
+    def __init__(self, what: str, scope: Mapping[str, Any], local: set[str]):
+        self._what, self._scope, self._local = what, scope, local
+        self._counts: dict[str, int] = {}
+        """What loops count with, where the text has come to."""
+        self._given = set[str]()
+        """Arguments, of which vectors have three components."""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        self._given = {one.arg for one in node.args.args}
+        return self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> ast.AST:
+        return _number(node, node.value)
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return self._resolved(node) if isinstance(node.ctx, ast.Load) else node
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
+        return self.generic_visit(node) if (found := self._resolved(node)) is node else found
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        node.value = self.visit(node.value)
+        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        numbers = [self._index(part) for part in parts]
+        if isinstance(node.value, ast.Name) and node.value.id in self._given and set(numbers) - set(range(-3, 3)):
+            raise InputError(f"{self._what} has {ast.unparse(node)}, but must have an index of 0, 1 or 2 there.")
+        written: list[ast.expr] = [ast.Constant(number) for number in numbers]
+        node.slice = ast.Tuple(written, ast.Load()) if isinstance(node.slice, ast.Tuple) else written[0]
+        return node
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+        return node if isinstance(node.value, ast.Constant) else self.generic_visit(node)
+
+    def visit_For(self, node: ast.For) -> Lines:
+        ends, lines = [self._index(end) for end in node.iter.args], list[ast.stmt]()
+        for count in range(*ends):
+            self._counts[node.target.id] = count
+            lines += self._lines(node.body)
+        return lines + self._lines(node.orelse) or [ast.Pass()]
+
+    def _lines(self, lines: list[ast.stmt]) -> list[ast.stmt]:
+        found = [self.visit(deepcopy(line)) for line in lines]
+        return [line for one in found for line in (one if isinstance(one, list) else [one])]
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> Lines:
+        before = ast.Name(node.target.id, ast.Load())  # type: ignore[union-attr]
+        return self.visit(ast.Assign([node.target], ast.BinOp(before, node.op, node.value)))
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        left, right = self.visit(node.left), self.visit(node.right)
+        if (name := _OPERATORS.get(type(node.op))) is not None:
+            return ast.Call(ast.Name(name, ast.Load()), [left, right], [])
+        return ast.BinOp(left, node.op, right)
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        values = [node.left, *node.comparators]
+        pairs = zip(values, node.ops, values[1:], strict=False)
+        each: list[ast.expr] = [
+            ast.Compare(self.visit(deepcopy(a)), [op], [self.visit(deepcopy(b))]) for a, op, b in pairs
+        ]
+        return each[0] if len(each) == 1 else ast.BoolOp(ast.And(), each)
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        name = node.func.id if isinstance(node.func, ast.Name) and node.func.id not in self._scope else None
+        given = [self.visit(argument) for argument in node.args]
+        if name in _CALLS:
+            return ast.Call(ast.Name(_CALLS[name], ast.Load()), given, [])
+        if name == "pow" and len(given) == 2:
+            return ast.BinOp(given[0], ast.Pow(), given[1])
+        if name in ("min", "max") and len(given) > 2:
+            while len(given) > 1:
+                given = [ast.Call(ast.Name(name, ast.Load()), given[:2], []), *given[2:]]
+            return given[0]
+        keywords = [ast.keyword(one.arg, self.visit(one.value)) for one in node.keywords]
+        return ast.Call(self.visit(node.func), given, keywords)
+
+    def _index(self, node: ast.expr) -> int:
+        """What a whole number is, as Python computes it; raises `InputError`."""
+        known = {one.id: one for one in ast.walk(node) if isinstance(one, ast.Name)}
+        values = {name: self._counts.get(name, self._scope.get(name)) for name in known if name not in self._local}
+        values |= {name: count for name, count in self._counts.items() if name in known}
+        try:
+            found = eval(compile(ast.Expression(node), "<index>", "eval"), {"__builtins__": {}}, values)
+            if isinstance(found, (int, np.integer)) and not isinstance(found, bool):
+                return int(found)
+        except Exception:  # whatever an expression of other things raises
+            pass
+        found = f"{self._what} has the index {ast.unparse(node)}"
+        raise InputError(f"{found}, but must have whole numbers there, or what follows from the counts of its loops.")
+
+    def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
+        """A name from outside, as a number or a type of the precision if it stands for one."""
+        try:
+            value = self._value(node)
+        except (KeyError, AttributeError):
+            return node
+        if isinstance(value, type) and value in _TYPES:
+            return ast.Name(_TYPES[value], ast.Load())
+        return _number(node, value)
+
+    def _value(self, node: ast.expr) -> Any:
+        if isinstance(node, ast.Attribute):
+            return getattr(self._value(node.value), node.attr)
+        if not isinstance(node, ast.Name) or (node.id in self._local and node.id not in self._counts):
+            raise KeyError
+        return float if node.id == "float" else self._counts.get(node.id, self._scope.get(node.id))
+
+
+def _number(node: ast.expr, value: Any) -> ast.AST:
+    """A call that makes a number or a vector of the precision, where a value is one; truth values as they are."""
+    if type(value) in (wp.vec3f, wp.vec3d):
+        return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
+    if isinstance(value, (bool, np.bool_)):
+        return ast.Constant(bool(value))
+    if type(value) in wp._src.types.scalar_types:
+        value = value.value
+    if not isinstance(value, (int, float, np.integer, np.floating)):
+        return node
+    return ast.Call(ast.Name(REAL, ast.Load()), [ast.Constant(float(value))], [])
+
+
+BUILTINS = ("abs", "float", "int", "max", "min", "pow", "range", "round")
+"""Functions of Python that a function may call."""
+MATH = (
+    *("acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "degrees", "exp", "floor", "isfinite", "isinf", "isnan"),
+    *("log", "log10", "log2", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
+)
+"""Those of its module math."""
+
+
+def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
+    """Raises `InputError` for a call of something else than functions and types of Warp, as Warp would take one of its
+    own of the same name."""
+    for node in ast.walk(function):
+        if not isinstance(node, ast.Call):
+            continue
+        name, root = ast.unparse(node.func), _root(node.func)
+        if root is None or root in own:
+            continue
+        called = _found(node.func, scope)
+        if root not in scope and root in BUILTINS:
+            if name == "round" and len(node.args) + len(node.keywords) != 1:
+                raise InputError(f"{what} rounds to digits, but must have round of one number alone.")
+        elif not _is_of_warp(called):
+            raise InputError(
+                f"{what} cannot be compiled: it calls {name}, which is no function of Warp; it must call functions of "
+                f"Warp alone, of its own under @wp.func, {', '.join(BUILTINS)}, or those of math that Warp has."
+            )
+
+
+def check_truths(what: str, function: ast.FunctionDef) -> None:
+    """Raises `InputError` for ``and`` and ``or`` whose value is one of their numbers, as it is a truth in Warp."""
+    tests: set[ast.AST] = set()
+    for node in ast.walk(function):
+        if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):
+            tests.add(node.test)
+        elif isinstance(node, ast.BoolOp) and node in tests:
+            tests.update(node.values)
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            tests.add(node.operand)
+    truths = {name for name, values in _assigned(function).items() if all(_is_truth(v, set()) for v in values)}
+    for node in ast.walk(function):
+        if isinstance(node, ast.BoolOp) and node not in tests and not _is_truth(node, truths):
+            found = f"{what} has {ast.unparse(node)!r}, which is one of its numbers in Python and a truth in Warp"
+            raise InputError(f"{found}, but must have comparisons there, or x if x != 0.0 else y.")
+
+
+def check_helper(what: str, function: ast.FunctionDef) -> None:
+    """Raises `InputError` for what a function under ``@wp.func``, whose numbers have types of their own, has in another
+    meaning than Python's."""
+    check_truths(what, function)
+    wholes = set(counts_of(function))
+    for node in ast.walk(function):
+        of = getattr(node, "op", None)
+        if isinstance(of, (ast.Mod, ast.FloorDiv)) or (isinstance(of, ast.Div) and _is_of_wholes(node, wholes)):
+            wanted = "wp.mod, wp.floor, wp.rint and numbers with a point"
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("round", "builtins.round"):
+            wanted = "wp.rint, or wp.round, which rounds halves away from 0"
+        else:
+            continue
+        found = f"{what} calls a function of Warp with {ast.unparse(node)!r}, which is another number in Python"
+        raise InputError(f"{found}, but must say what is meant, by {wanted}.")
+
+
+def _is_of_wholes(node: ast.AST, wholes: set[str]) -> bool:
+    return isinstance(node, ast.BinOp) and all(_is_whole(part, wholes) for part in (node.left, node.right))
+
+
+def _is_whole(node: ast.expr, wholes: set[str]) -> bool:
+    if isinstance(node, ast.Constant):
+        return type(node.value) is int
+    if isinstance(node, ast.BinOp):
+        return _is_of_wholes(node, wholes)
+    if isinstance(node, ast.UnaryOp):
+        return _is_whole(node.operand, wholes)
+    if isinstance(node, ast.Call):
+        return ast.unparse(node.func) in ("int", "wp.int32", "wp.int64")
+    return isinstance(node, ast.Name) and node.id in wholes
+
+
+def _assigned(function: ast.FunctionDef) -> dict[str, list[ast.expr]]:
+    found: dict[str, list[ast.expr]] = {}
+    for node in ast.walk(function):
+        for target in node.targets if isinstance(node, ast.Assign) else ():
+            found.setdefault(ast.unparse(target), []).append(node.value)
+    return found
+
+
+def _is_truth(node: ast.expr, truths: set[str]) -> bool:
+    if isinstance(node, ast.BoolOp):
+        return all(_is_truth(value, truths) for value in node.values)
+    is_not = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+    is_named = isinstance(node, ast.Name) and node.id in truths
+    return is_not or is_named or isinstance(node, ast.Compare) or getattr(node, "value", None) in (True, False)
+
+
+def _root(node: ast.expr) -> str | None:
+    while isinstance(node, ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else None
+
+
+def _found(node: ast.expr, scope: Mapping[str, Any]) -> Any:
+    if isinstance(node, ast.Attribute):
+        owner = _found(node.value, scope)
+        return getattr(owner, node.attr, wp._src.context.builtin_functions.get(node.attr) if owner is wp else None)
+    return scope.get(node.id, getattr(builtins, node.id, None)) if isinstance(node, ast.Name) else None
+
+
+def _is_of_warp(called: Any) -> bool:
+    if isinstance(called, wp.Function) or called is float:
+        return True
+    name = getattr(called, "__module__", None) or ""
+    return name.partition(".")[0] == "warp" or (name == "math" and called.__name__ in MATH)
