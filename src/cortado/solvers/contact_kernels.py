@@ -1,6 +1,4 @@
-"""How strongly a body and what it touches push each other: see `cortado.solvers.contact_kernels`.
-
-What a body gets from another solid that it touches: a smooth penalty.
+"""The force between a body and a solid that it touches: a smooth penalty.
 
 Points of a body's surface that are in the other solid, d_j > 0 deep, give it the momentum
 

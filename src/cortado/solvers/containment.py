@@ -1,6 +1,6 @@
-"""Which particles are lost: outside of their container or in a solid, too far away, or not finite.
-
-Looks for lost particles at the end of every step, on the device. Any solver can use it.
+"""A search for lost particles at the end of every step, on the device: those outside of their container or in a solid,
+too
+far away, or not finite. Any solver can use it.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,8 +1,6 @@
-"""Decisions of the loops of a step and records of them, taken on the device.
-
-What is noted of a system of equations that a force solves in every step.
-
-Loops of a step that go round until an error is small enough, and what is noted of them in every step.
+"""The loops of a step, which go round until an error is small enough. Kernels decide on the device whether to go on,
+and
+record iterations and errors of every step, also those of the systems of equations that forces solve.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,6 @@
-"""Solvers from outside: what `Simulation` takes as ``solver``, and what it is given to make one.
-
-What makes the solver and the forces that a scene names by their kinds, and the parameters that these bring.
+"""Makers of solvers: what `Simulation` takes as ``solver``, and the makers of the solver and the forces that a scene
+names
+by their kinds, with the parameters that these bring.
 """
 
 from collections.abc import Sequence

@@ -13,10 +13,7 @@ ACTS / R in space. A smaller delta raises pressures, and twice as much the force
 So ACTS d / (3 (d - 1)) is taken off: pressure and squared frequency of the mode 2 then err by as much, one to this side
 and one to that, by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
 
-What surface tension by curvature makes of the sums over a particle's neighbours, see
-`cortado.sph.curvature_kernels`.
-
-The sums of surface tension by curvature over the neighbours of a particle, see `cortado.sph.curvature_kernels`.
+Functions of Warp for these sums, and for what follows from them, are here too.
 """
 
 from dataclasses import dataclass

@@ -19,8 +19,6 @@ of the surface. Over the layers of a flat surface w |q| adds up to J. For delta 
 
 D comes as its symmetric part, which is all that the trace needs.
 
-The tangents and the adjoints of surface tension by curvature, see `cortado.sph.curvature_kernels`.
-
 Tangents go the way of the sums, adjoints from the last one to the first: what the adjoint of one adds to those of q, w,
 e, c, g and z, the next one takes up.
 """

@@ -1,8 +1,4 @@
-"""The one sum over neighbours that diffusion is made of, B of `cortado.sph.diffusion`, and its derivatives.
-
-How many explicit steps of diffusion a time step takes.
-
-Cahn-Hilliard diffusion between the phases of a mixture (after Yang et al. 2015):
+"""Cahn-Hilliard diffusion between the phases of a mixture (after Yang et al. 2015):
 
     chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)

@@ -8,8 +8,6 @@ s = u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
 q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate and A its area.
 Position and velocity do not jump when a particle becomes free. Particles in reserve, further upstream than the column
 is long, are elsewhere, by a constant vector, until they join its end.
-
-An emitter: the particles that have not left its nozzle yet are prescribed at the end of a step, others are free.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
-"""The parameters of a function of one's own as one vector, theta: time, numbers and vectors, one behind the other.
-
-A force that is one Python function, as Warp compiles it: in either precision, with numbers of that precision.
-
-What kernels of a force call that is one function f of a user's: f itself, and its derivatives.
+"""A user's Python function as kernels call it: compiled by Warp in either precision, with its derivatives. Its
+parameters
+are one vector, theta: time, numbers and vectors, one behind the other.
 """
 
 import ast

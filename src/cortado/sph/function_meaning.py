@@ -1,8 +1,5 @@
-"""What Python's operators mean that Warp has another meaning for, as functions of Warp, in a precision.
-
-A user's text as Warp compiles it: with numbers of a precision, and with what Python means by its operators.
-
-Refuses what Warp takes in a user's function for something else than Python does.
+"""A user's function means the same in Warp as in Python: numbers get the precision of the run, operators that Warp
+understands otherwise are replaced by Warp functions with Python's meaning, and what cannot be replaced is refused.
 """
 
 import ast

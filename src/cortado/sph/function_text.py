@@ -1,8 +1,6 @@
-"""The text of a user's function, which is what Warp compiles: it must be what the function was made from.
-
-What a user's function names that is not its own: as it is when the force is made, and in words.
-
-The text of a user's function: what Warp can differentiate, and its numbers in a precision.
+"""The source text of a user's function, which Warp compiles: checked against the function itself, with the values of
+the
+names from outside as they are when the force is made, and refused where Warp cannot differentiate it.
 """
 
 import ast

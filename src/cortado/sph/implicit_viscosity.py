@@ -1,24 +1,14 @@
-"""The operator of implicit viscosity, for `cortado.sph.conjugate_gradients`:
-
-    (B y)_i = y_i - dt g(y)_i,
-
-where g(y) is the acceleration by viscosity as a stress (`cortado.sph.stress_kernels`) of fluid with velocities y, with
-M and mu kept. B is symmetric and positive with respect to the product sum_i m_i a_i . b_i.
-
-The kernels of implicit viscosity that lead to a solve and back from one: see `cortado.sph.implicit_viscosity`.
-
-Velocities v are those at the start, of which mu is, and u = v + dt a' those at the end, of which the stress is.
-
-Viscosity as a stress at the end of a step: its time step has no limit.
+"""Viscosity as a stress at the end of a step: its time step has no limit.
 
 With the acceleration a by all other forces, and g(v) by the stress of fluid with velocities v
 (`cortado.sph.stress_kernels`), with M and mu of the velocities at the start, what acts is a' of
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.conjugate_gradients` solves to round-off. So the derivatives are those of the solution, whatever way
-led to it: the tangent is one more solve with B, and so is the adjoint, as B is symmetric in the product weighted with
-masses.
+which `cortado.sph.conjugate_gradients` solves to round-off. B is symmetric and positive with respect to the product
+sum_i m_i a_i . b_i. mu is that of the velocities v at the start, the stress that of u = v + dt a' at the end. So the
+derivatives are those of the solution, whatever way led to it: the tangent is one more solve with B, and so is the
+adjoint, as B is symmetric in the product weighted with masses.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,4 @@
-"""Kernels that take entries of particles from the scene's order to the sorted one, and back.
-
-Semi-implicit Euler, and the way between scene order and sorted order.
+"""Semi-implicit Euler, and the way of particles' entries from the scene's order to the sorted one, and back.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a particle of several phases is made of: its mass fractions c, and what follows from them.
+"""The mass fractions c of a particle of several phases, and the rest density and viscosity that follow from them:
 
     1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
 
@@ -6,9 +6,8 @@ Masses are constant (Yang et al. 2015 leave open whether mass or volume is; with
 fractions it is the mass), so that a particle's rest volume follows its rest density. The logarithms keep the viscosity
 positive where fractions stray out of [0, 1].
 
-The mixture step: phases diffuse into one another, and each particle gets the material of what it is made of.
-
-It comes first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
+In the mixture step phases diffuse into one another, and each particle gets the material of its new fractions. It comes
+first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
 """
 
 from contextlib import nullcontext

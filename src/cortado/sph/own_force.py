@@ -1,11 +1,9 @@
-"""What forces that are one function of a user's have in common: its text, its parameters, how they are made.
+"""Forces that are one function of a user's, on each particle or between neighbours.
 
-A force on each particle that is one function of a user's: a_i = f(x_i, v_i, t, theta) [m/s2].
+`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. Its adjoint is Warp's own of the product
+f . a_bar; its tangent is put together of the gradients of its components, so that both are exact.
 
-Its adjoint is Warp's own of the product f . a_bar; its tangent is put together of the gradients of its components, so
-that both are exact.
-
-A force between neighbours that is one function of a user's: the force [N], in 2-D per metre, on a particle from each
+`Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each
 neighbour within the support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
 
 a_i = 1 / (m_i s^d) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)

@@ -1,9 +1,9 @@
-"""What a part of a step is given, and what it gives: forces, the mixture, the nozzle.
+"""The parts of a step, such as forces, the mixture and the nozzle: what they are given, and when they act.
 
 A part reads the sorted particles and the parameters, and adds to adjoints: nothing that it is given is overwritten.
 
-What a part of a step may do besides accelerating particles: keep fields from step to step, and work at the beginning
-and at the end of a step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
+Besides accelerating particles a part may keep fields from step to step, and work at the beginning and at the end of a
+step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
 
 A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
 order in reverse mode. A method that a part has not does nothing. Of what a step knows, kernels find at the `begin` of a
@@ -13,9 +13,8 @@ neighbours and n as well, and at `end` everything.
 A derivative takes a step again from its state, but not its end. So what a tangent or an adjoint needs of a step has to
 stand in arrays that `begin`, `sort` or `settle` write.
 
-Fields of particles that a solver carries from step to step: a pressure that the next step begins with, say.
-
-A state has them in the scene's order of particles, a step works on sorted ones. The adjoint of sorting is the way back.
+A solver too carries fields of particles from step to step, such as the pressure that the next step begins with. A state
+has them in the scene's order of particles, a step works on sorted ones. The adjoint of sorting is the way back.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,4 +1,6 @@
-"""A wall without slip as a neighbour of a particle: at the point of its surface below the particle, and at rest.
+"""The sum over neighbours of viscosity as a stress, m_i a_i of `cortado.sph.stress_kernels`; mu is that of the stress.
+A
+wall without slip is a neighbour at the point of its surface below the particle, at rest.
 
 With the normal n of the wall, the distance d of particle i from its surface, and a particle b of the wall at x_b,
 
@@ -9,9 +11,6 @@ wall with their sign turned (Morris, Fox and Zhu 1997). d is 0 behind the surfac
 closer than which a wall pulls no harder. n . x_ib is below 0 where b belongs to the other side of a thin wall, or to
 another face of an edge, and then b does not count: with a weight below 0 it would drive the particle on. At all three
 the derivative has a corner. Functions know n by the ``foot``, the vector from x_b to the surface.
-
-The sum over neighbours of viscosity as a stress, m_i a_i of `cortado.sph.stress_kernels`; here mu is that of the
-stress.
 """
 
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ missing: M has no inverse there, and the particle takes no part in the stress. W
 H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S is not 0, det M is at least 0.008, so that the
 inverse needs no guard of its own.
 
-The sums of viscosity as a stress over the neighbours of a particle, M, A and R of `cortado.sph.stress_kernels`.
+M, A and R are sums over the neighbours of a particle (`cortado.sph.stress_kernels`).
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,4 @@
-"""The normals n of a fluid's surface that surface tension works with: see `cortado.sph.surface_stress`.
-
-The force of surface tension by curvature: its kernels (`cortado.sph.curvature_kernels`) and their arrays.
-
-Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
+"""Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
 (`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
 Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis,

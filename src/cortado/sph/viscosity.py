@@ -1,7 +1,4 @@
-"""The viscous force of a pair, phi(x, v) = B G with B = v . x / (|x|^2 + 0.01 h^2) (Monaghan 2005), as functions of
-Warp.
-
-The viscous force of the report (eq. 10; Monaghan 2005) between pairs and with walls at rest, of PCISPH:
+"""The viscous force of the report (eq. 10; Monaghan 2005) between pairs and with walls at rest, of PCISPH:
 
 a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V_b phi(x_ib, v_i)),   kappa = 2 (d + 2)
 

@@ -1,8 +1,7 @@
-"""How the viscosity of a fluid follows from its shear rate: a function of one's own, or that of a Newtonian fluid.
-
-The laws of viscosity that scenes name (`cortado.scene.rheology`), each a function that Warp compiles.
-
-A law of viscosity is tried where fluids are sheared before a run begins: as it is compiled, in its precision.
+"""Laws of viscosity, by which the viscosity of a fluid follows from its shear rate: a user's function, one of those
+that
+scenes name (`cortado.scene.rheology`), or the constant of a Newtonian fluid. Before a run begins each law is tried, as
+Warp compiles it, at shear rates that fluids have.
 """
 
 import inspect

@@ -1,11 +1,9 @@
-"""What walls push a particle with, and its derivative:
+"""The sums over walls by which walls act on a particle in one term of a step. The pressure's is
 
 g_i = sum_b w_b G_ib,   g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
 
 A particle with the pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric: its sum
 of forward mode is that of reverse mode too.
-
-What walls do to particles by one term of a step: the protocol, and that of a sum over neighbours.
 """
 
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ y the relaxation beside walls (`cortado.solvers.pcisph.relaxation`). G is taken 
 positions over the neighbours of x(t). The force is the transpose of the derivative of n with respect to positions,
 that of walls included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*)
 is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
-
-The pressure force of an iteration, and the prediction that follows it: see `cortado.solvers.pcisph.pressure`.
 """
 
 from functools import cache

@@ -1,4 +1,5 @@
-"""The density-ratio relaxation: a factor on the pressure correction of a heavy particle among lighter ones.
+"""Two factors on the pressure correction delta of an iteration: the density-ratio relaxation of a heavy particle among
+lighter ones, and the pressure relaxation beside walls.
 
 delta is made for particles of one mass. The pressure of a particle with lighter neighbours moves these further, by
 the ratio of the masses, and where the answer of its own density is more than twice what is wanted the iteration
@@ -8,8 +9,6 @@ diverges. So its pressure relaxation is multiplied with
 
 which is 1 among particles of its own mass or heavier ones, and tends to the mean 1 / (1 + t / 2) that the lattice asks
 for. a makes it smooth at 0.
-
-The pressure relaxation beside walls: a factor on the pressure correction of one iteration.
 
 delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own
 density further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib, and where that is above 2

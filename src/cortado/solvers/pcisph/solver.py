@@ -1,6 +1,4 @@
-"""PCISPH as a `Solver`: its steps, forward, and their derivatives.
-
-The PCISPH solver of a scene.
+"""PCISPH as the solver of a scene: its steps, forward, and their derivatives.
 """
 
 from math import inf

@@ -1,8 +1,4 @@
-"""How the way back through a PCISPH step begins: with the adjoints of its last prediction and of the pressure.
-
-What a PCISPH solver is made of: kernels, and room for its iterates.
-
-Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009).
+"""Steps of predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009).
 
 `PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
 iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.

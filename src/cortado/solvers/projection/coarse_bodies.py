@@ -1,6 +1,4 @@
-"""The kernels of free bodies on the coarse grid: see `cortado.solvers.projection.coarse_bodies`.
-
-Free bodies on the coarse grid of the pressure, so that a light body gives way from the first step on.
+"""Free bodies on the coarse grid of the pressure, so that a light body gives way from the first step on.
 
 Pressure impulses y give a body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i
 (`cortado.solvers.projection.body_kernels`), so the velocities V = F / (rho K) and W = R' I^-1 R'^T T / rho, which take

@@ -3,8 +3,8 @@
 A node's hat phi is 1 there and falls to 0 at the nodes next to it, linearly along each axis. The cells of the grid are
 those of a `CellSort`; the node of the same number is at the lower corner of a cell.
 
-The kernels of the nodes of the coarse grid: the matrix A of `cortado.solvers.projection.coarse_pressure` and sums
-over the particles around a node.
+Kernels of the nodes sum over the particles around each, also for the matrix A of
+`cortado.solvers.projection.coarse_pressure`.
 """
 
 from dataclasses import dataclass

@@ -9,8 +9,7 @@ For a pressure k_j = c_j phi(x_j) with a linear function phi, and T = c L, D^T k
 
 N is 1 inside of the fluid, and h is 0 there.
 
-The kernels of what of the divergence a coarse pressure is to take away: r of
-`cortado.solvers.projection.coarse_pressure`.
+The residual r of `cortado.solvers.projection.coarse_pressure` is the divergence that the coarse pressure takes away.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,5 @@
-"""Constants of the projection on the lattice of the rest spacing, in float64 and without Warp.
-
-The grid of the coarse correction, without Warp.
+"""Constants of the projection on the lattice of the rest spacing, and the grid of its coarse correction, in float64 and
+without Warp.
 """
 
 import itertools

@@ -10,7 +10,7 @@ in d dimensions, where images and walls that mirror (`cortado.solvers.projection
 The multiplier k / dt is no stress beside a wall, where neighbours are missing, and scatters where they
 are uneven, so that the forces do not.
 
-Pressures of the projection are impulses, k or `cortado.solvers.projection.mean_stress`, over dt.
+Kernels divide impulses, k or dt p, by the time step.
 """
 
 from functools import cache

@@ -1,4 +1,8 @@
-"""Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
+"""The three ways in which a step moves particles besides the repairs of density: the velocity x + dt v, the shift
+delta,
+and velocities that follow both.
+
+Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
 2013), and pairs that are nearer than 0.65 s are moved apart, wherever they are, at a rate that follows the velocity
 gradient and the tension, so that a fluid at rest is not stirred:
 
@@ -13,14 +17,14 @@ of low densities in repairs, near them and beside walls. Velocities stay as they
 (delta . grad) v the fluid gains energy. In spray and in thin sheets pairs come together, to 0.00 s without p, which no
 repair of the density parts, as theirs is too low.
 
-Velocities follow the particles to where the shift and the repairs take them, to first order (Xu, Stansby and
-Laurence 2009):
+With ``velocities_follow`` velocities are those of the places to which the shift and the repairs take particles, to
+first order (Xu, Stansby and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
 where x_K are the positions after the last repair, and A is that of the last iteration of the pressure.
 
-Where new velocities and a shift lead: x + dt v + delta, from which the repairs of density begin.
+The repairs of density begin from x + dt v + delta.
 """
 
 from dataclasses import dataclass

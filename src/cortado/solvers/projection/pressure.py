@@ -1,7 +1,4 @@
-"""What an iteration of the pressure wants of a particle, and which of its slopes it has: see
-`cortado.solvers.projection.pressure`.
-
-The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
+"""The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
 
 With k = dt p, the divergence D, in which walls that move have velocities v_b, and the transpose, which is the force,
 
@@ -15,11 +12,11 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are those
-of `cortado.solvers.projection.pressure`. Tension is let through by sigma, where particles are surrounded. Slopes of
+b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are told
+below. Tension is let through by sigma, where particles are surrounded. Slopes of
 the clamp and of the maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
 
-What a step begins with of the pressure of the step before: k is f times as large as it was, and v is v* + f w, with
+A step begins with the pressure of the step before: k is f times as large as it was, and v is v* + f w, with
 the kick w = -D^T k / m that it gave.
 
 Not so for a particle that its kick would take towards a wall, gamma . w > 0, by more than a tenth of a spacing in the

@@ -1,6 +1,4 @@
-"""The velocity projection as a `Solver`: its steps, forward, and their derivatives.
-
-The projection as the solver of a scene.
+"""The velocity projection as the solver of a scene: its steps, forward, and their derivatives.
 """
 
 from math import inf

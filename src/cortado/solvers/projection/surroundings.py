@@ -1,8 +1,5 @@
-"""The kernels of what surrounds particles: their number density (`cortado.sph.density`) and the moments of neighbours,
-what is beside walls, and what follows from them (`cortado.solvers.projection.effects`).
-
-What the projection measures of a particle's neighbours, n among it, with its derivatives: see
-`cortado.solvers.projection.surroundings`.
+"""The surroundings of particles, with their derivatives: the number density (`cortado.sph.density`), the moments of
+neighbours, sums over walls, and what follows from these (`cortado.solvers.projection.effects`).
 """
 
 from functools import cache, partial

@@ -1,7 +1,6 @@
 """The velocity that pressures leave of a predicted one, v* - D^T y / m: see `cortado.solvers.projection.pressure`.
 
-The kernels of A = sum_j v_ij g_ij^T, which the shift needs, where no iteration of the pressure has found it: with
-PCISPH, and at the fixed point of the projection.
+A = sum_j v_ij g_ij^T has kernels of its own for the fixed point of the projection, where no iteration has found it.
 """
 
 from dataclasses import dataclass

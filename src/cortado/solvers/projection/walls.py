@@ -1,4 +1,4 @@
-"""What walls are to a particle of the projection, with its derivatives.
+"""How walls push a particle of the projection, with derivatives.
 
 With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, sums over wall particles are
 
@@ -11,7 +11,7 @@ and, as walls may move, their drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b 
 Along a flat wall and in a corner that walls close, e is 0, so that the order of wall particles holds nothing back.
 About an edge that sticks out into the fluid, parts along normals add up to a third of what is missing, and e is 1.
 
-Along what the pressure of a particle pushes the walls of one solid in the projection: gamma / V of that solid.
+The pressure of a particle pushes the walls of one solid along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s)
 
