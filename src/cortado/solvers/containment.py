@@ -1,7 +1,5 @@
 """A search for lost particles at the end of every step, on the device: those outside of their container or in a solid,
-too
-far away, or not finite. Any solver can use it.
-"""
+too far away, or not finite. Any solver can use it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The loops of a step, which go round until an error is small enough. Kernels decide on the device whether to go on,
-and
-record iterations and errors of every step, also those of the systems of equations that forces solve.
-"""
+and record iterations and errors of every step, also those of the systems of equations that forces solve."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Makers of solvers: what `Simulation` takes as ``solver``, and the makers of the solver and the forces that a scene
-names
-by their kinds, with the parameters that these bring.
-"""
+names by their kinds, with the parameters that these bring."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

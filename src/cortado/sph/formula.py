@@ -1,7 +1,5 @@
 """A user's Python function as kernels call it: compiled by Warp in either precision, with its derivatives. Its
-parameters
-are one vector, theta: time, numbers and vectors, one behind the other.
-"""
+parameters are one vector, theta: time, numbers and vectors, one behind the other."""
 
 import ast
 import inspect

@@ -1,5 +1,4 @@
-"""Semi-implicit Euler, and the way of particles' entries from the scene's order to the sorted one, and back.
-"""
+"""Semi-implicit Euler, and the way of particles' entries from the scene's order to the sorted one, and back."""
 
 from dataclasses import dataclass
 from functools import cache

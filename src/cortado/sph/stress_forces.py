@@ -1,6 +1,5 @@
 """The sum over neighbours of viscosity as a stress, m_i a_i of `cortado.sph.stress_kernels`; mu is that of the stress.
-A
-wall without slip is a neighbour at the point of its surface below the particle, at rest.
+A wall without slip is a neighbour at the point of its surface below the particle, at rest.
 
 With the normal n of the wall, the distance d of particle i from its surface, and a particle b of the wall at x_b,
 

@@ -1,5 +1,4 @@
-"""PCISPH as the solver of a scene: its steps, forward, and their derivatives.
-"""
+"""PCISPH as the solver of a scene: its steps, forward, and their derivatives."""
 
 from math import inf
 from typing import Self

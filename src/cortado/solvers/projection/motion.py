@@ -1,6 +1,5 @@
 """The three ways in which a step moves particles besides the repairs of density: the velocity x + dt v, the shift
-delta,
-and velocities that follow both.
+delta, and velocities that follow both.
 
 Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
 2013), and pairs that are nearer than 0.65 s are moved apart, wherever they are, at a rate that follows the velocity

@@ -1,5 +1,4 @@
-"""The velocity projection as the solver of a scene: its steps, forward, and their derivatives.
-"""
+"""The velocity projection as the solver of a scene: its steps, forward, and their derivatives."""
 
 from math import inf
 
