@@ -11,7 +11,7 @@ from benchmarks.bench.scene import dam_break
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
-from cortado.discretise.region import Region
+from cortado.discretise.room import Region
 from cortado.discretise.shapes import corners
 from cortado.particles.arrays import to_device
 from cortado.particles.fields import POSITIONS, VELOCITIES

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import cortado
 import cortado.environments
 from cortado import InputError, Simulation
-from cortado.discretise.domain import Domain
+from cortado.discretise.room import Domain
 from cortado.environments.actuators import Position, Velocity
 from cortado.environments.catalogue import TASKS
 from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd

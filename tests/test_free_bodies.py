@@ -5,7 +5,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from cortado import InputError, Problem, Scene, SceneError, Simulation
-from cortado.discretise.solids.mass import Mass
+from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose

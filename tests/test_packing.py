@@ -7,12 +7,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 import cortado
-from cortado.discretise.packing.around import PointsAround
-from cortado.discretise.packing.linearised import Linearised, ListedPairs
+from cortado.discretise.packing import Linearised, PointsAround, Relaxation
 from cortado.discretise.pairs import apart, pairs_among, pairs_within
-from cortado.discretise.region import Region
+from cortado.discretise.room import Region
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.discretise.walls.weights import RestLattice
+from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.sampling import period
 from cortado.scene.scene import Scene
@@ -195,7 +194,7 @@ def test_derivatives_of_densities_and_distances(dimension):
     def linearised(moves: np.ndarray | float = 0.0) -> Linearised:
         moved = points.copy()
         moved[:100] += moves
-        return ListedPairs(around(moved, (100, 200), lengths, 0.25), blind, free).linearised(0.09)
+        return Relaxation(around(moved, (100, 200), lengths, 0.25), blind, free).linearised(0.09)
 
     moves = free[:, None] * generator.normal(size=(100, dimension))
     found, step = linearised(), 1e-6

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Scene, SceneError, Simulation
-from cortado.discretise.solids.faces import cut_box_faces
+from cortado.discretise.solid import cut_box_faces
 from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import discretise
 from test_packing import densities

@@ -10,7 +10,7 @@ import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
 from cortado.cli.commands.describe import MeasuredSpeed
-from cortado.discretise.domain import Domain
+from cortado.discretise.room import Domain
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import Problem, Scene, SceneError, Simulation
-from cortado.discretise.solids.mass import Mass
+from cortado.discretise.solid import Mass
 from cortado.errors import InputError
 from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce

@@ -9,9 +9,7 @@ from scipy.spatial import cKDTree
 
 from cortado.discretise.calibration import SLACK
 from cortado.discretise.smoothing import KERNELS
-from cortado.discretise.walls.layers import SHALLOW, wall_layers
-from cortado.discretise.walls.points import box_walls
-from cortado.discretise.walls.short_box import ShortBox
+from cortado.discretise.walls import SHALLOW, box_walls, short_box, wall_layers
 from cortado.scene.containers import BoxContainer, Container
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.scene import Scene
@@ -240,11 +238,11 @@ def test_a_long_box_has_the_weights_that_are_found_for_all_of_it(monkeypatch, ke
 
 def test_a_short_box_has_every_wall_particle_of_a_long_one_where_it_folds_it():
     lower, upper = np.array([-0.1, 0.0, 0.2]), np.array([4.9, 0.63, 3.7])
-    short = ShortBox.of(lower, upper, SPACING, 2.6 * SPACING)
-    assert short.left_out.tolist() == [67, 0, 37]
-    walls, those = (box_walls(lower, end, [False] * 3, SPACING, 0.02) for end in (upper, short.upper))
+    shorter, folded = short_box(lower, upper, SPACING, 2.6 * SPACING)
+    assert ((upper - shorter) / SPACING).round(6).tolist() == [67, 0, 37]
+    walls, those = (box_walls(lower, end, [False] * 3, SPACING, 0.02) for end in (upper, shorter))
     assert len(those) < 0.4 * len(walls)
-    assert cKDTree(those).query(short.folded(walls))[0].max() < 1e-12
+    assert cKDTree(those).query(folded(walls))[0].max() < 1e-12
 
 
 def test_a_container_clear_of_solids_has_the_walls_that_it_has_without_them():

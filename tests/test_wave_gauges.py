@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado.discretise.domain import WITHOUT_PERIODS
+from cortado.discretise.room import WITHOUT_PERIODS
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.losses import Series
 from cortado.runs.sensors.sensor import value_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.threads import usable_cores
-from cortado.discretise.region import TOLERANCE
+from cortado.discretise.room import TOLERANCE
 from cortado.errors import DivergedError, InputError, shown
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.parameters.registry import BY_NAME

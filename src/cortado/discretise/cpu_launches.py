@@ -1,53 +1,39 @@
-"""Launches of kernels of the discretisation, which works on the CPU whatever device a simulation is on, with arrays of
-NumPy's."""
+"""Launches of kernels with NumPy arrays on the CPU, where scenes are discretised whatever device a simulation is on."""
 
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-def started() -> None:
-    """Start Warp, which modules of kernels need."""
-    from cortado.device.warp_start import start_warp
-
-    start_warp()
-
-
 @cache
-def _launchers() -> tuple[Any, Any]:
-    """What launches kernels in one thread, and what cuts them into bands for all cores."""
-    started()
+def _in_bands() -> Any:
     import warp as wp
 
-    from cortado.device.launching import BandLauncher, launch
+    from cortado.device.launching import BandLauncher
 
-    cpu = wp.get_device("cpu")
-    return partial(launch, device=cpu), BandLauncher(cpu)
-
-
-def launched(kernel: Any, threads: int, **arguments: Any) -> None:
-    """Launch a kernel in one thread, with arguments by name; it writes to arrays that it takes."""
-    _perform(0, kernel, threads, arguments)
+    return BandLauncher(wp.get_device("cpu"))
 
 
-def launched_in_bands(kernel: Any, threads: int, **arguments: Any) -> None:
-    """The same in bands (`cortado.device.launching`): no two threads of the kernel may write to one place."""
-    _perform(1, kernel, threads, arguments)
-
-
-def _perform(which: int, kernel: Any, threads: int, arguments: dict[str, Any]) -> None:
+def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
+    """Launch a kernel with arguments by name; it writes to the NumPy arrays that it is given. All cores take it in
+    bands (`cortado.device.launching`), where no two threads may write to one place, or otherwise one thread takes
+    it."""
+    from cortado.device.launching import launch
     from cortado.device.threads import WARP
 
     if threads:
         with WARP:
             given = {name: shared(x) if isinstance(x, np.ndarray) else x for name, x in arguments.items()}
-            _launchers()[which](kernel, threads, **given)
+            if in_bands:
+                _in_bands()(kernel, threads, **given)
+            else:
+                launch(kernel, threads, _in_bands().device, **given)
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """An array of Warp's in the memory of one of NumPy's; what has more than one axis is vectors along the last one."""
+    """A Warp array in the memory of a NumPy array; one of more than one axis has vectors along the last one."""
     import warp as wp
 
     types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i), "bool": (wp.bool, None)}

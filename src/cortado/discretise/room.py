@@ -1,14 +1,227 @@
-"""Where fluid may be: in the region of a container, outside of solids."""
+"""Where fluid may be: in the region of a container, outside of solids, in a period that repeats."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
+from typing import Any, Self
 
 import numpy as np
 
-from cortado.discretise.region import Region
+from cortado.discretise.pairs import apart, wrapped
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Placed, Solid
+from cortado.discretise.solid import Placed, Solid
+
+TOLERANCE = 0.5
+"""In spacings: how far outside of its container a particle may be. Walls bring back what is less far; light fluid among
+heavier is pressed there at times."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A convex region in d dimensions; by default all of space."""
+
+    lower: Points
+    """(d,) [m]"""
+    upper: Points
+    """(d,) [m]"""
+    base: Points
+    """(d,) a point on the axis of the cylinder [m]"""
+    across: Points
+    """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder, and
+    all 1 for a sphere, whose middle ``base`` then is"""
+    radius: float = np.inf
+    """Of the cylinder or the sphere [m]."""
+    rim: float = np.inf
+    """Where the open end of a cylinder is along its axis [m], infinite if it has a lid."""
+
+    @classmethod
+    def between(cls, lower: Points, upper: Points) -> "Region":
+        """A box without a cylinder."""
+        return cls(lower, upper, np.zeros(len(lower)), np.zeros(len(lower)))
+
+    @classmethod
+    def everywhere(cls, dimension: int) -> "Region":
+        """All of space."""
+        return cls.between(np.full(dimension, -np.inf), np.full(dimension, np.inf))
+
+    @classmethod
+    def ball(cls, centre: Points, radius: float) -> "Region":
+        """A sphere, or a disc in 2-D."""
+        everywhere = cls.everywhere(len(centre))
+        return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
+
+    @classmethod
+    def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
+        """A cylinder that stands on its base along an axis of space."""
+        across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
+        lower, upper = base - radius * across, base + radius * across
+        upper[axis] += height
+        return cls(lower, upper, base, across, radius)
+
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the region, negative inside [m]; beyond an edge or a corner it
+        is the distance from the nearer face, which is less."""
+        from_faces = np.full(len(points), -np.inf)
+        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # as short rows take NumPy long
+            from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
+        return np.maximum(from_faces, self._from_axis(points) - self.radius)
+
+    def sides(self) -> Iterator[Callable[[Points], Points]]:
+        """Of each side that is somewhere: (n,) how far points (n, d) [m] are from it, positive inside [m]."""
+        for axis in np.flatnonzero(self.across == 0.0).tolist():
+            for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
+                if np.isfinite(at):
+                    yield partial(_from_plane, axis=axis, at=at, inwards=inwards)
+        if np.isfinite(self.radius):
+            yield self._from_side
+
+    def _from_side(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are inside the cylinder or the sphere [m]."""
+        return np.asarray(self.radius - self._from_axis(points))
+
+    def nearest(self, points: Points) -> Points:
+        """(n, d) the points of the region that are nearest to points (n, d) [m] beside its faces or its side, and those
+        themselves that are within."""
+        boxed = np.clip(points, self.lower, self.upper)
+        across = (boxed - self.base) * self.across
+        from_axis = np.linalg.norm(across, axis=1, keepdims=True)
+        inwards = np.maximum(1.0 - self.radius / np.maximum(from_axis, 1e-300), 0.0)
+        return np.asarray(boxed - inwards * across)
+
+    def contains(self, points: Points, tolerance: float) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        found = self._from_axis(points) <= self.radius + tolerance
+        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
+            found &= (x >= lower - tolerance) & (x <= upper + tolerance)
+        return np.asarray(found)
+
+    def cell_shares(self, points: Points, spacing: float) -> Points:
+        """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
+        region; along a cylinder's side the cell counts as turned with it."""
+        half, found = 0.5 * spacing, np.ones(len(points))
+        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
+            width = np.minimum(x + half, upper) - np.maximum(x - half, lower)
+            found *= np.clip(width / spacing, 0.0, 1.0)
+        return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
+
+    def _from_axis(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are from the axis of the cylinder or the middle of the sphere; 0 without."""
+        squares = np.zeros(len(points))
+        for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
+            if is_across:
+                squares += (x - base) ** 2
+        return np.sqrt(squares)
+
+    def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
+        """(n,) whether particles at ``before`` (n, d) [m] went through a wall to be at ``after`` (n, d) [m].
+
+        Over the rim of an open cup they may go, and what was outside already has not gone through.
+        """
+        through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
+        return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
+
+    def is_below_rim(self, points: Points) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are where there is none."""
+        if not np.isfinite(self.rim):
+            return np.ones(len(points), dtype=bool)
+        return np.asarray(points @ (1.0 - self.across) < self.rim)
+
+    def opened(self, periods: Points) -> "Region":
+        """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""
+        lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
+        return Region(lower, upper, self.base, self.across, self.radius, self.rim)
+
+
+def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
+    """(n,) how far points (n, d) [m] are from a plane across an axis [m]."""
+    return np.asarray(inwards * (points[:, axis] - at))
+
+
+ALONG = 1e-3
+"""Directions whose angle [rad] is smaller than this count as the same: images along them are not told apart."""
+
+
+@dataclass(frozen=True)
+class Domain:
+    """One period of a scene."""
+
+    lower: tuple[float, ...]
+    """(d,) where it begins [m]; 0 along an axis that is not periodic."""
+    lengths: tuple[float, ...]
+    """(d,) how long it is [m]; 0 along an axis that is not periodic."""
+
+    @classmethod
+    def of(cls, lower: Points, lengths: Points) -> Self:
+        """From arrays (d,) [m]."""
+        axes = lengths > 0.0
+        return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
+
+    def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
+        """Its lower ends [m], its lengths [m] and one over these [1/m], as vectors of Warp."""
+        rest = (0.0,) * (3 - len(self.lengths))
+        frequency = (1.0 / length if length else 0.0 for length in self.lengths)
+        return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
+
+    def wrapped(self, points: Points) -> Points:
+        """The images of points (..., d) [m] that are within the period; along other axes as they are."""
+        lower = np.array(self.lower)
+        return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
+
+    def shortest(self, ways: Points) -> Points:
+        """Of ways (n, d) [m] those to the nearest images."""
+        return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
+
+    def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
+        """The images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower corner
+        where none is; and whether they are in it (n,). An end that is infinite is that of the period, if there is one;
+        a region that is longer than the period is the period."""
+        begin, lengths = np.array(self.lower), np.array(self.lengths)
+        start = np.where(np.isfinite(lower), lower, begin)
+        end = np.where(np.isfinite(upper), upper, begin + lengths)
+        whole = (lengths > 0.0) & (end - start >= lengths)
+        start, end = np.where(whole, begin, start), np.where(whole, np.inf, end)
+        lower, upper = np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
+        images = start + wrapped(points - start, lengths) if lengths.any() else points
+        images = np.where(lengths > 0.0, images, points)
+        return images, np.all((images >= lower) & (images < upper), axis=1)
+
+    def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
+        """The ways (n, k) from a place (d,) to all images of points (n, d) within a reach [m], as ``seen`` shows them:
+        a linear function of ways (n, d), such as what is left of them across a direction. Every array has one image of
+        each point.
+
+        Images that ``seen`` does not tell apart count once: as those within the period.
+        """
+        lengths = np.array(self.lengths)
+        if not lengths.any():
+            return [seen(points - place)]
+        way, steps = seen(self.wrapped(points) - place), _independent(seen(np.eye(len(lengths))), lengths)
+        if not len(steps):
+            return [way]
+        inverse = np.linalg.pinv(steps)
+        way = way - np.rint(way @ inverse) @ steps
+        most = np.floor(reach * np.linalg.norm(inverse, axis=0) + 0.5).astype(int)
+        return [way + np.array(turns) @ steps for turns in product(*(range(-k, k + 1) for k in most))]
+
+
+WITHOUT_PERIODS = Domain((), ())
+"""Nothing repeats."""
+
+
+def _independent(axes: Points, lengths: Points) -> Points:
+    """(m, k) from image to image, along as many periodic axes as are independent when they are seen as ``axes`` (d, k):
+    first along those that are seen best."""
+    left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
+    for _ in lengths:
+        sizes = np.linalg.norm(left, axis=1)
+        best = int(np.argmax(sizes))
+        if sizes[best] < ALONG:
+            break
+        unit = left[best] / sizes[best]
+        found.append(lengths[best] * axes[best])
+        left = left - np.outer(left @ unit, unit)
+    return np.array(found)
 
 
 @dataclass(frozen=True)

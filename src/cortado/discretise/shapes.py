@@ -1,14 +1,18 @@
-"""Shapes as points, in float64: blocks of a lattice, and discs."""
+"""Arrays of points, and shapes as points, in float64: blocks of a lattice, and discs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import product
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Points = NDArray[np.float64]
+"""(n, d)"""
+Which = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
 
 ROUND_OFF = 1e-6
 """Share of a spacing by which a length may fall short of a whole number of cells: 0.25 / 0.05 holds 5."""
@@ -20,6 +24,33 @@ EXCESS = 0.003
 MOST_STRETCHED = 0.03
 """Logarithm of how much a lattice is stretched along an axis: up to there the density is that of the rest lattice
 within 1 %, beside walls too."""
+
+
+class Rows:
+    """Base of dataclasses whose fields are arrays with one first axis."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of several, one behind the other."""
+        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
+
+    def some(self, which: Any) -> Self:
+        """The rows that an index of arrays takes: a slice, numbers or a mask (n,)."""
+        return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
+
+
+def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
+    """Bounds (n,) of where a condition on numbers (n,) ceases to hold, that holds at ``low`` (n,) and not at ``high``
+    (n,): nearer ones, halved so many times."""
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        good = holds(middle)
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    return low, high
 
 
 @dataclass(frozen=True)
@@ -124,7 +155,7 @@ def whole_cells(lengths: Points, spacing: float) -> Points:
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 
-def grid(axes: Sequence[Points]) -> Points:
+def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """(n, d): every combination of the values of the axes, the last axis fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 

@@ -18,20 +18,12 @@ import warp as wp
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
-
-@dataclass(frozen=True)
-class RadialFunctions:
-    """Warp functions of a kernel's dimensionless form: w, f = w' / q for its gradient, and f' / q for its Hessian."""
-
-    value: Any
-    """Of q."""
-    gradient_factor: Any
-    """Of q and 1 / q."""
-    hessian_factor: Any
-    """Of q and 1 / q."""
+Radial = tuple[Any, Any, Any]
+"""Warp functions of a kernel's dimensionless form: w of q, f = w' / q for its gradient, and f' / q for its Hessian,
+both of q and 1 / q."""
 
 
-def _cubic_spline(precision: Precision) -> RadialFunctions:
+def _cubic_spline(precision: Precision) -> Radial:
     real = precision.real
 
     @wp.func
@@ -49,10 +41,10 @@ def _cubic_spline(precision: Precision) -> RadialFunctions:
         t = wp.max(real(1.0) - q, real(0.0))
         return wp.where(q <= real(0.5), real(18.0), real(6.0) * t * (real(2.0) * q + t) * per_q * per_q) * per_q
 
-    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+    return value, gradient_factor, hessian_factor
 
 
-def _wendland_c2(precision: Precision) -> RadialFunctions:
+def _wendland_c2(precision: Precision) -> Radial:
     real = precision.real
 
     @wp.func
@@ -70,10 +62,10 @@ def _wendland_c2(precision: Precision) -> RadialFunctions:
         t = wp.max(real(1.0) - q, real(0.0))
         return real(60.0) * t * t * per_q
 
-    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+    return value, gradient_factor, hessian_factor
 
 
-def _wendland_c4(precision: Precision) -> RadialFunctions:
+def _wendland_c4(precision: Precision) -> Radial:
     real = precision.real
 
     @wp.func
@@ -94,7 +86,7 @@ def _wendland_c4(precision: Precision) -> RadialFunctions:
         t_2 = t * t
         return real(560.0) * t_2 * t_2
 
-    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+    return value, gradient_factor, hessian_factor
 
 
 RADIAL_FUNCTIONS = {
@@ -102,12 +94,12 @@ RADIAL_FUNCTIONS = {
     WENDLAND_C2.name: _wendland_c2,
     WENDLAND_C4.name: _wendland_c4,
 }
-"""By the kernel's name: for a precision, ``value`` w, ``gradient_factor`` f and ``hessian_factor`` f' / q."""
+"""Makers of the `Radial` functions in a precision, by the kernel's name."""
 
 
 @dataclass(frozen=True)
 class SmoothingFunctions:
-    """Warp functions of W at a separation x, and of what its derivatives are made of."""
+    """Warp functions of W, and of parts of its derivatives, at a separation x."""
 
     weight: Any
     slope: Any
@@ -128,8 +120,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
     ``taped`` ones.
     """
     real, vector = precision.real, precision.vector
-    radial = RADIAL_FUNCTIONS[kernel.name](precision)
-    value, gradient_factor, hessian_factor = radial.value, radial.gradient_factor, radial.hessian_factor
+    value, gradient_factor, hessian_factor = RADIAL_FUNCTIONS[kernel.name](precision)
     functions = arithmetic(precision, taped)
     root, inverse_root = functions.root, functions.inverse_root
     tiny = wp.constant(real(precision.tiny))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.threads import WARP
-from cortado.discretise.domain import WITHOUT_PERIODS, Domain
+from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.environments.terms import StepEnd, Term
 from cortado.losses.loss import Snapshot, SnapshotBatch
 from cortado.particles.state import State

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import launch
 from cortado.device.reduction import add, sum_of
-from cortado.discretise.domain import WITHOUT_PERIODS, Domain
 from cortado.discretise.pairs import apart
+from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.environments.kernels import EnvironmentKernels, environment_kernels
 from cortado.losses.loss import precision_of
 from cortado.particles.arrays import padded, to_device

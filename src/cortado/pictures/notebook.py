@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.domain import WITHOUT_PERIODS
+from cortado.discretise.room import WITHOUT_PERIODS
 from cortado.errors import CortadoError
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
 from cortado.pictures.particle_view import STYLE, Cloud, particle_view, script, thinned

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.faces import Faces
-from cortado.discretise.solids.solid import Hollow, Placed, Solid
+from cortado.discretise.solid import Faces, Hollow, Placed, Solid
 from cortado.scene.materials import Finish
 from cortado.scene.scene import Scene
 

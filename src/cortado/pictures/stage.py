@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.discretise.domain import WITHOUT_PERIODS, Domain
+from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids, union
 from cortado.scene.camera_paths import View

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.crowding import check_apart, check_crowding, crowding_of, nearest
+from cortado.discretise.pairs import check_apart, check_crowding, crowding_of, nearest
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.overlaps import NEAREST
 from cortado.scene.parameters.values import Arrays

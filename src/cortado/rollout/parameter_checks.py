@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.precision import Precision
-from cortado.discretise.region import TOLERANCE
-from cortado.discretise.room import Room
+from cortado.discretise.room import TOLERANCE, Room
 from cortado.errors import InputError, OutOfRangeError
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Range

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cortado.arrays import as_one_number, as_precise_numbers, is_whole
 from cortado.device.precision import Precision
-from cortado.discretise.crowding import check_apart, nearest
+from cortado.discretise.pairs import check_apart, nearest
 from cortado.errors import InputError, shown
 from cortado.rollout.parameter_checks import outside, place_in_words
 from cortado.rollout.scene_parameters import DENSITY, Simulated

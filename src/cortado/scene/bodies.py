@@ -11,8 +11,7 @@ from typing import TypeGuard
 import numpy as np
 
 from cortado.discretise.pairs import apart, pairs_within
-from cortado.discretise.region import Region
-from cortado.discretise.room import Room
+from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import Points, grid
 from cortado.scene.fluids import ALIGNED, Fluid, RegionFluid
 

@@ -4,9 +4,9 @@ import numpy as np
 from pydantic_core import PydanticCustomError
 
 from cortado.device.memory import sampling_parts, shortage
-from cortado.discretise.region import TOLERANCE
+from cortado.discretise.mesh_files import read_mesh
+from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.mesh_files import read_mesh
 from cortado.errors import InputError, Words, shown
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import EmitterTable

@@ -8,14 +8,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cortado.discretise.domain import Domain
-from cortado.discretise.region import Region
+from cortado.discretise.primitives import Box, HalfSpace, Revolved
+from cortado.discretise.room import Domain, Region
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.primitives import Box, HalfSpace, Revolved
-from cortado.discretise.solids.solid import Hollow, Placed, Solid
-from cortado.discretise.walls.places import Places, box_places, cup_places
-from cortado.discretise.walls.points import box_walls, cup_walls
-from cortado.discretise.walls.short_box import ShortBox
+from cortado.discretise.solid import Hollow, Placed, Solid
+from cortado.discretise.walls import Places, box_places, box_walls, cup_places, cup_walls, short_box
 from cortado.errors import Words
 from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
@@ -149,8 +146,8 @@ class BoxContainer(Container):
         return (*lowest, *(HalfSpace(-axis, -float(upper @ axis), *ends) for axis in axes))
 
     def shortened(self, spacing: float, support: float) -> tuple[Container, Callable[[Points], Points]]:
-        short = ShortBox.of(*self.extent(), spacing, support)
-        return self.model_copy(update={"upper": tuple(short.upper.tolist())}), short.folded
+        upper, folded = short_box(*self.extent(), spacing, support)
+        return self.model_copy(update={"upper": tuple(upper.tolist())}), folded
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)

@@ -14,14 +14,12 @@ from cortado.discretise.calibration import (
     rest_volume,
     wall_response,
 )
-from cortado.discretise.crowding import check_crowding, crowding_of
-from cortado.discretise.domain import Domain
-from cortado.discretise.packing.packing import Packing
-from cortado.discretise.region import Region
+from cortado.discretise.packing import Packing
+from cortado.discretise.pairs import check_crowding, crowding_of
+from cortado.discretise.room import Domain, Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
-from cortado.discretise.walls.layers import WallLayers, wall_layers
-from cortado.discretise.walls.weights import RestLattice
+from cortado.discretise.walls import RestLattice, WallLayers, wall_layers
 from cortado.errors import MassWarning, warn
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluid_masses import FluidMasses

@@ -7,9 +7,9 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field
 
+from cortado.discretise.primitives import block_around, points_inside
 from cortado.discretise.shapes import Block, Points
-from cortado.discretise.solids.inside_points import block_around, points_inside
-from cortado.discretise.solids.solid import Placed, Solid
+from cortado.discretise.solid import Placed, Solid
 from cortado.scene.fields import FieldPath, Length
 from cortado.scene.fluids import (
     ALIGNED,

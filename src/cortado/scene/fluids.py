@@ -7,11 +7,10 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import ValidationInfo, field_validator, model_validator
 
-from cortado.discretise.region import Region
-from cortado.discretise.room import Room
+from cortado.discretise.primitives import Box, Revolved, Round
+from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
-from cortado.discretise.solids.primitives import Box, Revolved, Round
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table

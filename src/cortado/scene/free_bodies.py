@@ -3,7 +3,7 @@
 import numpy as np
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.errors import Words
 from cortado.scene.fields import field_error
 from cortado.scene.model import SceneTables

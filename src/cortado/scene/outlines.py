@@ -6,13 +6,12 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from cortado.discretise.mesh import Mesh
+from cortado.discretise.mesh_checks import FoundMesh
+from cortado.discretise.mesh_files import mesh_in_file, thickness_of
+from cortado.discretise.primitives import Polygon
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.mesh import Mesh
-from cortado.discretise.solids.mesh_checks import FoundMesh
-from cortado.discretise.solids.mesh_files import mesh_in_file
-from cortado.discretise.solids.mesh_fit import thickness_of
-from cortado.discretise.solids.primitives import Polygon
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Text, field_error, quantity
 from cortado.scene.fluids import beside_scene
 from cortado.scene.tables import Table

@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from cortado.arrays import unit
+from cortado.discretise.primitives import HalfSpace
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.primitives import HalfSpace
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.errors import Words
 from cortado.scene.containers import Container
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity

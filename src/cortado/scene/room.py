@@ -4,7 +4,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 from cortado.discretise.room import Room
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.scene.model import SceneTables
 from cortado.scene.solids import SolidTable
 

@@ -5,9 +5,9 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from cortado.discretise.primitives import Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.primitives import Polygon, Revolved, Round
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, box_about, check_order, cylinder_about, refuse_plane
 from cortado.scene.outlines import MeshShape, PolygonShape

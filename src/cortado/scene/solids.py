@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Hollow, Placed, Solid
+from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.containers import Container
 from cortado.scene.fields import MISSING, Colour, FieldPath, Length, OneOf, Text, field_error, quantity

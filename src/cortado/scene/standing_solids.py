@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from cortado.discretise.solids.surface_points import surface_feet
+from cortado.discretise.surface_points import surface_feet
 from cortado.scene.containers import BoxContainer
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import Steady, courses, told

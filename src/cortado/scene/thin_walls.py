@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cortado.discretise.room import Room
-from cortado.discretise.solids.surface_points import surface_feet
+from cortado.discretise.surface_points import surface_feet
 from cortado.scene.model import DiscretisationTable, SceneTables
 from cortado.scene.room import resting_room
 from cortado.scene.sentences import point_in_words

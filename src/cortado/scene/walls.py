@@ -6,16 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.region import Region
-from cortado.discretise.room import Room
+from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.container_walls import ContainerWalls
-from cortado.discretise.solids.solid import Placed
-from cortado.discretise.solids.wall_points import WallPoints
-from cortado.discretise.solids.walls import ExposedSurface, solid_places
-from cortado.discretise.walls.layers import Planes, WallLayers
-from cortado.discretise.walls.places import Places
-from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
+from cortado.discretise.solid import Placed
+from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
+from cortado.discretise.walls import Places, Planes, RestLattice, WallLayers, even_changes, uneven_changes, wall_weights
 from cortado.errors import InputError
 from cortado.scene.containers import Container, NoContainer
 from cortado.scene.motions import moving, wall_numbers
@@ -87,8 +82,8 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
     sought = _even_points(short, dimension, layers, lattice.spacing)
     lower, lengths = short.periods(dimension)
     room = Room(short.region(dimension).opened(lengths), (), lengths)
-    surface = WallSurface(sought.positions, sought.flat, lattice, room, lower, lengths, even_changes)
-    weights = surface.weights(short.places(dimension, lattice.spacing, lattice.support))
+    places = short.places(dimension, lattice.spacing, lattice.support)
+    weights = wall_weights(sought.positions, sought.flat, places, lattice, room, lower, even_changes)
     same = cKDTree(sought.positions).query(folded(points.positions))[1]
     return Walls.of(points, weights[same], scene.container.sticks)
 
@@ -156,9 +151,8 @@ def _weighed(
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
     places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
     walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
-    known = len(kept.weights)
-    all_walls = WallSurface(walls, flat, lattice, room, surface.lower, room.periods, uneven_changes, known)
-    return points, all_walls.weights(places)[: len(points)]
+    found = wall_weights(walls, flat, places, lattice, room, surface.lower, uneven_changes, len(kept.weights))
+    return points, found[: len(points)]
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:

@@ -10,8 +10,7 @@ import numpy as np
 from cortado.device.grid import Grid
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
-from cortado.discretise.solids.mass import Mass
-from cortado.discretise.solids.solid import Hollow, Solid
+from cortado.discretise.solid import Hollow, Mass, Solid
 from cortado.errors import InputError, shown
 from cortado.particles.arrays import padded
 from cortado.particles.neighbourhood import Discretisation

@@ -12,7 +12,7 @@ import warp as wp
 from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.discretise.region import TOLERANCE, Region
+from cortado.discretise.room import TOLERANCE, Region
 from cortado.discretise.shapes import Points
 from cortado.particles.arrays import padded
 from cortado.particles.moving_walls import MovingWalls, Poses, matrix_of

@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 
 FINE = 0.2
 """In spacings: the width of faces by which round solids are looked at."""

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import Named
-from cortado.discretise.solids.mass import Mass
+from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.moving_walls import MovingWalls, matrix_of

@@ -28,7 +28,7 @@ import warp as wp
 from cortado.device.launching import KernelLauncher, Named
 from cortado.device.modules import kernel_module, kind_of
 from cortado.device.reduction import add, type_name
-from cortado.discretise.walls.layers import WallLayers
+from cortado.discretise.walls import WallLayers
 from cortado.errors import MissingDerivativeError
 from cortado.particles.arrays import Arrays, Fields, zeros
 from cortado.particles.fields import StateField

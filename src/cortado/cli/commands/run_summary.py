@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.region import TOLERANCE
+from cortado.discretise.room import TOLERANCE
 from cortado.particles.state import State
 from cortado.pictures.shown_run import is_out
 from cortado.rollout.rollout import Rollout

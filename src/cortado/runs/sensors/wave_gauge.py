@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.domain import Domain
+from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solid import Solid
 from cortado.fixed import fixed
 from cortado.particles.arrays import padded
 from cortado.runs.sensors.sensor import (

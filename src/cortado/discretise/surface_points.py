@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.device.threads import usable_cores
-from cortado.discretise.shapes import Points, block_about
-from cortado.discretise.solids.solid import Solid, Which
+from cortado.discretise.shapes import Numbers, Points, Which, bisected, block_about
+from cortado.discretise.solid import Solid
 
-Numbers = NDArray[np.int64]
 Near = Callable[[Points, float], Which]
 """Whether points (n, d) [m] are less than a length [m] from something."""
 FINE = 3
@@ -120,12 +118,11 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
         return np.full(len(feet), depth)
     found, tolerance = np.full(len(feet), depth), 1e-3 * depth
     thin = np.flatnonzero(solid.distance_up_to(feet - depth * away, depth) >= -depth + tolerance)
-    low, high = np.zeros(len(thin)), np.full(len(thin), depth)
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        good = solid.distance_up_to(feet[thin] - middle[:, None] * away[thin], depth) < -middle + tolerance
-        low, high = np.where(good, middle, low), np.where(good, high, middle)
-    found[thin] = low
+
+    def is_nearest(depths: Points) -> Which:
+        return solid.distance_up_to(feet[thin] - depths[:, None] * away[thin], depth) < -depths + tolerance
+
+    found[thin] = bisected(is_nearest, np.zeros(len(thin)), np.full(len(thin), depth), HALVINGS)[0]
     return found
 
 

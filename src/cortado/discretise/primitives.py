@@ -1,21 +1,23 @@
-"""Solids of simple shapes, which formulas describe, in float64."""
+"""Solids of simple shapes, which formulas describe, and lattice points within solids, in float64."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.discretise.shapes import Points, across
-from cortado.discretise.solids.faces import (
+from cortado.discretise.shapes import Block, Points, Which, across, block_between
+from cortado.discretise.solid import (
     Faces,
+    Moments,
+    Solid,
     arc,
     box_faces,
     cut_box_faces,
+    enclosed_moments,
     outer_edges,
     polygon_faces,
     revolved_faces,
+    revolved_moments,
 )
-from cortado.discretise.solids.moments import Moments, enclosed_moments, revolved_moments
-from cortado.discretise.solids.solid import Solid, Which
 
 FACING = 0.9
 """Cosine between the normals of two sides of a polygon, one of them turned round, at least, where it is a sheet."""
@@ -247,3 +249,16 @@ def _standing(direction: Points) -> Points:
     frame = np.stack([*across(direction), direction], axis=1)
     frame[:, 0] *= np.linalg.det(frame)
     return frame
+
+
+def block_around(solid: Solid, spacing: float) -> Block:
+    """The lattice ``lower + (i + 1/2) spacing`` in the box around a solid; its last points may be so near the box's end
+    that their cells reach beyond it, by less than half a spacing [m]."""
+    lower, upper = solid.extent()
+    return block_between(lower, upper + 0.5 * spacing, spacing)
+
+
+def points_inside(solid: Solid, spacing: float) -> Points:
+    """(n, d) [m] the points of the lattice in the box around a solid that are inside of it."""
+    points = block_around(solid, spacing).points()
+    return np.asarray(points[solid.distance_up_to(points, spacing) < 0.0])

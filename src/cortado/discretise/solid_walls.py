@@ -6,13 +6,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points
-from cortado.discretise.solids.container_walls import ContainerWalls
-from cortado.discretise.solids.solid import Solid
-from cortado.discretise.solids.surface_points import (
+from cortado.discretise.shapes import Numbers, Points, Rows, Which, bisected
+from cortado.discretise.solid import Solid
+from cortado.discretise.surface_points import (
     FINE,
     SurfacePoints,
     evenly_chosen,
@@ -20,9 +18,66 @@ from cortado.discretise.solids.surface_points import (
     surface_feet,
     surface_points,
 )
-from cortado.discretise.solids.wall_points import WallPoints
-from cortado.discretise.walls.layers import Planes, WallLayers
-from cortado.discretise.walls.places import Places
+from cortado.discretise.walls import Places, Planes, WallLayers
+
+
+@dataclass(frozen=True)
+class WallPoints(Rows):
+    """Wall particles whose weights are not known yet."""
+
+    positions: Points
+    """(b, d) [m]"""
+    flat: Points
+    """(b,) weights in the density that they would have in a flat wall [-]"""
+    feet: Points
+    """(b, d) from each to the nearest point of its surface [m]"""
+
+
+@dataclass(frozen=True, eq=False)
+class ContainerWalls:
+    """The wall particles that a container has without solids.
+
+    Of those that are so far from all solids that no fluid beside these sees them, each keeps its place and its cell.
+    """
+
+    points: WallPoints
+    solids: Sequence[Solid]
+    """What closes the container."""
+    room: Room
+    """Where fluid may be, beside solids."""
+    spacing: float
+    """Of particles [m]."""
+    support: float
+    """[m]"""
+
+    @property
+    def _clear(self) -> float:
+        """How far from solids feet of wall particles are that keep their places [m]."""
+        return 2.0 * self.support + self.spacing
+
+    @cached_property
+    def stay(self) -> Which:
+        """(b,) which wall particles keep their places."""
+        feet = self.points.positions + self.points.feet
+        return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
+
+    def keeps(self, points: Points) -> Which:
+        """(n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place, or
+        above the rim of the container."""
+        from scipy.spatial import cKDTree
+
+        kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)
+        outside = points[kept]
+        cells = self.stay.any() and self.stay[cKDTree(self.points.positions).query(outside)[1]]
+        kept[kept] = ~self.room.region.is_below_rim(outside) | cells
+        return kept
+
+    def is_near(self, points: Points, furthest: float) -> Which:
+        """(n,) which points (n, d) [m] are less than a length [m] from the surface where particles do not keep their
+        places, whose cells are cut there, or from solids; a few more are."""
+        near = self._clear + 2.0 * self.spacing + furthest
+        return np.asarray(self.room.from_solids(points, near) < near)
+
 
 DENSITY = 0.75
 """In spacings: how far wall particles are apart."""
@@ -44,7 +99,7 @@ class ExposedSurface:
     """(n, d) [m]"""
     away: Points
     """(n, d) unit vectors into the room"""
-    owner: NDArray[np.int64]
+    owner: Numbers
     """(n,) whose they are: index into `solids`"""
     solids: Sequence[Solid]
     """First what closes the container."""
@@ -96,7 +151,7 @@ class ExposedSurface:
             )
         return WallPoints.joined(parts)
 
-    def owners(self, walls: WallPoints) -> NDArray[np.int64]:
+    def owners(self, walls: WallPoints) -> Numbers:
         """(b,) whose wall particles are: index into `solids`."""
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
@@ -115,7 +170,7 @@ class ExposedSurface:
         if not len(self.feet):
             return self.feet
 
-        def is_near(points: Points, furthest: float) -> NDArray[np.bool_]:
+        def is_near(points: Points, furthest: float) -> Which:
             beyond = furthest - depth - 0.5 * fine
             away = self._tree.query(points, distance_upper_bound=furthest)[0]
             near = np.isfinite(away) & (away > depth - 0.5 * fine - beyond)
@@ -135,7 +190,7 @@ class ExposedSurface:
             found.append(feet[band] + (depth / distances[band, None]) * down[band])
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
-    def _feet_of(self, points: Points, reach: Points, nearest: NDArray[np.int64]) -> Points:
+    def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
         """(n, d) [m] the point of the surface that is nearest to each of the points (n, d) [m] beneath it, on a solid
         or where two of them meet; ``nearest`` (n,) is the nearest of the fine points, ``reach`` (n,) [m] away."""
         fine = self.spacing / FINE
@@ -155,7 +210,7 @@ class ExposedSurface:
         found[between] = self._edges(found[between], owner[between])
         return found
 
-    def _edges(self, feet: Points, owner: NDArray[np.int64]) -> Points:
+    def _edges(self, feet: Points, owner: Numbers) -> Points:
         """(n, d) [m] points where the solid that feet (n, d) [m] belong to meets the one that is next to them, near
         the feet: these, moved to one surface and the other in turn."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
@@ -173,11 +228,8 @@ class ExposedSurface:
         """(n, d) [m] points beneath the feet that have another part of the surface nearer than at a depth, as deep as
         that is."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
-        low, high = np.zeros(len(thin)), np.full(len(thin), depth)
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            good = self._is_nearest(thin, middle)
-            low, high = np.where(good, middle, low), np.where(good, high, middle)
+        ends = np.zeros(len(thin)), np.full(len(thin), depth)
+        low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, HALVINGS)
         return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
@@ -187,13 +239,13 @@ class ExposedSurface:
         return np.asarray(distances > depths - TOLERANCE * self.spacing)
 
 
-def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> NDArray[np.bool_]:
+def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
     """(n,) whether points (n, d) [m] are no more than ``reach`` [m] outside of periods that begin at ``lower``."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
-def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> NDArray[np.bool_]:
+def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> Which:
     """(n,) whether fluid in a room can touch points of surfaces (n, d) [m], from which unit vectors (n, d) point."""
     return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 

@@ -1,0 +1,371 @@
+"""Triangles made a solid, or a sentence that says what is wrong with them, where, and what to do about it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.discretise.mesh import Mesh, TriangleTree
+from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
+from cortado.errors import InputError
+from cortado.words import counted
+
+SAME = 1e-6
+"""Of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32 rounds
+them."""
+COARSE, TOLD = 0.02, 1e-3
+"""Of the length of a mesh: coordinates that a file rounds to more are refused, and told of."""
+ASIDE = 1e-6
+"""Of the length of a mesh: how far from a surface one looks at what is beside it."""
+CROSSED = 1e-7
+"""Of the length of a mesh: what goes through a triangle by less only touches it."""
+LOOKED_AT = 8192
+"""Triangles about whose sides one asks."""
+SAME_WAY = 1e-6
+"""Angle [rad] between triangles that lie on each other, where two bodies touch."""
+TOGETHER = 1e-3
+"""The same as float32 may round it, where one only asks in how many directions a surface goes on."""
+MEETING = (
+    "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
+    "says what is inside: delete faces that divide its inside or stick out of it."
+)
+OPEN = (
+    "{what} is not closed, so that nothing says what is inside: it has {edges}, the first at {place}; close its holes, "
+    "small ones by trimesh's mesh.fill_holes(), and give a sheet a thickness."
+)
+TURNED = (
+    "Normals of {what} point inwards at some triangles and outwards at others: they change at {edges}, the first at "
+    "{place}; let all point outwards, as trimesh's mesh.fix_normals() does."
+)
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The edges of triangles that share vertices."""
+
+    ends: Numbers
+    """(e, 2) numbers of their vertices, the lower one first"""
+    names: Numbers
+    """(k, 3) numbers of the edges that the sides of triangles are"""
+    ways: Numbers
+    """(k, 3) 1 where a side goes from the lower number to the higher, -1 where it goes back"""
+
+    @classmethod
+    def of(cls, triangles: Numbers) -> "Edges":
+        """The edges of triangles (k, 3)."""
+        sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1)
+        ends = np.sort(sides, axis=-1)
+        span = int(triangles.max(initial=0)) + 1
+        keys, names = np.unique(ends[..., 0] * span + ends[..., 1], return_inverse=True)
+        ways = np.where(sides[..., 0] < sides[..., 1], 1, -1)
+        return cls(np.column_stack([keys // span, keys % span]), names.reshape(-1, 3), ways)
+
+    @property
+    def counts(self) -> Numbers:
+        """(e,) how many triangles meet at each edge."""
+        return np.bincount(self.names.ravel(), minlength=len(self.ends))
+
+    def close(self) -> Which:
+        """(e,) whether triangles close at an edge: as many go along it one way as the other."""
+        return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
+
+    def check(self, vertices: Points, what: str) -> None:
+        """Raises `InputError`, a sentence that calls the mesh ``what``, where the triangles do not close."""
+        unbalanced, counts = ~self.close(), self.counts
+        for wrong, edge, sentence in (
+            (unbalanced & (counts > 2), "edge", MEETING),
+            (counts == 1, "open edge", OPEN),
+            (unbalanced, "edge", TURNED),
+        ):
+            if wrong.any():
+                place = self.place(int(np.argmax(wrong)), vertices)
+                raise InputError(sentence.format(what=what, edges=counted(int(wrong.sum()), edge), place=place))
+
+    def place(self, edge: int, vertices: Points) -> str:
+        """The middle of an edge, in words."""
+        return place_in_file(vertices[self.ends[edge]].mean(axis=0))
+
+
+def place_in_file(place: Points) -> str:
+    """A point in words, for a sentence."""
+    return f"({', '.join(f'{value:.7g}' for value in place)}) in the file"
+
+
+def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
+    """Triangles (k, 3) between vertices (m, 3) that are at different places, or further apart than a tolerance.
+
+    Left out are those that have a vertex twice, what comes once more, and pairs that are back to back, as where two
+    bodies touch.
+    """
+    vertices, names = _distinct(vertices)
+    if tolerance > 0.0:
+        vertices, names = _further_apart(vertices, names, tolerance)
+    triangles = names[triangles]
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    turned = np.take_along_axis(triangles, (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    once = np.sort(np.unique(turned, axis=0, return_index=True)[1])
+    _, found, counts = np.unique(np.sort(turned[once], axis=1), axis=0, return_inverse=True, return_counts=True)
+    return vertices, triangles[once[counts[found.ravel()] == 1]]
+
+
+def _distinct(vertices: Points) -> tuple[Points, Numbers]:
+    """Vertices at different places, and which of them each of those that are given is."""
+    order = np.lexsort(vertices.T)
+    new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
+    names = np.empty(len(vertices), dtype=np.int64)
+    names[order] = np.cumsum(new) - 1
+    return vertices[order[new]], names
+
+
+def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[Points, Numbers]:
+    """The vertices and names of `_distinct` with one vertex in the place of several no further apart than a
+    tolerance."""
+    from scipy.spatial import cKDTree
+
+    groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
+    return vertices[np.unique(groups, return_index=True)[1]], groups[names]
+
+
+def _connected(links: Numbers, count: int) -> Numbers:
+    """(count,) the connected component of each of so many nodes, with links (m, 2) between them."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(links), dtype=np.int8), tuple(links.T)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
+    """(k,) numbers from 0 on of the bodies that triangles (k, 3) of a closed mesh belong to.
+
+    Triangles that follow one another at an edge with the solid between them are of one body. Raises `InputError`, a
+    sentence that calls the mesh ``what``, at an edge from which its surface goes on in more than two directions;
+    ``origin`` (3,) is the place of the mesh in the file.
+    """
+    names = edges.names.ravel()
+    sides = np.argsort(names, kind="stable")
+    first = np.append(0, np.cumsum(edges.counts))[:-1]
+    two = edges.counts == 2
+    links = [np.column_stack([sides[first[two]], sides[first[two] + 1]])]
+    for edge in np.flatnonzero(~two):
+        there = sides[first[edge] : first[edge] + edges.counts[edge]]
+        opposite = vertices[triangles.ravel()[3 * (there // 3) + (there + 2) % 3]]
+        angles, ways = _angles(vertices[edges.ends[edge]], opposite), edges.ways.ravel()[there]
+        if _directions(angles, ways) > 2:
+            raise InputError(
+                f"{what} has an edge that more than two triangles share, at "
+                f"{edges.place(int(edge), origin + vertices)}, where bodies, or two parts of one, only touch: move "
+                "them apart, or let them overlap."
+            )
+        links.append(there[_pairs(angles, ways > 0)])
+    return _connected(np.concatenate(links) // 3, len(triangles))
+
+
+def _angles(edge: Points, opposite: Points) -> Points:
+    """(m,) the angles around an edge (2, 3) at which points (m, 3) are seen, right-handed."""
+    along = (edge[1] - edge[0]) / np.linalg.norm(edge[1] - edge[0])
+    across = np.eye(3)[np.argmin(np.abs(along))]
+    right = np.cross(along, across)
+    return np.arctan2((opposite - edge[0]) @ np.cross(along, right), (opposite - edge[0]) @ right)
+
+
+def _directions(angles: Points, ways: Numbers) -> int:
+    """The number of directions in which a surface goes on from an edge that triangles share, at angles [rad] and with
+    ways (m,). Triangles that lie on each other and go opposite ways cancel."""
+    order = np.argsort(angles)
+    angles, ways = angles[order], ways[order]
+    groups = np.cumsum(np.diff(angles, prepend=angles[0]) > TOGETHER)
+    groups[2.0 * np.pi + angles[0] - angles <= TOGETHER] = 0
+    return int(np.count_nonzero(np.bincount(groups, ways)))
+
+
+def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
+    """(m / 2, 2) the pairs of triangles around an edge (m,) that bound the same solid wedge: one at which it begins and
+    the next at which one ``ends`` (m,); where two lie on each other, one ends before one begins."""
+    turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
+    order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
+    begun, ended, pairs = list[int](), list[int](), []
+    for number in map(int, order):
+        waiting, own = (begun, ended) if ends[number] else (ended, begun)
+        if ends[number] and waiting:
+            pairs.append((waiting.pop(0), number))
+        else:
+            own.append(number)
+    return np.array([*pairs, *zip(begun, ended, strict=True)], dtype=np.int64)
+
+
+def parts_of(
+    mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
+) -> tuple[tuple[Numbers, ...], int | None, int | None]:
+    """Bodies that overlap in parts within each of which none do: the triangles of each part, none if the mesh is one
+    part that does not cross itself; a triangle at which a body crosses itself, and one of a body inside another, or
+    None.
+
+    Args:
+        mesh: closed.
+        tree: of its triangles.
+        labels: (k,) the body of each triangle.
+        crossings: (m, 2) pairs of triangles that cross.
+        some: (s,) triangles, of each body at least one with an area.
+        beside: (s, 3) a place just outside of each of those [m].
+    """
+    count = int(labels.max()) + 1
+    bodies = [np.flatnonzero(labels == body) for body in range(count)]
+    trees = [tree] if count == 1 else [TriangleTree.of(mesh.corners[body]) for body in bodies]
+    around = np.array([one.windings(beside) for one in trees])
+    seen = labels[some]
+    owners = _owners(np.array([_volume(mesh.corners[body]) for body in bodies]), around, seen)
+    own = owners[labels[crossings]]
+    within = own[:, 0] == own[:, 1]
+    crossing = int(crossings[within][0, 0]) if within.any() else None
+    pieces = np.unique(owners)
+    if len(pieces) == 1:
+        return ((np.arange(len(labels)),) if within.any() else ()), crossing, None
+    around = np.array([around[owners == piece].sum(axis=0) for piece in pieces])
+    inside = np.zeros((len(pieces), len(pieces)), dtype=bool)  # of the first, some place beside the second
+    wholly = inside.copy()
+    seen = np.searchsorted(pieces, owners[seen])
+    for number in range(len(pieces)):
+        places = around[:, seen == number] > 0
+        inside[:, number], wholly[:, number] = places.any(axis=1), places.all(axis=1) & (places.shape[1] > 0)
+    np.fill_diagonal(inside, False)
+    np.fill_diagonal(wholly, False)
+    first, second = np.searchsorted(pieces, own[~within]).T
+    met = inside | inside.T
+    met[first, second] = met[second, first] = True
+    wholly[first, second] = wholly[second, first] = False
+    groups = _apart(met, [int(np.count_nonzero(owners[labels] == piece)) for piece in pieces])
+    parts = tuple(np.flatnonzero(np.isin(owners[labels], pieces[group])) for group in groups)
+    filled = np.flatnonzero(wholly.any(axis=0))
+    hidden = int(np.argmax(owners[labels] == pieces[filled[0]])) if len(filled) else None
+    return (parts if len(parts) > 1 or within.any() else ()), crossing, hidden
+
+
+def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
+    """(bodies,) the body that each belongs to: a cavity to the least of those around it, all others to themselves.
+    ``around`` (bodies, s): how often each goes around places beside the bodies ``seen`` (s,)."""
+    owners = np.arange(len(volumes))
+    for cavity in np.flatnonzero(volumes < 0.0):
+        holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
+        if holds.any():
+            candidates = np.flatnonzero(holds)
+            owners[cavity] = candidates[np.argmin(volumes[candidates])]
+    return owners
+
+
+def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
+    """Numbers in as few groups as are found, the largest first, so that none has met another of its group."""
+    groups: list[list[int]] = []
+    for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
+        free = next((group for group in groups if not met[number, group].any()), None)
+        if free is None:
+            groups.append([number])
+        else:
+            free.append(number)
+    return groups
+
+
+def _volume(corners: Points) -> float:
+    """The volume within a closed surface of triangles (k, 3, 3) [m3], negative if its normals point inwards."""
+    a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
+    return float((a * np.cross(b, c)).sum() / 6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMesh:
+    """The solid in a file of triangles."""
+
+    mesh: Mesh
+    """In the file's unit of length, about an origin of its own."""
+    origin: Points
+    """(3,) where that is in the file: near the middle of a mesh that is far from the origin of the file, and 0 of all
+    others."""
+    notes: tuple[str, ...]
+    """Sentences about what is probably not meant."""
+    left_out: int
+    """Triangles without area, or that came twice."""
+
+
+def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
+    """The solid that triangles (k, 3) between vertices (m, 3) enclose; raises `InputError`, a sentence that calls the
+    mesh ``what``. In the file coordinates are whole multiples of a ``rounding``, if that is not 0."""
+    used = vertices[triangles.ravel()]
+    if not np.isfinite(used).all():
+        wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        raise InputError(
+            f"{what} has {len(wrong)} {'vertex' if len(wrong) == 1 else 'vertices'} with coordinates that are not "
+            f"finite, the first of them number {wrong[0]}, counted from 0: export the mesh once more."
+        )
+    length = np.ptp(used, axis=0).max()
+    far = (
+        f"{what} lies far from the origin: move it before it is exported, as the file rounds its coordinates to "
+        f"{rounding:g} there, beside a length of {length:g}."
+    )
+    if rounding > COARSE * length:
+        raise InputError(far)
+    count, origin = len(triangles), whole_origin(used)
+    vertices, triangles = merged(vertices - origin, triangles)
+    edges = Edges.of(triangles)
+    if not edges.close().all():
+        if rounding > TOLD * length:
+            raise InputError(far)
+        vertices, triangles = merged(vertices, triangles, SAME * length)
+        edges = Edges.of(triangles)
+    if not len(triangles):
+        raise InputError(
+            f"{what} holds no volume: all of its {count} triangles have no area, or come twice, back to back; give the "
+            "sheet a thickness."
+        )
+    edges.check(origin + vertices, what)
+    mesh = Mesh(vertices, triangles)
+    tree = TriangleTree.of(mesh.corners)
+    parts, notes = _solid_parts(mesh, tree, bodies(edges, vertices, triangles, origin, what), origin, what)
+    notes = (*notes, *((far,) if rounding > TOLD * length else ()))
+    known = () if parts else (tree,)
+    return FoundMesh(Mesh(vertices, triangles, parts, known), origin, notes, count - len(triangles))
+
+
+def _solid_parts(
+    mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
+) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
+    """The parts of a closed mesh, with the tree of its triangles, whose bodies have labels (k,), and notes about it;
+    raises `InputError` where it is inside out. ``origin`` (3,) is the place of the mesh in the file."""
+    size = np.ptp(mesh.corners, axis=(0, 1)).max()
+    crossings = tree.crossings(mesh.triangles, CROSSED * size)
+    some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
+    by_area = np.argsort(-mesh.areas(), kind="stable")
+    some = np.unique(np.append(some, by_area[np.unique(labels[by_area], return_index=True)[1]]))
+    some = some[mesh.areas()[some] > 0.0]
+    beside = mesh.corners[some].mean(axis=1) + ASIDE * size * mesh.normals()[some]
+    wrong = tree.windings(beside) < 0
+    if wrong.any():
+        raise InputError(_inside_out(wrong, labels, labels[some], what, origin + mesh.corners[some[np.argmax(wrong)]]))
+    notes = []
+    parts, crossing, filled = parts_of(mesh, tree, labels, crossings, some, beside)
+    middles = origin + mesh.corners.mean(axis=1)
+    if crossing is not None:
+        notes.append(
+            f"{what} crosses itself, for example at {place_in_file(middles[crossing])}: what it goes around twice "
+            "counts once; mend it if that is not meant."
+        )
+    if filled is not None:
+        notes.append(
+            f"A body of {what} lies inside another one, for example at {place_in_file(middles[filled])}, and makes no "
+            "difference: for a cavity turn its triangles over, as trimesh's mesh.invert() does."
+        )
+    return parts, tuple(notes)
+
+
+def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
+    """The sentence of `_solid_parts`, given the body of each triangle that was ``seen``, and ``corners`` (3, 3) of one
+    that is wrong."""
+    if wrong.all():
+        return (
+            f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "
+            "over, as trimesh's mesh.invert() does."
+        )
+    all_bodies, count = len(np.unique(labels)), len(np.unique(seen[wrong]))
+    which = f"{count} of the {all_bodies} bodies of {what}" if all_bodies > 1 else f"a part of {what}"
+    return (
+        f"The normals of {which} point inwards, for example at {place_in_file(corners.mean(axis=0))}, where there is "
+        "nothing solid around them: turn these triangles over, and mend what crosses itself."
+    )

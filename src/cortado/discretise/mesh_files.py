@@ -1,0 +1,220 @@
+"""Solids out of files of triangles (STL, OBJ, PLY and glTF, as trimesh reads them), checked beside particles of a
+spacing and beside a container: their unit of length, and how thick they are."""
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.mesh import Mesh
+from cortado.discretise.mesh_checks import FoundMesh, found_mesh
+from cortado.discretise.shapes import Numbers, Points, bisected
+from cortado.errors import InputError, Words, shown, warn
+from cortado.files.input_files import reason, regular_file
+
+SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
+"""How a file of triangles may end."""
+MOST_BYTES = 2**30
+"""Of a file."""
+LEAST_THICKNESS = 0.5
+"""In spacings. In the plane, water 16 spacings deep on one side or on both goes through walls 0.2 spacings thick within
+0.2 s; those 0.3 thick hold it for 1 s, with either solver."""
+SHARE = 0.01
+"""Of the surface: where no more is too thin, nothing is said."""
+ALONG = 0.9
+"""Cosine between the normals of both sides of a sheet, one of them turned round, at least; of a wedge it is less."""
+TOO_LARGE = 100.0
+"""Times the length of the container, or 100 spacings without one: a mesh that is longer has another unit of length."""
+PROBES, STEPS, HALVINGS = 20_000, 16, 12
+"""Points of a surface at which its thickness is measured, in so many steps, the last of which is halved so often."""
+BEYOND = 1e-3
+"""Of the steps' length: how far behind a solid one looks back at it."""
+
+
+def read_mesh(
+    path: str,
+    scale: float,
+    spacing: float,
+    support: float | None = None,
+    container: tuple[Points, Points] | None = None,
+) -> Mesh:
+    """The solid in a file, beside particles a spacing [m] apart that see each other up to a support [m]; or a body of
+    fluid, which may be of any thickness.
+
+    Raises `InputError`, a sentence that names the file and says what is wrong, where, and what to do; warns with
+    `CortadoWarning` of what is probably not meant.
+
+    Args:
+        path: of the file.
+        scale: the factor of its lengths, 0.001 where they are millimetres.
+        spacing: [m].
+        support: [m]; None for a body of fluid.
+        container: lower and upper corner, each (3,) [m], of the box around the container of the fluid, if there is one.
+    """
+    found, what = mesh_in_file(path), repr(path)
+    mesh = found.mesh.moved(scale, np.zeros(3))
+    _check_unit(mesh, what, scale, spacing, container)
+    of_thickness = _thickness_notes(mesh, scale * found.origin, what, spacing, support) if support is not None else ()
+    for note in (*found.notes, *of_thickness):
+        warn(note)
+    return mesh
+
+
+def mesh_in_file(path: str) -> FoundMesh:
+    """The solid in a file, in its own unit of length, checked by itself; raises `InputError`."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
+    try:
+        stat = regular_file(path, MOST_BYTES)
+    except OSError as problem:
+        raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
+    if not stat.st_size:
+        raise InputError(f"{path!r} is empty: export the mesh once more.")
+    return _found(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=8)
+def _found(path: str, changed: int, size: int) -> FoundMesh:
+    """The solid in a version of a file, which is known by the time of its last change and its size; read once."""
+    vertices, triangles, rounding = read_triangles(path)
+    return found_mesh(vertices, triangles, repr(path), rounding)
+
+
+def read_triangles(path: str) -> tuple[Points, Numbers, float]:
+    """The vertices (m, 3) and the triangles (k, 3), at least one, of all bodies of a file, where its scene puts them,
+    in its unit of length; and the step to which the file rounds coordinates, 0 if they are not float32. Raises
+    `InputError`."""
+    rounding, is_single = 0.0, _is_single(path)
+    vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
+    scene = _scene(path)
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        body = scene.geometry[name]
+        corners = np.asarray(getattr(body, "faces", np.zeros((0, 3))), dtype=np.int64)
+        others |= not len(corners)
+        if np.linalg.det(transform[:3, :3]) < 0.0:
+            corners = corners[:, ::-1]  # what is mirrored is turned over
+        if len(corners):
+            vertices.append(np.asarray(body.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3])
+            triangles.append(corners + count)
+            count += len(vertices[-1])
+            if is_single and np.isfinite(body.vertices).all():
+                step = float(np.spacing(np.float32(np.abs(body.vertices).max())))
+                rounding = max(rounding, step * float(np.linalg.norm(transform[:3, :3], axis=0).max()))
+    if len(triangles) == 1:
+        what = "points or lines, but no triangles" if others else "no triangles that can be read; it may be damaged"
+        raise InputError(f"{path!r} holds {what}: export the mesh as triangles.")
+    return np.concatenate(vertices), np.concatenate(triangles), rounding
+
+
+def _is_single(path: str) -> bool:
+    """Whether a file has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
+    suffix = Path(path).suffix.lower()
+    if suffix in (".stl", ".ply"):
+        with open(path, "rb") as file:
+            head = file.read(4096)
+        if suffix == ".ply":
+            return not re.search(rb"property (double|float64) x", head)
+        return len(head) >= 84 and Path(path).stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little")
+    return suffix in (".gltf", ".glb")
+
+
+def _scene(path: str) -> Any:
+    import trimesh
+
+    try:
+        with open(path, "rb") as file, warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            kind, beside = Path(path).suffix.lower()[1:], trimesh.resolvers.FilePathResolver(path)
+            return trimesh.load_scene(file, file_type=kind, resolver=beside, process=False)
+    except Exception as problem:  # of many types, where a file is damaged
+        why = shown(Words(f"{type(problem).__name__}: {reason(problem)}"))
+        raise InputError(f"{path!r} is no mesh that can be read ({why}); it may be damaged.") from None
+
+
+def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
+    """Raises `InputError`, a sentence that calls the mesh ``what``, where it is far too large or too small."""
+    length = float(np.ptp(mesh.extent(), axis=0).max())
+    room = None if container is None else float(np.ptp(container, axis=0).max())
+    beside = 100.0 * spacing if room is None else room
+    if length > TOO_LARGE * beside:
+        times = f"{length / spacing:,.0f} spacings" if room is None else f"{length / room:,.0f} times the container"
+        raise InputError(
+            f"{what} is {length:g} m long, {times}; it looks like millimetres: give it scale = {0.001 * scale:g}, and "
+            f"it will be {0.001 * length:g} m long."
+        )
+    if length < spacing:
+        raise InputError(
+            f"{what} is only {length:g} m long, less than a spacing, {spacing:g} m; it may have another unit of "
+            f"length, so give it a larger scale than {scale:g}, or make the spacing smaller."
+        )
+
+
+@dataclass(frozen=True)
+class Thickness:
+    """Thicknesses of a solid beneath points of its surface that stand for equal parts of it."""
+
+    points: Points
+    """(n, 3) [m]"""
+    lengths: Points
+    """(n,) from each straight down to where the solid ends [m]; infinite beyond the reach of the search"""
+    is_sheet: np.ndarray
+    """(n,) whether the surface where the solid ends is nearly parallel to that at the point"""
+
+    def share(self, which: np.ndarray) -> float:
+        """The part of the surface for which some points (n,) stand."""
+        return float(np.count_nonzero(which) / max(len(which), 1))
+
+    def place(self, which: np.ndarray) -> str:
+        """The thinnest of some points, in words."""
+        thinnest = self.points[which][np.argmin(self.lengths[which])]
+        return f"({', '.join(f'{value:g}' for value in thinnest)}) m"
+
+    @property
+    def thinnest(self) -> float:
+        """The thickness of sheets [m] that all but `SHARE` of the surface exceeds; infinite without sheets."""
+        return float(np.quantile(np.where(self.is_sheet, self.lengths, np.inf), SHARE, method="higher"))
+
+
+def thickness_of(mesh: Mesh, reach: float) -> Thickness:
+    """The thickness of a mesh where it is less than a reach [m]."""
+    points, outward = mesh.own_feet(float(np.sqrt(mesh.areas().sum() / PROBES)))
+    depths = reach * (np.arange(STEPS) + 1.0) / STEPS
+    inside = np.array([mesh.holds(points - depth * outward) for depth in depths])
+    through = ~inside.all(axis=0)
+    high, probes, down = depths[np.argmin(inside, axis=0)[through]], points[through], -outward[through]
+    _, high = bisected(lambda at: mesh.holds(probes + at[:, None] * down), high - reach / STEPS, high, HALVINGS)
+    lengths, is_sheet = np.full(len(points), np.inf), np.zeros(len(points), dtype=bool)
+    lengths[through] = high
+    beyond = probes + (high + BEYOND * reach)[:, None] * down
+    is_sheet[through] = (mesh.outward(beyond) * down).sum(axis=1) > ALONG
+    return Thickness(points, lengths, is_sheet)
+
+
+def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
+    """Sentences about a mesh that is thin beside the support [m]; raises `InputError` where it cannot keep fluid out.
+    ``origin`` (3,): that of the mesh in the file, times the scale [m]."""
+    found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
+    found = replace(found, points=origin + found.points)
+    sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet
+    if found.share(sheet) > SHARE:
+        raise InputError(
+            f"{what} is thinner than half a spacing, {least:g} m, at {found.share(sheet):.0%} of its surface, for "
+            f"example at {found.place(sheet)}, so that fluid would pass: make it thicker, or the spacing smaller."
+        )
+    if found.share(sharp) > SHARE:
+        yield (
+            f"{what} has edges so sharp that it is thinner than half a spacing, {least:g} m, at "
+            f"{found.share(sharp):.0%} of its surface, for example at {found.place(sharp)}: fluid may pass there."
+        )
+    thin = (found.lengths < support) & found.is_sheet
+    if found.share(thin) > SHARE:
+        yield (
+            f"{what} is thinner than the support, {support:g} m, at {found.share(thin):.0%} of its surface, down to "
+            f"{found.lengths[thin].min():.3g} m at {found.place(thin)}: fluid on one side feels that on the other."
+        )

@@ -1,0 +1,393 @@
+"""Particles moved until the fluid has its rest density everywhere, in float64.
+
+In Colagrossi et al. (2012) and in Negi and Ramachandran (2021) particles push each other until they fill a shape
+evenly. Here nonlinear least squares (Gauss-Newton) do it: the density of every particle is to be that of the lattice,
+where walls count with their weights and air counts as if it were fluid, and no two particles are to be too near each
+other. Only particles near a surface move, as those on a lattice have the rest density from the start.
+"""
+
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.calibration import SLACK, lattice_offsets, rest_volume
+from cortado.discretise.cpu_launches import launch_on_cpu, shared
+from cortado.discretise.pairs import pairs_within
+from cortado.discretise.shapes import Numbers, Points, Which
+from cortado.discretise.walls import RestLattice
+from cortado.files.terminal import timed_note
+
+Int32s = NDArray[np.int32]
+MOST_CELLS = 2_000_000
+"""Of a grid: what is further apart shares them."""
+NO_LIMIT = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PointsAround:
+    """The points that particles see, found by cells: first particles, if any, then fixed points of air and walls."""
+
+    lattice: RestLattice
+    """The lattice of the fluid at rest."""
+    points: Points
+    """(m, d) [m]"""
+    weights: Points
+    """(m,) what each counts for in the density, a particle being 1 [-]"""
+    air: tuple[int, int]
+    """Number of the first point of air, which blind particles do not see, and of the first one behind the last."""
+    lengths: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
+    reach: float
+    """How far particles look [m]."""
+
+    def near(self, particles: Points) -> Which:
+        """(n,) whether there is a point within the reach of particles (n, d) [m]."""
+        return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
+
+    def sums(self, particles: Points, blind: Which) -> Points:
+        """(n,) the weighted sum of the kernels of the points [1 / m^d] at particles (n, d) [m], of which those that are
+        ``blind`` (n,) see no air; the reach is the support."""
+        return np.asarray(self._looked(particles, blind)["sums"])
+
+    def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
+        """Neighbour lists of the first n points, at ``particles`` (n, d) [m], each with the points of higher numbers
+        within the reach: where the list of each begins (n,) and ends (n,), and numbers of points, with gaps between
+        the lists."""
+        room = len(lattice_offsets(self.lattice.spacing, self.reach, self.points.shape[1]))
+        while True:
+            starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
+            others = np.empty(max(starts[-1], 1), dtype=np.int32)
+            counts = self._looked(particles, blind, are_own=True, starts=starts, others=others)["counts"]
+            if counts.max(initial=0) <= room:
+                return starts[:-1], starts[:-1] + counts, others
+            room = int(counts.max())
+
+    def _looked(self, particles: Points, blind: Which, **given: Any) -> dict[str, Any]:
+        """The outputs of the kernel ``look_around``, by name."""
+        count = len(particles)
+        given = {"are_own": False, "most": NO_LIMIT, "starts": np.zeros(count + 1, dtype=np.int32), **given}
+        found = {"others": np.zeros(1, dtype=np.int32), "counts": np.zeros(count, dtype=np.int32), **given}
+        found = {"sums": np.zeros(count), **found}
+        if len(self.points):
+            placed, grid = self._by_cell
+            where = {"around": self.on_cpu, "placed": placed, "grid": grid, "reach": self.reach}
+            launch_on_cpu(self.kernels.look_around, count, x=in_space(particles), blind=blind, **where, **found)
+        return found
+
+    @property
+    def volume(self) -> float:
+        """Volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
+        return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.points.shape[1])
+
+    @property
+    def own_weight(self) -> float:
+        """The kernel of a particle at its own place [1 / m^d]."""
+        return float(self.lattice.kernel.weight(np.zeros(1), self.points.shape[1], self.lattice.support)[0])
+
+    @cached_property
+    def kernels(self) -> Any:
+        """The `packing_kernels` for the lattice's smoothing kernel."""
+        from cortado.device.warp_start import start_warp
+
+        start_warp()
+        from cortado.discretise.packing_kernels import packing_kernels
+
+        return packing_kernels(self.lattice.kernel)
+
+    @cached_property
+    def in_space(self) -> Points:
+        """(m, 3) the points as kernels see them [m]."""
+        return in_space(self.points)
+
+    @cached_property
+    def on_cpu(self) -> Any:
+        """The points as the struct ``Around`` of kernels."""
+        around, dimension = self.kernels.around(), self.points.shape[1]
+        around.x, around.weights = shared(self.in_space), shared(self.weights)
+        around.air, around.behind_air = self.air
+        around.is_periodic, around.period = bool(self.lengths.any()), in_space(self.lengths)
+        around.frequency = np.divide(1.0, around.period, where=np.array(around.period) > 0.0, out=np.zeros(3))
+        around.per_support = 1.0 / self.lattice.support
+        around.normalisation = self.lattice.kernel.normalisation(dimension, self.lattice.support)
+        return around
+
+    @cached_property
+    def _by_cell(self) -> tuple[Any, Any]:
+        """The points in the order of cells as wide as the reach, and the grid of these."""
+        from cortado.device.grid import Grid
+
+        ends = self.points.min(axis=0), self.points.max(axis=0)
+        cells = Grid.around(*ends, self.lengths, self.reach, MOST_CELLS)
+        along = np.floor((self.in_space - cells.origin) / cells.cell).astype(np.int64) % np.array(cells.shape)
+        own = (along[:, 2] * cells.shape[1] + along[:, 1]) * cells.shape[0] + along[:, 0]
+        order = np.argsort(own, kind="stable").astype(np.int32)
+        placed, grid = self.kernels.placed(), self.kernels.grid()
+        placed.x, placed.numbers = shared(self.in_space[order]), shared(order)
+        grid.origin, grid.frequency, grid.shape = cells.origin, 1.0 / cells.cell, cells.shape
+        grid.starts = shared(starts_of(np.bincount(own, minlength=cells.cells)))
+        return placed, grid
+
+
+def in_space(points: Points) -> Points:
+    """(..., 3) points (..., d), with 0 along an axis that there is not."""
+    return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
+
+
+def starts_of(counts: Numbers | Int32s) -> Int32s:
+    """(n + 1,) where each of lists of these lengths (n,) begins, one behind the other, and the end."""
+    return np.append(0, np.cumsum(counts)).astype(np.int32)
+
+
+HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
+"""Of a packed particle's density beside that of the lattice, relative. It is not above, or pressure would drive the
+particles apart in the first step."""
+ROUNDS = 6
+"""Of least squares, until those that move are chosen anew."""
+LISTED = 0.6
+"""[spacings] beyond the support up to which pairs are kept for the rounds to come."""
+NEAR = 0.9
+"""[spacings]: pairs of particles that are nearer push each other apart."""
+PUSH = 0.1
+"""What a pair that is too near by a spacing counts, beside a density that is wrong by its whole."""
+FARTHEST = 0.15
+"""[spacings] that a particle moves in a round at most, as the equations are linear only nearby."""
+DAMPING, MOST_INNER_ROUNDS = 0.02, 20
+"""Of the linear least squares: among solutions that are nearly as good, the one that moves particles least."""
+
+
+def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
+    """(n,) by how much densities are above that of the lattice, relative, given sums of kernels (n,) [1 / m^d]; 0 for
+    particles that stay where it is below."""
+    errors = around.volume * sums - (1.0 - SLACK)
+    return np.where(stays, np.maximum(errors, 0.0), errors)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Densities, and distances of pairs that are close, to first order in the moves of particles: products of their
+    derivatives at some places, without a matrix."""
+
+    kernels: Any
+    equations: Any
+    """The derivatives, as kernels see them."""
+    sums: Points
+    """(n,) of kernels at the particles [1 / m^d]"""
+    distances: Points
+    """(m,) of pairs that are close [m]"""
+
+    def multiply(self, moves: Points) -> tuple[Points, Points]:
+        """By how much the sums (n,) [1 / m^d] and the distances (m,) [m] change with moves (n, 3) [m]."""
+        changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
+        self._launch(self.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
+        return changes, approaches
+
+    def multiply_back(self, changes: Points, approaches: Points) -> Points:
+        """(n, 3) the product with the transpose."""
+        moves = np.zeros((len(changes), 3))
+        self._launch(self.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
+        return moves
+
+    def _launch(self, kernel: Any, **arrays: Points) -> None:
+        launch_on_cpu(kernel, len(self.sums), in_bands=False, equations=self.equations, **arrays)
+
+
+class Relaxation:
+    """Least squares for the places of particles, the first n of the points around, of which some are ``free`` (n,) to
+    move. Those that stay (n,) do not see air. Pairs are listed once, as no particle moves further than it looks."""
+
+    def __init__(self, around: PointsAround, stays: Which, free: Which):
+        starts, ends, listed = around.lists(around.points[: len(free)], stays)
+        self._around, self._stays, self._free, self._most = around, stays, free, int((ends - starts).sum())
+        self._given = {"around": around.on_cpu, "free": free, "starts": starts, "ends": ends, "listed": listed}
+
+    def relaxed(self) -> Points:
+        """Particles (n, d) [m] after `ROUNDS` of least squares for those that are free, or fewer."""
+        spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
+        first, dimension = places.copy(), self._around.points.shape[1]
+        for _ in range(ROUNDS):
+            moves = self._solved()
+            sizes = np.linalg.norm(moves, axis=1, keepdims=True)
+            places += spacing * moves * np.minimum(1.0, FARTHEST / np.maximum(sizes, FARTHEST))
+            if np.abs(places - first).max() > 0.5 * (LISTED - FARTHEST) * spacing:
+                break
+        return places[:, :dimension].copy()
+
+    def _solved(self) -> Points:
+        """(n, 3) moves [spacings] from where the particles are now."""
+        from scipy.sparse.linalg import LinearOperator, lsmr
+
+        spacing, count = self._around.lattice.spacing, len(self._free)
+        equations = self.linearised(NEAR * spacing)
+        errors = density_errors(self._around, equations.sums, self._stays)
+        counted = (~self._stays | (errors > HIGHEST)).astype(np.float64)
+        unit, held = spacing * self._around.volume * counted, ~self._free
+        gaps = NEAR - equations.distances / spacing
+        wanted = np.concatenate([counted * (np.clip(errors, *AIM) - errors), PUSH * gaps])
+
+        def multiply(moves: Points) -> Points:
+            changes, approaches = equations.multiply(moves.reshape(-1, 3))
+            return np.concatenate([unit * changes, PUSH * approaches])
+
+        def multiply_back(wrong: Points) -> Points:
+            moves = equations.multiply_back(unit * wrong[:count], PUSH * wrong[count:])
+            moves[held] = 0.0
+            return moves.ravel()
+
+        product = LinearOperator((len(wanted), 3 * count), multiply, multiply_back, dtype=np.float64)
+        found = lsmr(product, wanted, damp=DAMPING, maxiter=MOST_INNER_ROUNDS, atol=1e-3, btol=1e-3)[0]
+        return np.asarray(found.reshape(-1, 3))
+
+    def linearised(self, close: float) -> Linearised:
+        """The derivatives where the particles are now, and those of distances that are less than ``close`` [m]."""
+        kernels, count, most = self._around.kernels, len(self._free), self._most
+        sums, distances = np.full(count, self._around.own_weight), np.empty(most)
+        close_starts = np.zeros(count + 1, dtype=np.int32)
+        arrays: dict[str, NDArray[Any]] = {
+            "starts": np.zeros(count + 1, dtype=np.int32),
+            "others": np.empty(most, dtype=np.int32),
+            "gradients": np.empty((most, 3)),
+            "own": np.empty((count, 3)),
+            "close_starts": close_starts,
+            "close_others": np.empty(most, dtype=np.int32),
+            "directions": np.empty((most, 3)),
+        }
+        equations = kernels.equations()
+        for name, array in arrays.items():
+            setattr(equations, name, shared(array))
+        found = {"sums": sums, "equations": equations, "distances": distances}
+        launch_on_cpu(kernels.linearise, count, in_bands=False, close=close, **found, **self._given)
+        return Linearised(kernels, equations, sums, distances[: close_starts[-1]])
+
+
+MOST_LOOKS, MOST_ROUNDS = 12, 36
+"""How often it is looked at all particles; rounds of least squares after each look."""
+COMPRESSED, DIGITS = 0.03, 6
+"""By how much the density of a particle that is left out is above the lattice's, relative, and to how many decimals."""
+BESIDE, MOST_OUT = 10.0, 40
+"""Particles are left out one at a time within so many supports, as others have more room then; and how often."""
+ROUND_OFF = 1e-9
+"""By how much, relative, particles of a lattice may be further away than they are."""
+MANY = 20_000
+"""Particles: a line announces the packing of so many, as it takes some seconds or minutes."""
+GRAINS = 2.0**13
+"""Particles move by whole numbers of this part of a spacing, so that round-off, which differs between machines, does
+not show in where they are."""
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Packs particles among fixed points of air and of walls."""
+
+    lattice: RestLattice
+    """The lattice of the fluid at rest."""
+    fixed: Points
+    """(m, d) points of air and of walls [m]"""
+    weights: Points
+    """(m,) what each counts for in the density, a particle being 1 [-]"""
+    air: int
+    """How many of the fixed points, the first ones, are air."""
+    lengths: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
+
+    def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
+        """Places at rest (m, d) [m] of particles (n, d) [m], of which some stay where they are, ``stays`` (n,), and the
+        numbers (m,) of those that there is room for. The last few answers are kept."""
+        arrays = self.fixed, self.weights, self.lengths, particles, stays
+        found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
+        return found.copy(), kept
+
+    def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
+        """(m,) by how much the densities of ``some`` of particles (n, d) [m] are above that of the lattice, relative; 0
+        for those that stay (n,), around which no air is counted, where they are below it."""
+        around = self._around(particles, self.lattice.support)
+        return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
+
+    def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
+        """As `packed`, computed. Of particles that have the rest density already none moves; while some are compressed,
+        as in wedges or where a small body was rounded up to a whole particle, those that are most are left out."""
+        kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
+        for _ in range(MOST_OUT):
+            crowded = self._crowded(found, stays[kept])
+            if not len(crowded):
+                break
+            kept, found = np.delete(kept, crowded), np.delete(found, crowded, axis=0)
+            found = self._at_rest(found, stays[kept])
+        grain = self.lattice.spacing / GRAINS
+        return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
+
+    def _crowded(self, particles: Points, stays: Which) -> Numbers:
+        """The numbers (m,) of particles (n, d) [m] that are compressed, and not less than any beside them."""
+        errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
+        over = np.flatnonzero((errors > COMPRESSED) & ~stays)
+        points, reach = particles[over], BESIDE * self.lattice.support
+        lengths = np.where(self.lengths > 2.0 * reach, self.lengths, 0.0)
+        one, other, _ = pairs_within(points, points, reach, lengths=lengths)
+        less = one[errors[over[one]] < errors[over[other]]]
+        return np.delete(over, np.unique(less))
+
+    def _at_rest(self, particles: Points, stays: Which) -> Points:
+        """Places at rest (n, d) [m] of all particles (n, d) [m]."""
+        found = particles
+        for _ in range(MOST_LOOKS):
+            wrong = self._wrong(found, stays)
+            if not wrong.any():
+                break
+            found = self._settled_near(wrong, found, stays)
+        return found
+
+    def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
+        """Particles (n, d) [m] after those near the ones that are ``wrong`` (n,) were moved. Nothing further away is
+        looked at meanwhile, as there may be very much of it."""
+        support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
+        movable = self._near(particles, wrong, near) & ~stays
+        region = self._near(particles, movable, support)
+        around, part = self._among(particles[~region]), particles[region]
+        part_stays, part_wrong = stays[region], wrong[region]
+        for _ in range(MOST_ROUNDS // ROUNDS):
+            free = around._near(part, part_wrong, near) & movable[region]
+            if not free.any():
+                break
+            seen = around._near(part, free, support)
+            others, reach = around._among(part[~seen]), support + LISTED * self.lattice.spacing
+            part[seen] = Relaxation(others._around(part[seen], reach), part_stays[seen], free[seen]).relaxed()
+            part_wrong[seen] = around._wrong(part, part_stays, seen)
+        found = particles.copy()
+        found[region] = part
+        return found
+
+    def _wrong(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Which:
+        errors = self.errors(particles, stays, some)
+        return np.asarray((errors > HIGHEST) | (errors < LOWEST))
+
+    def _near(self, particles: Points, some: Which, reach: float) -> Which:
+        """(n,) which particles are at most ``reach`` [m] from one of some of them."""
+        others = particles[some]
+        weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
+        found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
+        return found.near(particles)
+
+    def _around(self, particles: Points, reach: float) -> PointsAround:
+        """The surroundings of particles (n, d) [m] up to ``reach`` [m]: one another, and what is fixed."""
+        count = len(particles)
+        points, weights = np.concatenate([particles, self.fixed]), np.append(np.ones(count), self.weights)
+        return PointsAround(self.lattice, points, weights, (count, count + self.air), self.lengths, reach)
+
+    def _among(self, others: Points) -> "Packing":
+        """This packing with further fixed particles (m, d) [m]."""
+        weights = np.append(self.weights, np.ones(len(others)))
+        return replace(self, fixed=np.concatenate([self.fixed, others]), weights=weights)
+
+
+@lru_cache(maxsize=8)
+def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, Numbers]:
+    """See `Packing.packed`: simulations of one scene are made more than once."""
+    *numbers, stays = arrays
+    fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
+    packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)
+    is_long = shape[0] > MANY
+    with timed_note(f"Packing the particles of round bodies, {shape[0]:,} in all") if is_long else nullcontext():
+        return packing.settled(particles.reshape(shape), np.frombuffer(stays, dtype=bool))

@@ -1,1 +1,0 @@
-"""Particles moved until a body of fluid has its rest density everywhere."""

@@ -1,0 +1,303 @@
+"""Solids to the discretisation: signed distances, faces, volume and moments, in float64."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+
+from cortado.discretise.shapes import Numbers, Points, whole_origin
+from cortado.discretise.shapes import corners as corners_of
+
+
+@dataclass(frozen=True)
+class Faces:
+    """A closed surface as flat faces, edges in 2-D and triangles in 3-D; its inside is on their left, or behind
+    them."""
+
+    vertices: Points
+    """(m, d) [m]"""
+    corners: Numbers
+    """(k, d) numbers of the vertices of each face, in 3-D counterclockwise as seen from outside"""
+
+    def moved(self, turn: Points, position: Points) -> "Faces":
+        """The faces turned by a matrix (d, d) and then moved (d,) [m]."""
+        return Faces(self.vertices @ turn.T + position, self.corners)
+
+    def reversed(self) -> "Faces":
+        """The faces of the outside."""
+        return Faces(self.vertices, self.corners[:, ::-1])
+
+
+def box_faces(half: Points) -> Faces:
+    """The faces of a box about the origin with half its sides (d,) [m]."""
+    if len(half) == 2:
+        return polygon_faces(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Faces(half * signs, np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))]))
+
+
+def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
+    """The faces of the part of a box, between corners (d,) [m], that is below a plane with a unit normal (d,) at a
+    height along it [m]."""
+    from scipy.spatial import ConvexHull
+
+    ends = corners_of(lower, upper)
+    heights = ends @ normal - height
+    first, second = np.nonzero((heights[:, None] < 0.0) & (heights[None] > 0.0))
+    edges = (ends[first] != ends[second]).sum(axis=1) == 1
+    first, second = first[edges], second[edges]
+    along = (heights[first] / (heights[first] - heights[second]))[:, None]
+    hull = ConvexHull(np.concatenate([ends[heights <= 0.0], ends[first] + along * (ends[second] - ends[first])]))
+    if len(lower) == 2:
+        return polygon_faces(hull.points[hull.vertices])
+    a, b, c = np.moveaxis(hull.points[hull.simplices], 1, 0)
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
+    return Faces(hull.points, np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64))
+
+
+def polygon_faces(corners: Points) -> Faces:
+    """The edges of a polygon (m, 2) [m], given either way round."""
+    following = np.roll(corners, -1, axis=0)
+    (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
+    area = (x * y_next - x_next * y).sum()
+    ordered = corners if area > 0.0 else corners[::-1]
+    numbers = np.arange(len(corners))
+    return Faces(ordered, np.stack([numbers, np.roll(numbers, -1)], axis=1))
+
+
+def arc(centre: Points, radius: float, start: float, end: float, fine: float) -> Points:
+    """(m, 2) [m] points of an arc from one angle to another [rad], about ``fine`` [m] apart."""
+    count = max(int(np.ceil(abs(end - start) * radius / fine)), 4)
+    angles = np.linspace(start, end, count + 1)
+    return centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
+    """The faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. Its profile is its cut with
+    a plane through the axis, the same on both sides."""
+    count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
+    angles = 2.0 * np.pi * np.arange(count) / count
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    first, second = [k for k in range(3) if k != axis]
+    mirrored = -1.0 if axis == 1 else 1.0  # x, z and y make a left-handed frame
+    vertices, corners = list[Points](), list[Numbers]()
+    for start, end in outer_edges(profile):
+        base = len(vertices) * count
+        for radius, height in (start, end):
+            ring = np.full((count, 3), height)
+            ring[:, first], ring[:, second] = radius * around[:, 0], mirrored * radius * around[:, 1]
+            vertices.append(ring)
+        here, there = base + np.arange(count), base + np.roll(np.arange(count), -1)
+        if start[0] > 0.0:
+            corners.append(np.stack([here, there, here + count], axis=1))
+        if end[0] > 0.0:
+            corners.append(np.stack([there, there + count, here + count], axis=1))
+    return Faces(np.concatenate(vertices), np.concatenate(corners))
+
+
+def outer_edges(profile: Faces) -> Points:
+    """(k, 2, 2) [m] starts and ends of the edges of a profile, cut off at the axis."""
+    edges = profile.vertices[profile.corners]
+    return np.array([[_cut(start, end), _cut(end, start)] for start, end in edges if max(start[0], end[0]) > 0.0])
+
+
+def _cut(start: Points, end: Points) -> Points:
+    """(2,) the start of an edge, or where the edge crosses the axis if it starts beyond."""
+    if start[0] >= 0.0:
+        return start
+    return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
+
+
+NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
+"""Of Gauss's quadrature with three points from 0 to 1, exact for polynomials of degree 5."""
+WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Volume, centroid and second moments of a solid in d dimensions."""
+
+    volume: float
+    """[m^d]"""
+    centre: Points
+    """(d,) its centroid [m]"""
+    second: Points
+    """(d, d) the integrals of products of coordinates about the centroid [m^(d + 2)]"""
+
+
+def enclosed_moments(corners: Points, weights: Points) -> Moments:
+    """The moments of what edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, counterclockwise as seen from outside and
+    each with a weight (k,), by integrals over the surface (Mirtich 1996): they are bases of cones about a place near
+    by."""
+    d = corners.shape[1]
+    origin = whole_origin(corners.reshape(-1, d))
+    about = corners - origin
+    sums, (first, second) = about.sum(axis=1), np.moveaxis(about, 1, 0)[:2]
+    cones = weights * (first[:, 0] * second[:, 1] - second[:, 0] * first[:, 1] if d == 2 else np.linalg.det(about))
+    volume = float(cones.sum()) / factorial(d)
+    middle = np.asarray((cones[:, None] * sums).sum(axis=0) / ((d + 1.0) * cones.sum()))
+    products = np.einsum("k,kci,kcj->ij", cones, about, about) + np.einsum("k,ki,kj->ij", cones, sums, sums)
+    return Moments(volume, origin + middle, products / factorial(d + 2) - volume * np.outer(middle, middle))
+
+
+def revolved_moments(edges: Points, axis: int) -> Moments:
+    """The moments of a solid of revolution about an axis of space, by the edges (k, 2, 2) [m] of its profile on one
+    side of the axis, distance from it and height, counterclockwise; those on the axis may be left out."""
+    height = edges[..., 1].mean()
+    start, end = edges[:, 0], edges[:, 1]
+    x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
+
+    def integral(p: int, q: int) -> float:
+        """The integral of x^p (y - height)^q over the profile, by Green's theorem."""
+        return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
+
+    volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[axis]
+    middle = integral(1, 1) / integral(1, 0)
+    across, upright = np.pi * integral(3, 0), 2.0 * np.pi * integral(1, 2) - volume * middle**2
+    second = across * np.eye(3) + (upright - across) * np.outer(along, along)
+    return Moments(volume, (height + middle) * along, second)
+
+
+class Solid(ABC):
+    """A closed body in d dimensions."""
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether all of it is in the box around it."""
+        return True
+
+    @abstractmethod
+    def extent(self) -> tuple[Points, Points]:
+        """The box around it: lower and upper, each (d,) [m]."""
+
+    @abstractmethod
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are from the surface, negative inside [m]."""
+
+    @abstractmethod
+    def nearest(self, points: Points) -> Points:
+        """(n, d) [m] the points of the surface that are nearest to points (n, d) [m]."""
+
+    @abstractmethod
+    def faces(self, fine: float) -> Faces:
+        """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
+
+    def moments(self) -> Moments:
+        """Its volume, centroid and second moments, to round-off; solids that may move freely have them."""
+        raise NotImplementedError(f"{type(self).__name__} has no moments")
+
+    def shown_faces(self, fine: float) -> Faces:
+        """The `faces` for pictures: of an unbounded solid those within the box around it."""
+        return self.faces(fine)
+
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        """(n,) the `distance` [m] of points (n, d) [m] where its size is less than a reach [m]; elsewhere any number of
+        the same sign that is at least as large as the reach. Solids with many faces find it sooner."""
+        return self.distance(points)
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        """Points of the surface (n, d) [m], each for an area of fine^(d - 1) [m^(d - 1)], and unit vectors (n, d)
+        outwards; None of a solid that has no quicker way to them than a lattice around it."""
+        return None
+
+    def outward(self, points: Points) -> Points:
+        """(n, d) unit vectors away from the solid at points (n, d) [m] that are not on its surface."""
+        across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
+        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
+
+
+@dataclass(frozen=True)
+class Placed(Solid):
+    """A solid that is turned about the origin and then moved."""
+
+    solid: Solid
+    position: Points
+    """(d,) where its origin is [m]"""
+    turn: Points
+    """(d, d) the rotation matrix"""
+
+    @property
+    def is_bounded(self) -> bool:
+        return self.solid.is_bounded
+
+    def extent(self) -> tuple[Points, Points]:
+        lower, upper = self.solid.extent()
+        middle, half = self.turn @ (0.5 * (lower + upper)), np.abs(self.turn) @ (0.5 * (upper - lower))
+        return self.position + middle - half, self.position + middle + half
+
+    def distance(self, points: Points) -> Points:
+        return self.solid.distance((points - self.position) @ self.turn)
+
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        if not self.solid.is_bounded:
+            return self.solid.distance_up_to((points - self.position) @ self.turn, reach)
+        lower, upper = self.extent()
+        near = ((points > lower - reach) & (points < upper + reach)).all(axis=1)
+        found = np.full(len(points), np.inf)
+        found[near] = self.solid.distance_up_to((points[near] - self.position) @ self.turn, reach)
+        return found
+
+    def nearest(self, points: Points) -> Points:
+        return self.position + self.solid.nearest((points - self.position) @ self.turn) @ self.turn.T
+
+    def faces(self, fine: float) -> Faces:
+        return self.solid.faces(fine).moved(self.turn, self.position)
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        found = self.solid.own_feet(fine)
+        return None if found is None else (self.position + found[0] @ self.turn.T, found[1] @ self.turn.T)
+
+
+@dataclass(frozen=True)
+class Hollow(Solid):
+    """All of space but a shape: a tank with walls of any thickness."""
+
+    cavity: Solid
+
+    @property
+    def is_bounded(self) -> bool:
+        return False
+
+    def extent(self) -> tuple[Points, Points]:
+        return self.cavity.extent()
+
+    def distance(self, points: Points) -> Points:
+        return -self.cavity.distance(points)
+
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        return -self.cavity.distance_up_to(points, reach)
+
+    def nearest(self, points: Points) -> Points:
+        return self.cavity.nearest(points)
+
+    def faces(self, fine: float) -> Faces:
+        return self.cavity.faces(fine).reversed()
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        found = self.cavity.own_feet(fine)
+        return None if found is None else (found[0], -found[1])
+
+
+@dataclass(frozen=True)
+class Mass:
+    """Volume and inertia of a solid with a density of 1."""
+
+    volume: float
+    """[m^d]"""
+    inertia: Points
+    """(3, 3) about the centroid [m^(d + 2)]; in 2-D all but the entry about z is 0."""
+
+    @classmethod
+    def of(cls, solid: Solid) -> "Mass":
+        """The mass of a solid, by its moments."""
+        moments = solid.moments()
+        about = np.trace(moments.second) * np.eye(3)
+        if len(moments.centre) == 2:
+            return cls(moments.volume, np.diag([0.0, 0.0, about[2, 2]]))
+        return cls(moments.volume, about - moments.second)
+
+    def in_volumes(self, unit: float) -> "Mass":
+        """This mass with volumes counted in units of so many m^d."""
+        return Mass(self.volume / unit, self.inertia / unit)

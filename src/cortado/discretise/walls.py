@@ -1,0 +1,393 @@
+"""Walls of boxes and cups, layer by layer, and what wall particles count for in the density, in float64."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cortado.discretise.calibration import lattice_offsets
+from cortado.discretise.pairs import apart, pairs_within
+from cortado.discretise.room import Room
+from cortado.discretise.shapes import Points, Rows, disc, grid
+from cortado.discretise.smoothing import SmoothingKernel
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+
+def nearest_cells(length: float, spacing: float) -> int:
+    """How many cells fill a length [m] best, at least 1."""
+    return max(int(np.floor(length / spacing + 0.5)), 1)
+
+
+def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
+    """(n, d) one layer around a box, ``depth`` outside of it: faces, edges and corners, each point once.
+
+    Along a face the points continue the lattice inside; an axis whose length is no multiple of the spacing is stretched
+    a little between its walls. A periodic axis has no wall. Axis by axis: outside on this axis, inside on those before
+    it, either on those after it.
+    """
+    inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
+    outside = [
+        np.zeros(0) if open_axis else np.array([a - depth, b + depth])
+        for a, b, open_axis in zip(lower, upper, periodic, strict=True)
+    ]
+    both = [np.sort(np.concatenate(pair)) for pair in zip(inside, outside, strict=True)]
+    return np.concatenate([grid([*inside[:axis], outside[axis], *both[axis + 1 :]]) for axis in range(len(inside))])
+
+
+def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
+    """(n, 3) the walls of an upright cup whose base is centred on the origin, the third axis along its height.
+
+    The side: rings ``depth`` outside of the radius, about a spacing apart along and across. The base, and the lid if
+    there is one: the lattice that fluid in the cup has, ``depth`` outside, and a ring that continues the side.
+    """
+    side = ring(radius + depth, spacing)
+    end = np.concatenate([disc(radius, spacing, 2), side])
+    ends = [-depth, height + depth] if lid else [-depth]
+    levels = _cells(0.0, height, nearest_cells(height, spacing))
+    return np.concatenate([stacked(side, levels), stacked(end, np.array(ends))])
+
+
+def ring(radius: float, spacing: float) -> Points:
+    """(n, 2) points on a circle, about a spacing apart."""
+    count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
+    angles = 2.0 * np.pi * np.arange(count) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def _cells(lower: float, upper: float, count: int) -> Points:
+    """(count,) the centres of equal cells between two ends."""
+    return lower + (upper - lower) * (np.arange(count) + 0.5) / count
+
+
+def stacked(flat: Points, levels: Points) -> Points:
+    """(levels n, 3) a plane set of points (n, 2) repeated at every level."""
+    return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])
+
+
+OVERLAP = 0.8
+"""How far from the side of a cup, over the reach, fluid on the base may rest upright."""
+
+
+@dataclass(frozen=True)
+class Places(Rows):
+    """Places beside walls where fluid may rest, each with the axes of the lattice that it would rest on."""
+
+    points: Points
+    """(n, d) [m]"""
+    axes: Points
+    """(n, d, d) a unit vector a row"""
+
+    @classmethod
+    def upright(cls, points: Points) -> "Places":
+        """Places (n, d) [m] on lattices along the axes of space."""
+        dimension = points.shape[1]
+        return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
+
+
+def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
+    """Places less than ``reach`` [m] from a wall of a box, the first of them half a spacing from it.
+
+    Axis by axis: near a wall on this axis, far from all on those before it, anywhere on those after it.
+    """
+    every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
+    beside = [
+        np.zeros(len(x), dtype=bool) if open_axis else np.minimum(x - a, b - x) < reach
+        for x, a, b, open_axis in zip(every, lower, upper, periodic, strict=True)
+    ]
+    near, far = [x[c] for x, c in zip(every, beside, strict=True)], [x[~c] for x, c in zip(every, beside, strict=True)]
+    blocks = [grid([*far[:axis], near[axis], *every[axis + 1 :]]) for axis in range(len(every))]
+    return Places.upright(np.concatenate(blocks))
+
+
+def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
+    """Places less than ``reach`` [m] from a wall of an upright cup whose base is centred on the origin, the third axis
+    along its height.
+
+    Along the side the lattices are turned as the side is; on the base, up to where the side is hardly seen, they are
+    those of fluid in the cup. The uppermost part of an open cup, which may overflow, has none.
+    """
+    levels = _between(0.0, height, False, spacing)
+    closed = levels if lid else levels[levels < height - reach]
+    ends = closed[np.minimum(closed, height - closed) < reach] if lid else closed[closed < reach]
+    radii = radius - spacing * (np.arange(max(int(np.ceil(reach / spacing)), 1)) + 0.5)
+    rings = [ring(value, spacing) for value in radii[radii > 0.0]]
+    flat = np.concatenate([np.zeros((0, 2)), *rings])
+    side = stacked(flat, closed)
+    outward = np.pad(side[:, :2] / np.linalg.norm(side[:, :2], axis=1, keepdims=True), ((0, 0), (0, 1)))
+    up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), side.shape)
+    middle = disc(radius, spacing, 2)
+    inner = Places.upright(stacked(middle[np.linalg.norm(middle, axis=1) <= radius - OVERLAP * reach], ends))
+    return Places.joined([Places(side, np.stack([outward, np.cross(up, outward), up], axis=1)), inner])
+
+
+def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
+    """Places along an axis: from each wall on, a spacing apart, or evenly along a period."""
+    count = nearest_cells(upper - lower, spacing)
+    cells = np.arange(count, dtype=np.float64) + 0.5
+    if periodic:
+        return np.asarray(lower + (upper - lower) / count * cells)
+    return np.asarray(np.where(cells < 0.5 * count, lower + spacing * cells, upper - spacing * cells[::-1]))
+
+
+ENDS = 6.0
+"""In supports: what is this far from an edge has the same weight as what is further, to 1e-6 of it and better."""
+WHOLE = 1e-9
+"""In cells: by how much a side may be off a whole number of them."""
+
+
+def short_box(
+    lower: Points, upper: Points, spacing: float, support: float
+) -> tuple[Points, Callable[[Points], Points]]:
+    """A shorter box with wall particles of the same weights as a box between corners (d,) [m], as these repeat far from
+    edges and corners: its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of the long
+    box to those of the shorter one.
+
+    Cells of a spacing [m], beside fluid with a support [m], are left out in the middle of long sides, of those that are
+    a whole number of cells.
+    """
+    ends, lengths = int(np.ceil(ENDS * support / spacing)), upper - lower
+    cells = np.array([nearest_cells(length, spacing) for length in lengths])
+    whole = np.abs(lengths / spacing - cells) < WHOLE * cells
+    left_out = np.where(whole, np.maximum(cells - 2 * ends - 1, 0), 0)
+
+    def folded(points: Points) -> Points:
+        numbers = np.floor((points - lower) / spacing)
+        middle = lower + (ends + 0.5) * spacing
+        behind = numbers >= ends + left_out + 1
+        found = np.where(behind, points - left_out * spacing, np.where(numbers < ends, points, middle))
+        return np.where(left_out > 0, found, points)
+
+    return np.where(left_out > 0, upper - left_out * spacing, upper), folded
+
+
+SHALLOW = 0.4
+"""Depth of the shallow layer, in spacings; there is one where the second lattice layer of the fluid sees the wall.
+
+At half a spacing the deep layer would have to be so steep that it lies where the kernel ends."""
+
+
+@dataclass(frozen=True)
+class WallLayers:
+    """The layers of wall particles behind a flat wall, the deepest last."""
+
+    depths: tuple[float, ...]
+    """Distances behind the surface of the container [m]."""
+    weights: tuple[float, ...]
+    """Weights of a particle of each layer in the density, a fluid particle being 1."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Sums over the points of a lattice plane, beside the sum of W over the whole lattice."""
+
+    kernel: SmoothingKernel
+    spacing: float
+    """[m]"""
+    support: float
+    """[m]"""
+    dimension: int
+
+    @cached_property
+    def flat(self) -> np.ndarray:
+        """(m, d - 1) the points of a plane that are less than a support away along it [m]."""
+        return np.unique(lattice_offsets(self.spacing, self.support, self.dimension)[:, 1:], axis=0)
+
+    def across(self, distance: float) -> np.ndarray:
+        """(m, d) separations [m] from the points of a plane at a distance [m], whose first axis is its normal."""
+        return np.hstack([np.full((len(self.flat), 1), distance), self.flat])
+
+    def weight(self, distance: float) -> float:
+        """Sum of W over a plane at a distance [m]."""
+        distances = np.linalg.norm(self.across(distance), axis=1)
+        return float(self.kernel.weight(distances, self.dimension, self.support).sum())
+
+    def slope(self, distance: float) -> float:
+        """The derivative of `weight` by the distance."""
+        return float(self.kernel.gradient(self.across(distance), self.support)[:, 0].sum())
+
+
+def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayers:
+    """The layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
+
+    - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
+    - a uniform pressure pushes no particle of the first layer: what a wall adds to the density of a particle is steep
+      enough to balance the pressure of the particle and that of all its neighbours.
+
+    One layer is enough where the second layer of the fluid does not see the wall, with a support of up to two spacings.
+    """
+    planes = Planes(kernel, spacing, support, dimension)
+    below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
+    missing = np.array([sum(map(planes.weight, below)), sum(map(planes.weight, below[1:]))])
+    pull = 2.0 * sum(map(planes.slope, below))
+    heights = spacing * np.array([0.5, 1.5])
+
+    two = missing[1] > 1e-6 * missing[0]
+
+    def depths(deepest: float) -> np.ndarray:
+        return np.array([SHALLOW * spacing, deepest] if two else [deepest])
+
+    def weights(deepest: float) -> np.ndarray:
+        """With them the first layers of the fluid, as many as the wall has, have the rest density."""
+        layers = depths(deepest)
+        seen = [[planes.weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
+        return np.linalg.solve(np.array(seen), missing[: len(layers)])
+
+    def push(deepest: float) -> float:
+        slopes = [planes.slope(heights[0] + depth) for depth in depths(deepest)]
+        return float(weights(deepest) @ slopes - pull)
+
+    from scipy.optimize import brentq
+
+    deepest = brentq(push, 0.5 * spacing, support - (0.5 + 1e-3) * spacing, xtol=1e-14 * spacing)
+    return WallLayers(tuple(depths(deepest).tolist()), tuple(weights(deepest).tolist()))
+
+
+STIFFNESS = 3e-3
+"""How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
+stays that of a flat wall."""
+UNEVEN_STIFFNESS = 0.06
+"""The same where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes there."""
+LEAST, ROUNDS = 0.6, 4
+"""Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
+less are set to it, and the others found anew."""
+BALANCE = 0.02
+"""What the push of a uniform pressure counts beside an error of the density. Densities alone hardly say how steep two
+layers are: round a cup they would make them so shallow that fluid passes. At 0.1 corners would be too dense."""
+RAISED = 3.0
+"""In spacings: how far along the first axis of a place, away from a solid, one looks how much room there is."""
+CHUNK = 4096
+"""How many places are looked at at a time: bounds the memory."""
+
+
+@dataclass(frozen=True)
+class RestLattice:
+    """The lattice of the fluid at rest, and the smoothing kernel of sums over it."""
+
+    kernel: SmoothingKernel
+    spacing: float
+    """[m]"""
+    support: float
+    """[m]"""
+
+    def sums(self, separations: np.ndarray) -> np.ndarray:
+        """(m, 1 + d) W, and the gradient of W times the spacing, at separations (m, d) [m], both over the sum of W on
+        the lattice [-]."""
+        dimension = separations.shape[1]
+        offsets = lattice_offsets(self.spacing, self.support, dimension)
+        total = self.kernel.weight(np.linalg.norm(offsets, axis=1), dimension, self.support).sum()
+        weights = self.kernel.weight(np.linalg.norm(separations, axis=1), dimension, self.support)
+        gradients = self.kernel.gradient(separations, self.support)
+        return np.asarray(np.column_stack([weights, self.spacing * gradients]) / total)
+
+    def missing(self, places: Places, room: Room) -> Points:
+        """(n, 1 + d) the part of the `sums` over a lattice at each of the places that lies outside of a room. A lattice
+        point is outside by as much as its cell is."""
+        dimension = places.points.shape[1]
+        offsets = lattice_offsets(self.spacing, self.support, dimension)
+        cells = places.points[:, None] + offsets @ places.axes
+        raised = places.points + RAISED * self.spacing * places.axes[:, 0]
+        furthest = (RAISED + 0.5) * self.spacing + self.support
+        empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
+        open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * self.spacing
+        shares = np.ones(open_cells.shape)
+        shares[~open_cells] = room.cell_shares(cells[~open_cells], self.spacing)
+        found = (1.0 - shares) @ self.sums(-offsets)
+        found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
+        return np.asarray(found)
+
+
+Fit = Callable[["csr_array", Points], Points]
+"""Finds changes (b,) of weights, relative to those of a flat wall, given a matrix (m, b) and what its product with them
+is to be, (m,)."""
+
+
+def wall_weights(
+    walls: Points,
+    flat: Points,
+    places: Places,
+    lattice: RestLattice,
+    room: Room,
+    lower: Points,
+    fit: Fit,
+    known: int = 0,
+) -> Points:
+    """(b,) weights of wall particles in the density [-], a fluid particle being 1.
+
+    With them the lattice has the rest density at all places, and a uniform pressure pushes no particle less than a
+    spacing from a wall, as nearly as can be, in the sense of least squares: along faces, edges and corners, in a cup,
+    and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is twice
+    that of the fluid that is missing.
+
+    Args:
+        walls: (b, d) wall particles [m].
+        flat: (b,) their weights in a flat wall [-], or those that are known.
+        places: where fluid may rest.
+        lattice: of the fluid at rest.
+        room: where fluid may be.
+        lower: (d,) where the period begins [m].
+        fit: `even_changes`, or `uneven_changes` where particles are on no lattice.
+        known: how many of the wall particles, the last ones, have weights that are known.
+    """
+    from scipy.sparse import vstack
+
+    sought, changes = len(walls) - known, np.zeros(len(walls))
+    if not sought or not len(places):
+        return flat.copy()
+    chunks = [places.some(slice(start, start + CHUNK)) for start in range(0, len(places), CHUNK)]
+    demands = [_demands(walls, flat, chunk, lattice, room, lower) for chunk in chunks]
+    sums = vstack([part for part, _ in demands]).tocsr()
+    left = np.concatenate([part for _, part in demands]) - sums.sum(axis=1)
+    own = sums[:, :sought]
+    seen = np.diff(own.indptr) > 0
+    changes[:sought] = fit(own[seen], left[seen])
+    return np.asarray(flat * (1.0 + changes), dtype=np.float64)
+
+
+def _demands(
+    walls: Points, flat: Points, places: Places, lattice: RestLattice, room: Room, lower: Points
+) -> tuple["csr_array", Points]:
+    """A matrix (m, b) of sums over wall particles at places, by their weights over the flat ones, and the sums (m,)
+    that fluid at rest needs there."""
+    from scipy.sparse import coo_array, vstack
+
+    place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
+    separations = apart(places.points[place] - walls[wall], room.periods)
+    shape, indices = (len(places), len(walls)), (place.astype(np.int32), wall.astype(np.int32))
+    seen = flat[wall, None] * lattice.sums(separations)
+    densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
+    missing = lattice.missing(places, room)
+    near = ~room.contains(places.points, -lattice.spacing)
+    sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
+    return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
+
+
+def even_changes(sums: "csr_array", wanted: Points) -> Points:
+    """The `Fit` for wall particles on lattices, whose weights are at least 0."""
+    from scipy.optimize import lsq_linear
+    from scipy.sparse import eye_array, vstack
+
+    count = sums.shape[1]
+    system = vstack([sums, STIFFNESS * eye_array(count)]).tocsr()
+    right = np.concatenate([wanted, np.zeros(count)])
+    return np.asarray(lsq_linear(system, right, bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x)
+
+
+def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
+    """The `Fit` for particles that are about evenly spaced, whose weights are at least `LEAST` of those of a flat
+    wall."""
+    from scipy.sparse.linalg import lsmr
+
+    changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)
+    for _ in range(ROUNDS):
+        some = sums[:, free]
+        held = wanted - sums[:, ~free] @ changes[~free]
+        changes[free] = lsmr(some, held, damp=UNEVEN_STIFFNESS, atol=1e-6, btol=1e-6)[0]
+        if (changes[free] >= LEAST - 1.0).all():
+            break
+        free &= changes >= LEAST - 1.0
+        changes[~free] = LEAST - 1.0
+    return np.maximum(changes, LEAST - 1.0)
