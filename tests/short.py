@@ -25,6 +25,7 @@ KEPT = {
         "test_a_body_and_fluid_in_free_space_keep_their_momentum[2]",
         "test_derivatives_of_bodies[plane]",
     },
+    "test_freeze": {"test_texts_are_the_same"},
     "test_held_water": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
     "test_image_loss": {"test_the_whole_chain_from_gravity_to_the_picture[True]"},
     "test_implicit_pressure": {"test_at_the_fixed_point_it_is_the_exact_gradient[three phases-1e-05]"},
