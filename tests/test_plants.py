@@ -28,7 +28,6 @@ UNNAMED = {
     "sph.implicit_viscosity": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.images": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
     "solvers.projection.coarse_residual": {"coarse_sums.push_back"},
-    "solvers.projection.motion": {"shift_functions.back", "change_functions.back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),
         *("projection_sums.divergence_back", "projection_sums.velocity_gradient_back", "projection_sums.push_back"),

@@ -21,6 +21,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.pair_loops import Body, Types, over_fluid, summed, type_name, zero
 from cortado.particles.terms import NUMBERS, Term, array_of, own_entry
@@ -33,7 +34,7 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
     of its sums. It returns the adjoints of the entries of particle i in each array, and of each of the others.
     ``module`` is the Warp module of the function, if not that of the file."""
     term = _differentiable(make, d)
-    arrays = {**term.arrays, **_bars(term)}
+    arrays = {**term.arrays, **bars_of(term)}
     loop = over_fluid(d, arrays, _adjoint(term), ahead=True, numbered="j" in term.parameters)
     return _made(term, d, arrays, term.others, (*term.arrays.values(), *term.others.values()), loop, module)
 
@@ -60,14 +61,16 @@ def _made(
     term: Term, d: Discretisation, arrays: Types, others: Types, results: Iterable[Any], loop: str, module: Any
 ) -> Any:
     module = module or wp.get_module(term.function.__module__)
-    return summed(term.name, d, arrays, others, results, loop, {"_work": _work(term, d, module), "_wp": wp}, module)
+    return summed(
+        term.name, d, arrays, others, results, loop, {"_work": work_of(term, d.precision, module), "_wp": wp}, module
+    )
 
 
-def _work(term: Term, d: Discretisation, module: Any) -> Any:
+def work_of(term: Term, precision: Precision, module: Any) -> Any:
     """The Warp function T . bar of the arguments of a term and of an adjoint of each of its results."""
-    types, bars = {**term.parameters, **_bars(term)}, _bars(term)
+    types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
-        f"_term_{n} * {bar}" if kind is d.precision.real else f"_wp.dot(_term_{n}, {bar})"
+        f"_term_{n} * {bar}" if kind is precision.real else f"_wp.dot(_term_{n}, {bar})"
         for n, (bar, kind) in enumerate(bars.items())
     )
     text = f"""\
@@ -78,11 +81,11 @@ def _work({", ".join(types)}):
     known: dict[str, Any] = {"_term": wp.func(term.function, module=module), "_wp": wp}
     exec(text, known)
     made: Any = known["_work"]
-    made.__annotations__ = {**types, "return": d.precision.real}
+    made.__annotations__ = {**types, "return": precision.real}
     return wp.Function(made, f"{term.name}_work", "", module=module, source=text)
 
 
-def _bars(term: Term) -> dict[str, Any]:
+def bars_of(term: Term) -> dict[str, Any]:
     """Names and types of the adjoints of the results."""
     return {f"_bar_{n}": kind for n, kind in enumerate(term.results)}
 
@@ -93,14 +96,14 @@ def _with_tangents(types: Types) -> dict[str, Any]:
 
 def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
     """The line that assigns the derivative of T . bar by each parameter to ``label_parameter``."""
-    names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *_bars(term)))
+    names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *bars_of(term)))
     return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
 
 
 def _adjoint(term: Term) -> Body:
     def body(of_j: Mapping[str, str]) -> Iterator[str]:
-        yield _gradient("own", term, term.seen_from_i(of_j), map(own_entry, _bars(term)))
-        yield _gradient("other", term, term.seen_from_j(of_j), (of_j[bar] for bar in _bars(term)))
+        yield _gradient("own", term, term.seen_from_i(of_j), map(own_entry, bars_of(term)))
+        yield _gradient("other", term, term.seen_from_j(of_j), (of_j[bar] for bar in bars_of(term)))
         for n, array in enumerate(term.arrays):
             shares = {
                 f"{array}_i": f"_own_{array}_i",
@@ -116,7 +119,7 @@ def _adjoint(term: Term) -> Body:
 
 def _tangent(term: Term, d: Discretisation) -> Body:
     """Of each component of each result the gradient times the tangents of the parameters."""
-    kinds = {**term.parameters, **_bars(term)}
+    kinds = {**term.parameters, **bars_of(term)}
 
     def change_of(name: str, of_j: Mapping[str, str]) -> str:
         array = array_of(name)

@@ -49,6 +49,10 @@ class Discretisation:
         """The Warp module of the kernels of forward mode, which no gradient needs."""
         return self._module("tangent", topic, False)
 
+    def modules(self, topic: str) -> tuple[Any, Any, Any]:
+        """The Warp modules of forward, tangent and adjoint kernels."""
+        return self.module(True, topic), self.tangent_module(topic), self.module(False, topic)
+
     def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
         images = "_periodic" * self.periodic + "_moving" * self.moving
         lanes = "" if self.lanes == 1 else f"_{self.lanes}_lanes"

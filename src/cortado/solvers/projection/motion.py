@@ -26,18 +26,17 @@ where x_K are the positions after the last repair, and A is that of the last ite
 The repairs of density begin from x + dt v + delta.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
 
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.pointwise import pointwise_kernels
 from cortado.solvers.projection.effects import effect_functions, weights_type
-from cortado.solvers.projection.surroundings import entries
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type
 
@@ -59,323 +58,68 @@ WEAK = 0.004
 """Of c, below which a pull counts with its square."""
 
 
-@dataclass(frozen=True)
-class ShiftFunctions:
-    """Warp functions of one particle."""
-
-    shift: Any
-    """delta of A, the sums over j in grad C and of p, M, g, gamma, the weights, k = dt p, m, dt and s."""
-    back: Any
-    """For an adjoint of delta, those of all but s."""
-
-
-@cache
-def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftFunctions:
-    """In 2 or 3 dimensions, in a Warp module. A is sum_j v_ij g_ij^T."""
+def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
+    """delta of A = sum_j v_ij g_ij^T, k = dt p, and what surrounds a particle; ``beside`` is gamma."""
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     inverse = effect_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
     farthest, away = wp.constant(real(FARTHEST)), wp.constant(real(AWAY))
     surface, pulled, weak = (wp.constant(real(value)) for value in (SURFACE**2, PULLED, WEAK))
 
-    @wp.func
     def shift(
-        A: matrix,
-        crowd: vector,
-        apart: vector,
-        M: matrix,
-        g: vector,
-        gamma: vector,
-        weights: weights4,
-        k: real,
-        m: real,
-        dt: real,
         spacing: real,
+        time_step: real,
+        A_i: matrix,
+        k_i: real,
+        m_i: real,
+        M_i: matrix,
+        g_i: vector,
+        beside_i: vector,
+        crowd_i: vector,
+        apart_i: vector,
+        weights_i: weights4,
     ) -> vector:
-        G = A * inverse(M)
-        turned = dt * dt * wp.ddot(G, G)
+        G = A_i * inverse(real(0.5) * (M_i + wp.transpose(M_i)))  # so that the adjoint of M is symmetric, as M is
+        turned = time_step * time_step * wp.ddot(G, G)
         strength = rate * turned / (wp.sqrt(turned + least * least) + least)
-        pull = weights[3] * dt * wp.max(-k, real(0.0)) / (m * spacing * spacing)
+        pull = weights_i[3] * time_step * wp.max(-k_i, real(0.0)) / (m_i * spacing * spacing)
         strength += pulled * pull * pull / ((pull + weak) * wp.sqrt(pull + weak))
-        out, slope = g + gamma, crowd + gamma
+        out, slope = g_i + beside_i, crowd_i + beside_i
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
         strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))
-        wish = strength * (away * apart - (spacing * spacing * weights[2]) * along)
+        wish = strength * (away * apart_i - (spacing * spacing * weights_i[2]) * along)
         most = farthest * spacing
         return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
 
-    @wp.func(module=module)
-    def work(
-        A: matrix,
-        crowd: vector,
-        apart: vector,
-        M: matrix,
-        g: vector,
-        gamma: vector,
-        weights: weights4,
-        k: real,
-        m: real,
-        dt: real,
-        spacing: real,
-        bar: vector,
-    ) -> real:
-        return wp.dot(shift(A, crowd, apart, M, g, gamma, weights, k, m, dt, spacing), bar)
-
-    @wp.func(module=module)
-    def back(
-        A: matrix,
-        crowd: vector,
-        apart: vector,
-        M: matrix,
-        g: vector,
-        gamma: vector,
-        weights: weights4,
-        k: real,
-        m: real,
-        dt: real,
-        spacing: real,
-        bar: vector,
-    ):
-        by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt, _s, _bar = wp.grad(work)(
-            A, crowd, apart, M, g, gamma, weights, k, m, dt, spacing, bar
-        )
-        even = real(0.5) * (by_M + wp.transpose(by_M))
-        return by_A, by_crowd, by_apart, even, by_g, by_gamma, by_weights, by_k, by_m, by_dt
-
-    return ShiftFunctions(shift, back)
+    return shift
 
 
 @cache
-def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
     """The kernels of delta."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
-    shift_of = shift_functions(precision, dimension, module).shift
-    along = shift_functions(precision, dimension, tangent_module).back
-    back = shift_functions(precision, dimension, adjoint_module).back
-    names = ("M", "g", "crowd", "apart", "beside", "weights")
-    own = {name: kind for name, kind in entries(precision).items() if name in names}
-    seen = bundle(**own)
-
-    @wp.kernel(module=module)
-    def shift(
-        particles: int,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        k: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: seen,
-        A: wp.array(dtype=matrix),
-        # out
-        delta: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        dt = time_step[i // particles]
-        delta[i] = shift_of(
-            A[i],
-            of.crowd[i],
-            of.apart[i],
-            of.M[i],
-            of.g[i],
-            of.beside[i],
-            of.weights[i],
-            k[i],
-            m[i],
-            dt,
-            spacing,
-        )
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def shift_tangent(
-        particles: int,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        k: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: seen,
-        A: wp.array(dtype=matrix),
-        dot: bundle(k=real, m=real, A=matrix, **own),
-        # out
-        delta_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        member = i // particles
-        total = vector()
-        count = int(3)  # not a number: Warp would write the gradient out for each
-        for axis in range(count):
-            unit = vector()
-            unit[axis] = real(1.0)
-            by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = along(
-                A[i],
-                of.crowd[i],
-                of.apart[i],
-                of.M[i],
-                of.g[i],
-                of.beside[i],
-                of.weights[i],
-                k[i],
-                m[i],
-                time_step[member],
-                spacing,
-                unit,
-            )
-            entry = wp.ddot(by_A, dot.A[i]) + wp.dot(by_crowd, dot.crowd[i]) + wp.ddot(by_M, dot.M[i])
-            entry += wp.dot(by_apart, dot.apart[i]) + wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.beside[i])
-            entry += wp.dot(by_weights, dot.weights[i])
-            total += (entry + by_k * dot.k[i] + by_m * dot.m[i] + by_dt * time_step_dot[member]) * unit
-        delta_dot[i] = total
-
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def shift_adjoint(
-        particles: int,
-        spacing: real,
-        time_step: wp.array(dtype=real),
-        k: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: seen,
-        A: wp.array(dtype=matrix),
-        delta_bar: wp.array(dtype=vector),
-        # in and out
-        bar: bundle(time_step=real, k=real, m=real, A=matrix, **own),
-    ):
-        i = wp.tid()
-        by_A, by_crowd, by_apart, by_M, by_g, by_gamma, by_weights, by_k, by_m, by_dt = back(
-            A[i],
-            of.crowd[i],
-            of.apart[i],
-            of.M[i],
-            of.g[i],
-            of.beside[i],
-            of.weights[i],
-            k[i],
-            m[i],
-            time_step[i // particles],
-            spacing,
-            delta_bar[i],
-        )
-        bar.A[i] = bar.A[i] + by_A
-        bar.crowd[i] = bar.crowd[i] + by_crowd
-        bar.apart[i] = bar.apart[i] + by_apart
-        bar.M[i] = bar.M[i] + by_M
-        bar.g[i] = bar.g[i] + by_g
-        bar.beside[i] = bar.beside[i] + by_gamma
-        bar.weights[i] = bar.weights[i] + by_weights
-        bar.k[i] = bar.k[i] + by_k
-        bar.m[i] = bar.m[i] + by_m
-        bar.time_step[i] = bar.time_step[i] + by_dt
-
-    return Kernels(shift, shift_tangent, shift_adjoint)
+    make = partial(shift_of_particle, d.precision, dimension)
+    modules = d.modules(f"projection_{dimension}d")
+    return pointwise_kernels(d.precision, modules, make, ["delta"], numbers=["spacing"])
 
 
-@cache
-def change_functions(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """The change of a velocity by A, M and the way, and for an adjoint of it those of A, M and the way."""
+def followed_velocity(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
+    """v' of velocities that follow."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     inverse = effect_functions(precision, dimension, module).inverse
 
-    @wp.func
-    def change(A: matrix, M: matrix, way: vector) -> vector:
-        return -(A * (inverse(M) * way))
+    def follow(time_step: real, x_i: vector, M_i: matrix, A_i: matrix, x_now_i: vector, v_new_i: vector) -> vector:
+        M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
+        return v_new_i - A_i * (inverse(M) * (x_now_i - x_i - time_step * v_new_i))
 
-    @wp.func(module=module)
-    def work(A: matrix, M: matrix, way: vector, bar: vector) -> real:
-        return wp.dot(change(A, M, way), bar)
-
-    @wp.func(module=module)
-    def back(A: matrix, M: matrix, way: vector, bar: vector):
-        by_A, by_M, by_way, _bar = wp.grad(work)(A, M, way, bar)
-        return by_A, real(0.5) * (by_M + wp.transpose(by_M)), by_way
-
-    return change, back
+    return follow
 
 
 @cache
-def following_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of v'."""
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    topic = f"projection_following_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
-    change = change_functions(precision, dimension, module)[0]
-    along = change_functions(precision, dimension, tangent_module)[1]
-    back = change_functions(precision, dimension, adjoint_module)[1]
-
-    @wp.kernel(module=module)
-    def follow(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        M: wp.array(dtype=matrix),
-        A: wp.array(dtype=matrix),
-        x_now: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
-        # out
-        v_end: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        way = x_now[i] - x[i] - time_step[i // particles] * v_new[i]
-        v_end[i] = v_new[i] + change(A[i], M[i], way)
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def follow_tangent(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        M: wp.array(dtype=matrix),
-        A: wp.array(dtype=matrix),
-        x_now: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
-        dot: bundle(x=vector, x_now=vector, v_new=vector, M=matrix, A=matrix),
-        # out
-        v_end_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        member = i // particles
-        dt = time_step[member]
-        way = x_now[i] - x[i] - dt * v_new[i]
-        way_dot = dot.x_now[i] - dot.x[i] - dt * dot.v_new[i] - time_step_dot[member] * v_new[i]
-        total = dot.v_new[i]
-        count = int(3)  # not a number: Warp would write the gradient out for each
-        for k in range(count):
-            unit = vector()
-            unit[k] = real(1.0)
-            by_A, by_M, by_way = along(A[i], M[i], way, unit)
-            total += (wp.ddot(by_A, dot.A[i]) + wp.ddot(by_M, dot.M[i]) + wp.dot(by_way, way_dot)) * unit
-        v_end_dot[i] = total
-
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def follow_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        M: wp.array(dtype=matrix),
-        A: wp.array(dtype=matrix),
-        x_now: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
-        # in and out: v_new_bar is at first the adjoint of v'
-        v_new_bar: wp.array(dtype=vector),
-        x_now_bar: wp.array(dtype=vector),
-        bar: bundle(x=vector, time_step=real, M=matrix, A=matrix),
-    ):
-        i = wp.tid()
-        dt, v_bar = time_step[i // particles], v_new_bar[i]
-        way = x_now[i] - x[i] - dt * v_new[i]
-        by_A, by_M, by_way = back(A[i], M[i], way, v_bar)
-        bar.A[i] = bar.A[i] + by_A
-        v_new_bar[i] = v_bar - dt * by_way
-        x_now_bar[i] = x_now_bar[i] + by_way
-        bar.M[i] = bar.M[i] + by_M
-        bar.x[i] = bar.x[i] - by_way
-        bar.time_step[i] = bar.time_step[i] - wp.dot(by_way, v_new[i])
-
-    return Kernels(follow, follow_tangent, follow_adjoint)
+def following_kernels(d: Discretisation, dimension: int) -> Kernels:
+    """The kernels of v'; its adjoint is where that of v is written."""
+    make, modules = partial(followed_velocity, d.precision, dimension), d.modules(f"projection_following_{dimension}d")
+    return pointwise_kernels(d.precision, modules, make, ["v_end"], {"v_end": "v_new"})
 
 
 @cache

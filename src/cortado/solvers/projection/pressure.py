@@ -428,7 +428,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         full_bar = part * (k_before[i] * y_bar + wp.dot(kick_before[i], bar.u[i]))
         weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
         if surfaced[i // particles] == 0:
-            weights_bar[i][0] = no
+            weights_bar[i][0] = real(0.0)
         v_bar[i] = v_bar[i] + bar.u[i]
 
     return Kernels(begin, begin_tangent, begin_adjoint)
