@@ -97,7 +97,7 @@ class CheckedLoss:
         if isinstance(bar, State):
             return _checked_state(bar, end)
         if isinstance(bar, SnapshotAdjoint):
-            colours = _checked_adjoint("adjoint of colours", bar.colours, end.colours.shape)
+            colours = _checked_share("adjoint of colours", bar.colours, end.colours.shape)
             return SnapshotAdjoint(_checked_state(bar.state, end), colours, _checked_table(bar.quantities, end))
         if isinstance(bar, Mapping):
             return _checked_table(bar, end)
@@ -109,7 +109,7 @@ class CheckedLoss:
             )
         wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
         forms = (f"adjoint of {form}" for form in FORMS)
-        return tuple(_checked_adjoint(*entry) for entry in zip(forms, bar, wanted, strict=False))
+        return tuple(_checked_share(*entry) for entry in zip(forms, bar, wanted, strict=False))
 
 
 class CheckedBatchedLoss(CheckedLoss):
@@ -156,7 +156,7 @@ def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarra
     """Adjoints by the names of fields of a state and of quantities."""
     for name in bar:
         check_readable(name, "a name in the loss's adjoint", end.state.names)
-    return {name: _checked_adjoint(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
+    return {name: _checked_share(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
 
 
 def _checked_array(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -166,7 +166,7 @@ def _checked_array(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
     return array
 
 
-def _checked_adjoint(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = _checked_array(what, values, shape)
     if not np.isfinite(array).all():
         row = np.argwhere(~np.isfinite(array))[0][0]
