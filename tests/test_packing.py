@@ -160,7 +160,7 @@ def test_distances_from_a_region():
 
 
 def around(points: np.ndarray, air: tuple[int, int], lengths: np.ndarray, reach: float) -> PointsAround:
-    lattice = RestLattice(CUBIC_SPLINE, 0.1, 0.2)
+    lattice = RestLattice(CUBIC_SPLINE, 0.1, 0.2, len(lengths))
     weights = np.where(np.arange(len(points)) < 100, 1.0, 0.7)
     return PointsAround(lattice, points, weights, air, lengths, reach)
 

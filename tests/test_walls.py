@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from cortado.discretise.calibration import SLACK
 from cortado.discretise.smoothing import KERNELS
-from cortado.discretise.walls import SHALLOW, box_walls, short_box, wall_layers
+from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box, wall_layers
 from cortado.scene.containers import BoxContainer, Container
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.scene import Scene
@@ -25,7 +25,7 @@ class FlatWall:
 
     def __init__(self, name: str, support: float, dimension: int):
         self.kernel, self.support, self.dimension = KERNELS[name], support * SPACING, dimension
-        self.layers = wall_layers(self.kernel, SPACING, self.support, dimension)
+        self.layers = wall_layers(RestLattice(self.kernel, SPACING, self.support, dimension))
         self.plane = SPACING * np.array(list(itertools.product(range(-4, 5), repeat=dimension - 1)), dtype=np.float64)
         whole = np.array(list(itertools.product(range(-4, 5), repeat=dimension)), dtype=np.float64)
         self.total = self.weight(SPACING * whole).sum()
@@ -87,7 +87,7 @@ def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
 @dimensions
 @supports
 def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
-    layers = wall_layers(KERNELS[name], SPACING, support * SPACING, dimension)
+    layers = wall_layers(RestLattice(KERNELS[name], SPACING, support * SPACING, dimension))
     wall = FlatWall(name, support, dimension)
     second = wall.missing(1) / wall.missing(0)
     assert len(layers.depths) == len(layers.weights) == (2 if second > 1e-6 else 1)

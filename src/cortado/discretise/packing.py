@@ -57,7 +57,7 @@ class PointsAround:
         """Neighbour lists of the first n points, at ``particles`` (n, d) [m], each with the points of higher numbers
         within the reach: where the list of each begins (n,) and ends (n,), and numbers of points, with gaps between
         the lists."""
-        room = len(lattice_offsets(self.lattice.spacing, self.reach, self.points.shape[1]))
+        room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
             others = np.empty(max(starts[-1], 1), dtype=np.int32)
@@ -81,12 +81,12 @@ class PointsAround:
     @property
     def volume(self) -> float:
         """Volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
-        return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.points.shape[1])
+        return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @property
     def own_weight(self) -> float:
         """The kernel of a particle at its own place [1 / m^d]."""
-        return float(self.lattice.kernel.weight(np.zeros(1), self.points.shape[1], self.lattice.support)[0])
+        return float(self.lattice.weights(np.zeros((1, self.lattice.dimension)))[0])
 
     @cached_property
     def kernels(self) -> Any:
@@ -106,7 +106,7 @@ class PointsAround:
     @cached_property
     def on_cpu(self) -> Any:
         """The points as the struct ``Around`` of kernels."""
-        around, dimension = self.kernels.around(), self.points.shape[1]
+        around, dimension = self.kernels.around(), self.lattice.dimension
         around.x, around.weights = shared(self.in_space), shared(self.weights)
         around.air, around.behind_air = self.air
         around.is_periodic, around.period = bool(self.lengths.any()), in_space(self.lengths)

@@ -1,7 +1,5 @@
 """Pairs of points that are near each other, across the ends of periods too, and how densely points lie, in float64."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,6 +10,7 @@ from cortado.errors import InputError
 CHUNK = 8192
 """How many points look for their neighbours at a time: bounds the memory."""
 
+Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
 """The first and the second point of each pair, and how far apart they are [m]; each (m,)."""
 
@@ -95,35 +94,31 @@ AT_ONE_PLACE = 1e-3
 """In spacings: particles that are nearer to each other are at one place."""
 
 
-@dataclass(frozen=True)
-class Crowding:
-    """Particles, and how densely they lie."""
+def check_crowding(
+    what: str,
+    positions: Points,
+    kernel: SmoothingKernel,
+    support: float,
+    volume: float,
+    spacing: float,
+    period: Period,
+) -> str | None:
+    """A warning of particles that are crowded or hardly touch each other, where they may be meant to; None of others.
+    Raises `InputError` where they would burst.
 
-    positions: Points
-    """(n, d) [m]"""
-    densities: NDArray
-    """(n,) number density over that on the rest lattice."""
-
-    @property
-    def compression(self) -> float:
-        """The mean of what is above the density at rest."""
-        return float(np.maximum(self.densities - 1.0, 0.0).mean())
-
-
-def crowding_of(
-    positions: Points, kernel: SmoothingKernel, support: float, volume: float, period: tuple[Points, Points]
-) -> Crowding:
-    """That of particles (n, d) [m] with a support radius [m] and a rest volume [m^d], in a period that begins at a
-    corner and has lengths [m], 0 along axes without one."""
+    Args:
+        what: they in words, in the plural.
+        positions: (n, d) [m].
+        kernel: W.
+        support: radius [m].
+        volume: of a particle at rest [m^d].
+        spacing: [m].
+        period: as of `check_apart`.
+    """
     point, _, distances = pairs_within(positions, positions, support, *period)
     seen = kernel.weight(distances, positions.shape[1], support)
-    return Crowding(positions, volume * np.bincount(point, seen, minlength=len(positions)))
-
-
-def check_crowding(crowding: Crowding, spacing: float, what: str) -> str | None:
-    """What to warn of where particles may be meant to lie as they do, None if there is nothing; raises `InputError`
-    where they would burst. ``what``: they in words, in the plural."""
-    positions, densities, average = crowding.positions, crowding.densities, crowding.compression
+    densities = volume * np.bincount(point, seen, minlength=len(positions))  # over that of the lattice
+    average = float(np.maximum(densities - 1.0, 0.0).mean())
     greatest, inside = densities.max(), float(np.quantile(densities, 0.75))  # away from the surface
     fit = spacing * inside ** (-1.0 / positions.shape[1])
     advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
@@ -141,8 +136,9 @@ def check_crowding(crowding: Crowding, spacing: float, what: str) -> str | None:
     return None
 
 
-def check_apart(what: str, positions: Points, spacing: float, period: tuple[Points, Points]) -> None:
-    """No two particles (n, d) [m] are at one place; raises `InputError` in a sentence that begins with ``what``."""
+def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
+    """Raises `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place, in a
+    period that begins at a corner (d,) and has lengths (d,) [m], 0 along axes without one."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:

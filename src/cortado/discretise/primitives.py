@@ -144,7 +144,7 @@ class Revolved(Solid):
 
 @dataclass(frozen=True)
 class HalfSpace(Solid):
-    """All that is below a plane, as far as a box shows it."""
+    """All that is below a plane; pictures show the part of it in a box."""
 
     normal: Points
     """(d,) unit vector upwards"""
@@ -252,8 +252,8 @@ def _standing(direction: Points) -> Points:
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """The lattice ``lower + (i + 1/2) spacing`` in the box around a solid; its last points may be so near the box's end
-    that their cells reach beyond it, by less than half a spacing [m]."""
+    """The lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid; its last cells may reach beyond the end
+    of the box by less than half a spacing."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 

@@ -1,8 +1,7 @@
 """Where fluid may be: in the region of a container, outside of solids, in a period that repeats."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import Any, Self
 
@@ -37,7 +36,7 @@ class Region:
 
     @classmethod
     def between(cls, lower: Points, upper: Points) -> "Region":
-        """A box without a cylinder."""
+        """A box between corners (d,) [m]."""
         return cls(lower, upper, np.zeros(len(lower)), np.zeros(len(lower)))
 
     @classmethod
@@ -47,42 +46,28 @@ class Region:
 
     @classmethod
     def ball(cls, centre: Points, radius: float) -> "Region":
-        """A sphere, or a disc in 2-D."""
+        """A sphere, or a disc in 2-D, about a centre (d,) [m], with a radius [m]."""
         everywhere = cls.everywhere(len(centre))
         return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """A cylinder that stands on its base along an axis of space."""
+        """A cylinder that stands on the middle of its base (d,) [m] along an axis of space."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are outside of the region, negative inside [m]; beyond an edge or a corner it
-        is the distance from the nearer face, which is less."""
+        """(n,) distances [m] of points (n, d) [m] from the region, negative inside; beyond an edge or a corner that
+        from the nearer face, which is less."""
         from_faces = np.full(len(points), -np.inf)
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # as short rows take NumPy long
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
-    def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Of each side that is somewhere: (n,) how far points (n, d) [m] are from it, positive inside [m]."""
-        for axis in np.flatnonzero(self.across == 0.0).tolist():
-            for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
-                if np.isfinite(at):
-                    yield partial(_from_plane, axis=axis, at=at, inwards=inwards)
-        if np.isfinite(self.radius):
-            yield self._from_side
-
-    def _from_side(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are inside the cylinder or the sphere [m]."""
-        return np.asarray(self.radius - self._from_axis(points))
-
     def nearest(self, points: Points) -> Points:
-        """(n, d) the points of the region that are nearest to points (n, d) [m] beside its faces or its side, and those
-        themselves that are within."""
+        """(n, d) [m] the points of the region nearest to points (n, d) [m]."""
         boxed = np.clip(points, self.lower, self.upper)
         across = (boxed - self.base) * self.across
         from_axis = np.linalg.norm(across, axis=1, keepdims=True)
@@ -106,7 +91,8 @@ class Region:
         return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
 
     def _from_axis(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are from the axis of the cylinder or the middle of the sphere; 0 without."""
+        """(n,) distances [m] of points (n, d) [m] from the axis of the cylinder or the middle of the sphere; 0 without
+        either."""
         squares = np.zeros(len(points))
         for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
             if is_across:
@@ -114,28 +100,21 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """(n,) whether particles at ``before`` (n, d) [m] went through a wall to be at ``after`` (n, d) [m].
-
-        Over the rim of an open cup they may go, and what was outside already has not gone through.
-        """
+        """(n,) whether particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]: over the rim
+        of an open cup they may go, and one that was outside already has not gone through."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
     def is_below_rim(self, points: Points) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are where there is none."""
+        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are without one."""
         if not np.isfinite(self.rim):
             return np.ones(len(points), dtype=bool)
         return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
-        """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""
+        """The region without sides along axes with a period; ``periods`` (d,) [m] are 0 along the others."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
-
-
-def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
-    """(n,) how far points (n, d) [m] are from a plane across an axis [m]."""
-    return np.asarray(inwards * (points[:, axis] - at))
 
 
 ALONG = 1e-3
@@ -144,7 +123,7 @@ ALONG = 1e-3
 
 @dataclass(frozen=True)
 class Domain:
-    """One period of a scene."""
+    """One period of a scene. Positions go on beyond its ends, and a place sees all images of particles."""
 
     lower: tuple[float, ...]
     """(d,) where it begins [m]; 0 along an axis that is not periodic."""
@@ -153,12 +132,12 @@ class Domain:
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
-        """From arrays (d,) [m]."""
+        """A domain from where it begins (d,) [m] and its lengths (d,) [m], 0 along axes without a period."""
         axes = lengths > 0.0
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
     def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Its lower ends [m], its lengths [m] and one over these [1/m], as vectors of Warp."""
+        """The lower ends [m], the lengths [m] and the inverse lengths [1/m], as Warp vectors."""
         rest = (0.0,) * (3 - len(self.lengths))
         frequency = (1.0 / length if length else 0.0 for length in self.lengths)
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
@@ -169,7 +148,7 @@ class Domain:
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
 
     def shortest(self, ways: Points) -> Points:
-        """Of ways (n, d) [m] those to the nearest images."""
+        """Ways (n, d) [m] to the nearest images, from those (n, d) [m] to any image."""
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
@@ -226,7 +205,7 @@ def _independent(axes: Points, lengths: Points) -> Points:
 
 @dataclass(frozen=True)
 class Room:
-    """A region without the solids in it, which come again with every period."""
+    """A region less the solids in it, which come again with every period."""
 
     region: Region
     solids: Sequence[Solid]
@@ -239,16 +218,15 @@ class Room:
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """(n,) how far points (n, d) [m] are from the nearest solid, negative inside one [m]; infinite without any.
-        What is not less than a reach [m] in size may be any other number of its sign that is not."""
+        """(n,) distances [m] of points (n, d) [m] from the nearest solid, negative inside one; infinite without any. A
+        distance of a size not less than a reach [m] may be any other such number of its sign."""
         if not self.solids:
             return np.full(len(points), np.inf)
-        images = self._images(points)
+        images = [points + shift for shift in self.shifts()]
         return np.min([solid.distance_up_to(image, reach) for image in images for solid in self.solids], axis=0)
 
     def distance(self, points: Points, reach: float = np.inf) -> Points:
-        """(n,) how far points (n, d) [m] are outside of the room, negative inside [m]. What is not less than a reach
-        [m] in size may be any other number of its sign that is not."""
+        """(n,) distances [m] of points (n, d) [m] from the room, negative inside, with a reach as of `from_solids`."""
         return np.maximum(self.region.distance(points), -self.from_solids(points, reach))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
@@ -262,15 +240,10 @@ class Room:
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
-        """A solid, and those a period from it."""
+        """A solid and its copies a period away."""
         turn = np.eye(self.dimension)
-        return [solid, *(Placed(solid, shift, turn) for shift in self._shifts()[1:])]
+        return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
 
-    def _shifts(self) -> list[Points]:
-        """(d,) by how much images are off [m], the first of them not at all."""
-        ends = [(0.0, -length, length) if length else (0.0,) for length in self.periods]
-        return [np.array(shift) for shift in product(*ends)]
-
-    def _images(self, points: Points) -> list[Points]:
-        """Points (n, d) and those a period from them."""
-        return [points + shift for shift in self._shifts()]
+    def shifts(self) -> list[Points]:
+        """(d,) shifts of images [m], the first of them 0."""
+        return [np.array(shift) for shift in product(*((0.0, -a, a) if a else (0.0,) for a in self.periods))]

@@ -18,7 +18,7 @@ from cortado.discretise.surface_points import (
     surface_feet,
     surface_points,
 )
-from cortado.discretise.walls import Places, Planes, WallLayers
+from cortado.discretise.walls import Places, RestLattice, WallLayers
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,14 @@ class WallPoints(Rows):
 
 @dataclass(frozen=True, eq=False)
 class ContainerWalls:
-    """The wall particles that a container has without solids.
-
-    Of those that are so far from all solids that no fluid beside these sees them, each keeps its place and its cell.
-    """
+    """The wall particles that a container has without solids. Those so far from all solids that no fluid beside these
+    sees them keep their places and their cells."""
 
     points: WallPoints
     solids: Sequence[Solid]
-    """What closes the container."""
+    """They close the container."""
     room: Room
-    """Where fluid may be, beside solids."""
+    """Where fluid may be, outside of solids at rest."""
     spacing: float
     """Of particles [m]."""
     support: float
@@ -52,7 +50,7 @@ class ContainerWalls:
 
     @property
     def _clear(self) -> float:
-        """How far from solids feet of wall particles are that keep their places [m]."""
+        """Distance from solids to the feet of wall particles that keep their places, at least [m]."""
         return 2.0 * self.support + self.spacing
 
     @cached_property
@@ -92,25 +90,26 @@ HALVINGS, ROUNDS, DIGITS = 12, 30, 4
 
 @dataclass(frozen=True)
 class ExposedSurface:
-    """What fluid in a room can touch of solids, which may touch each other, and of the container near them, as fine
-    points."""
+    """The surface that fluid in a room can touch of solids, which may touch each other, and of the container near them,
+    as fine points."""
 
     feet: Points
     """(n, d) [m]"""
     away: Points
     """(n, d) unit vectors into the room"""
     owner: Numbers
-    """(n,) whose they are: index into `solids`"""
+    """(n,) index into `solids` of the one that each belongs to"""
     solids: Sequence[Solid]
-    """First what closes the container."""
+    """Those that close the container, then the others."""
     container: ContainerWalls
     lower: Points
     """(d,) where the period begins [m]"""
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """That of solids, and of the container near them, up to a support beyond the ends of a period that begins at
-        ``lower`` (d,) [m]. Each point stands for a part of it that is a `FINE`th of a spacing long and wide."""
+        """The exposed surface of solids, and of the container near them, up to a support beyond the ends of a period
+        that begins at ``lower`` (d,) [m]. Each point stands for a part that is a `FINE`th of a spacing long and
+        wide."""
         room, spacing, fine = container.room, container.spacing, container.spacing / FINE
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
@@ -135,7 +134,7 @@ class ExposedSurface:
 
         return cKDTree(self.feet)
 
-    def walls(self, layers: WallLayers, planes: Planes) -> WallPoints:
+    def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
         """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
         as its part of the layer is, and less where it is less deep: it counts the same for the first row of fluid. None
         counts as deeper than its layer, as those may seem whose foot is hidden where parts of a solid overlap."""
@@ -145,23 +144,22 @@ class ExposedSurface:
             feet = self._feet_of(found.points, *self._tree.query(found.points)) - found.points
             found_depths = np.minimum(np.linalg.norm(feet, axis=1) / self.spacing, depth / self.spacing + TOLERANCE)
             depths, which = np.unique(np.round(found_depths, DIGITS), return_inverse=True)
-            seen = np.array([planes.weight(first_row + self.spacing * one) for one in depths])[which]
+            seen = np.array([lattice.plane_weight(first_row + self.spacing * one) for one in depths])[which]
             parts.append(
-                WallPoints(found.points, weight * found.shares * planes.weight(first_row + depth) / seen, feet)
+                WallPoints(found.points, weight * found.shares * lattice.plane_weight(first_row + depth) / seen, feet)
             )
         return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> Numbers:
-        """(b,) whose wall particles are: index into `solids`."""
+        """(b,) index into `solids` of the one that each wall particle belongs to."""
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner, but
-        for where the container keeps its walls."""
+        """Points about a spacing apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner, except
+        where the container keeps its walls."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
         points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
-        areas = np.full(len(points), (self.spacing / FINE) ** (points.shape[1] - 1))
-        found = evenly_chosen(points, areas, DENSITY * self.spacing)
+        found = evenly_chosen(points, self.spacing / FINE, DENSITY * self.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
@@ -191,8 +189,8 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """(n, d) [m] the point of the surface that is nearest to each of the points (n, d) [m] beneath it, on a solid
-        or where two of them meet; ``nearest`` (n,) is the nearest of the fine points, ``reach`` (n,) [m] away."""
+        """(n, d) [m] the points of the surface, on a solid or where two of them meet, that are nearest to points (n, d)
+        [m] beneath it; ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
         fine = self.spacing / FINE
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -211,8 +209,8 @@ class ExposedSurface:
         return found
 
     def _edges(self, feet: Points, owner: Numbers) -> Points:
-        """(n, d) [m] points where the solid that feet (n, d) [m] belong to meets the one that is next to them, near
-        the feet: these, moved to one surface and the other in turn."""
+        """(n, d) [m] points near feet (n, d) [m] where the solid of each foot, ``owner`` (n,), meets the next one: the
+        feet, moved to one surface and the other in turn."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
         distances[owner, np.arange(len(feet))] = np.inf
         other, found = np.argmin(distances, axis=0), feet.copy()
@@ -225,16 +223,15 @@ class ExposedSurface:
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
-        """(n, d) [m] points beneath the feet that have another part of the surface nearer than at a depth, as deep as
-        that is."""
+        """(n, d) [m] points beneath those feet of which another part of the surface is nearer than a depth [m]: as deep
+        as the foot is the nearest point."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, HALVINGS)
         return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
-        """(n,) whether no part of the surface is nearer than its foot to a point beneath each of some, at depths (n,)
-        [m]."""
+        """(n,) whether the nearest part of the surface to points at depths (n,) [m] beneath some feet is the foot."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
         return np.asarray(distances > depths - TOLERANCE * self.spacing)
 

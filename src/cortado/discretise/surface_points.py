@@ -47,11 +47,16 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
     Where a solid is thinner than twice the depth, they are in its middle.
     """
-    return evenly_chosen(*_candidates(solid, spacing / FINE, depth), spacing)
+    fine = spacing / FINE
+    feet, away = surface_feet(solid, fine)
+    points = feet - _reached(solid, feet, away, depth)[:, None] * away
+    if depth <= 0.0:
+        points = points[np.abs(solid.distance_up_to(points, fine - depth) + depth) < 0.25 * fine]
+    return evenly_chosen(points, fine, spacing)
 
 
-def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfacePoints:
-    """Those of points (n, d) [m] with areas (n,) [m^(d - 1)] that stay, about a spacing [m] apart.
+def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
+    """Some of the points (n, d) [m] that are ``fine`` [m] apart on a surface, about a spacing [m] apart.
 
     First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
     to it (Lloyd 1982), and to a candidate; then any that are too near another are left out, and gaps are filled.
@@ -59,6 +64,7 @@ def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfaceP
     dimension = candidates.shape[1]
     if not len(candidates):
         return SurfacePoints(candidates, np.zeros(0))
+    areas = np.full(len(candidates), fine ** (dimension - 1))
     order, nothing = np.random.default_rng(SEED).permutation(len(candidates)), np.zeros(0, dtype=np.int64)
     chosen = candidates[_chosen(candidates, order, APART * spacing, nothing)]
     for _ in range(ROUNDS[dimension]):
@@ -74,46 +80,38 @@ def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfaceP
     return SurfacePoints(chosen, shares)
 
 
-def _normals(solid: Solid, feet: Points, spacing: float) -> Points:
-    """(n, d) outward unit vectors at points of the surface (n, d) [m], by differences of the distance."""
-    step, steps = 1e-3 * spacing, np.eye(feet.shape[1])
-    slopes = [solid.distance(feet + step * one) - solid.distance(feet - step * one) for one in steps]
-    found = np.stack(slopes, axis=1)
-    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300))
-
-
-def _everywhere(points: Points, furthest: float) -> Which:
-    return np.ones(len(points), dtype=bool)
-
-
-def surface_feet(solid: Solid, fine: float, is_near: Near = _everywhere) -> tuple[Points, Points]:
-    """Points of the surface (n, d) [m], some ``fine`` [m] apart, each with as much of its area, and unit vectors (n, d)
-    away from the solid; of a surface that a lattice finds those alone that are near something."""
+def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
+    """Points of a surface (n, d) [m], about ``fine`` [m] apart, each with as much of its area, and unit vectors (n, d)
+    away from the solid; of a surface that a lattice finds only those that are near something, where ``is_near`` says
+    so."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
-    near = _near(solid, fine, fine, is_near)
+    lower, upper = (np.asarray(end) for end in solid.extent())
+
+    def is_wanted(points: Points, furthest: float) -> Which:
+        found = np.abs(solid.distance_up_to(points, furthest)) < furthest
+        if is_near is not None:
+            found[found] = is_near(points[found], furthest)
+        return np.asarray(found)
+
+    cells = [points[is_wanted(points, fine)] for points in lattice_about(lower, upper, fine, fine, is_wanted)]
+    near = np.concatenate([np.zeros((0, len(lower))), *cells])
     near = near[np.abs(solid.distance(near)) < 0.5 * fine]  # a band of this thickness has fine^d / fine for each point
     feet, away = solid.nearest(near), solid.outward(near)
-    on_it = np.linalg.norm(near - feet, axis=1) < 1e-3 * fine  # too near to tell where out is
-    away[on_it] = _normals(solid, feet[on_it], fine)
+    on_it = np.linalg.norm(near - feet, axis=1) < 1e-3 * fine  # too near to tell where out is: by differences
+    slopes = [
+        solid.distance(feet[on_it] + 1e-3 * fine * axis) - solid.distance(feet[on_it] - 1e-3 * fine * axis)
+        for axis in np.eye(len(lower))
+    ]
+    normals = np.stack(slopes, axis=1)
+    away[on_it] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return feet, away
 
 
-def _candidates(solid: Solid, fine: float, depth: float) -> tuple[Points, Points]:
-    """(n, d) points of the surface at a depth [m], some ``fine`` [m] apart, and the area (n,) [m^(d - 1)] of each."""
-    feet, away = surface_feet(solid, fine)
-    points = feet - _reached(solid, feet, away, depth)[:, None] * away
-    areas = np.full(len(points), fine ** (points.shape[1] - 1))
-    if depth <= 0.0:
-        on_it = np.abs(solid.distance_up_to(points, fine - depth) + depth) < 0.25 * fine
-        points, areas = points[on_it], areas[on_it]
-    return points, areas
-
-
 def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
-    """(n,) how far beneath feet (n, d) [m] points may be up to a depth [m] so that no other part of the surface is
-    nearer to them than these."""
+    """(n,) depths beneath feet (n, d) [m], up to a depth [m], at which no other part of the surface is nearer than the
+    foot."""
     if depth <= 0.0:
         return np.full(len(feet), depth)
     found, tolerance = np.full(len(feet), depth), 1e-3 * depth
@@ -126,23 +124,10 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
     return found
 
 
-def _near(solid: Solid, fine: float, reach: float, is_wanted: Near) -> Points:
-    """(n, d) points of a lattice less than ``reach`` [m] from the surface, where it is near what is wanted."""
-    lower, upper = (np.asarray(end) for end in solid.extent())
-
-    def is_near(points: Points, furthest: float) -> Which:
-        found = np.abs(solid.distance_up_to(points, furthest)) < furthest
-        found[found] = is_wanted(points[found], furthest)
-        return np.asarray(found)
-
-    found = [points[is_near(points, reach)] for points in lattice_about(lower, upper, reach, fine, is_near)]
-    return np.concatenate([np.zeros((0, len(lower))), *found])
-
-
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
-    """Points (n, d) of a lattice, ``fine`` [m] apart, of which those no further than ``reach`` [m] from what is near
-    are all, in parts: of cells of the box between two corners and as far around it, and of parts of those, all whose
-    middles are near enough."""
+    """Points (n, d) of a lattice, ``fine`` [m] apart, in parts, with all of those that are no further than ``reach``
+    [m] from a thing within the box between two corners. Cells of the box, and parts of these, are kept as far as their
+    middles are near the thing, by ``is_near``."""
     dimension, size = len(lower), int(np.prod(CELLS)) * fine
     cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
     *coarse, last = CELLS
@@ -161,15 +146,15 @@ def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_ne
 
 
 def _divided(cells: Points, size: float, parts: int) -> Points:
-    """(n, d) middles of so many parts along each axis of cells of a size [m], whose middles (m, d) [m] are given."""
+    """(n, d) middles [m] of the parts, so many along each axis, of cells of a size [m] with middles (m, d) [m]."""
     along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
     inside = np.array(list(product(along, repeat=cells.shape[1])))
     return (cells[:, None] + inside).reshape(-1, cells.shape[1])
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
-    """Numbers of points (n, d) [m]: those chosen already, and of those in an order all that are further than ``apart``
-    [m] from them and from those that come before."""
+    """Numbers of points (n, d) [m]: those chosen already, and the numbers in an ``order`` that are further than
+    ``apart`` [m] from them and from all chosen before."""
     size = int(FIRST * len(order)) + 1
     while len(order):
         some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
@@ -181,8 +166,8 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """How far points (n, d) [m] are from the nearest of some (m, d) [m], and which it is; infinite from a reach [m]
-    on."""
+    """Distances (n,) from points (n, d) [m] to the nearest of some (m, d) [m], infinite from a reach [m] on, and the
+    numbers (n,) of these."""
     from scipy.spatial import cKDTree
 
     distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=usable_cores())
@@ -190,7 +175,7 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
 
 
 def _first_of_all_near(points: Points, apart: float) -> Which:
-    """(n,) which points (n, d) [m] stay if each in turn does unless one that stays is nearer than ``apart`` [m]."""
+    """(n,) the points (n, d) [m] that stay if each in turn stays unless one that does is nearer than ``apart`` [m]."""
     from scipy.spatial import cKDTree
 
     first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T

@@ -171,6 +171,48 @@ At half a spacing the deep layer would have to be so steep that it lies where th
 
 
 @dataclass(frozen=True)
+class RestLattice:
+    """The lattice of the fluid at rest, and the smoothing kernel of sums over it."""
+
+    kernel: SmoothingKernel
+    spacing: float
+    """[m]"""
+    support: float
+    """[m]"""
+    dimension: int
+    """2 or 3."""
+
+    @cached_property
+    def offsets(self) -> Points:
+        """(m, d) the `lattice_offsets` [m]."""
+        return lattice_offsets(self.spacing, self.support, self.dimension)
+
+    def weights(self, separations: Points) -> Points:
+        """(m,) W [1 / m^d] at separations (m, d) [m]."""
+        return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
+
+    def sums(self, separations: Points) -> Points:
+        """(m, 1 + d) W, and the gradient of W times the spacing, at separations (m, d) [m], both over the sum of W on
+        the lattice [-]."""
+        gradients = self.kernel.gradient(separations, self.support)
+        both = np.column_stack([self.weights(separations), self.spacing * gradients])
+        return np.asarray(both / self.weights(self.offsets).sum())
+
+    def _to_plane(self, distance: float) -> Points:
+        """(m, d) separations [m] from the points of a lattice plane at a distance [m], along the first axis."""
+        flat = np.unique(self.offsets[:, 1:], axis=0)
+        return np.hstack([np.full((len(flat), 1), distance), flat])
+
+    def plane_weight(self, distance: float) -> float:
+        """The sum of W [1 / m^d] over a lattice plane at a distance [m]."""
+        return float(self.weights(self._to_plane(distance)).sum())
+
+    def plane_slope(self, distance: float) -> float:
+        """The derivative of `plane_weight` by the distance [1 / m^(d + 1)]."""
+        return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
+
+
+@dataclass(frozen=True)
 class WallLayers:
     """The layers of wall particles behind a flat wall, the deepest last."""
 
@@ -180,37 +222,7 @@ class WallLayers:
     """Weights of a particle of each layer in the density, a fluid particle being 1."""
 
 
-@dataclass(frozen=True)
-class Planes:
-    """Sums over the points of a lattice plane, beside the sum of W over the whole lattice."""
-
-    kernel: SmoothingKernel
-    spacing: float
-    """[m]"""
-    support: float
-    """[m]"""
-    dimension: int
-
-    @cached_property
-    def flat(self) -> np.ndarray:
-        """(m, d - 1) the points of a plane that are less than a support away along it [m]."""
-        return np.unique(lattice_offsets(self.spacing, self.support, self.dimension)[:, 1:], axis=0)
-
-    def across(self, distance: float) -> np.ndarray:
-        """(m, d) separations [m] from the points of a plane at a distance [m], whose first axis is its normal."""
-        return np.hstack([np.full((len(self.flat), 1), distance), self.flat])
-
-    def weight(self, distance: float) -> float:
-        """Sum of W over a plane at a distance [m]."""
-        distances = np.linalg.norm(self.across(distance), axis=1)
-        return float(self.kernel.weight(distances, self.dimension, self.support).sum())
-
-    def slope(self, distance: float) -> float:
-        """The derivative of `weight` by the distance."""
-        return float(self.kernel.gradient(self.across(distance), self.support)[:, 0].sum())
-
-
-def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayers:
+def wall_layers(lattice: RestLattice) -> WallLayers:
     """The layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
 
     - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
@@ -219,10 +231,10 @@ def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimensi
 
     One layer is enough where the second layer of the fluid does not see the wall, with a support of up to two spacings.
     """
-    planes = Planes(kernel, spacing, support, dimension)
+    spacing, support, weight, slope = lattice.spacing, lattice.support, lattice.plane_weight, lattice.plane_slope
     below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
-    missing = np.array([sum(map(planes.weight, below)), sum(map(planes.weight, below[1:]))])
-    pull = 2.0 * sum(map(planes.slope, below))
+    missing = np.array([sum(map(weight, below)), sum(map(weight, below[1:]))])
+    pull = 2.0 * sum(map(slope, below))
     heights = spacing * np.array([0.5, 1.5])
 
     two = missing[1] > 1e-6 * missing[0]
@@ -233,11 +245,11 @@ def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     def weights(deepest: float) -> np.ndarray:
         """With them the first layers of the fluid, as many as the wall has, have the rest density."""
         layers = depths(deepest)
-        seen = [[planes.weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
+        seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
         return np.linalg.solve(np.array(seen), missing[: len(layers)])
 
     def push(deepest: float) -> float:
-        slopes = [planes.slope(heights[0] + depth) for depth in depths(deepest)]
+        slopes = [slope(heights[0] + depth) for depth in depths(deepest)]
         return float(weights(deepest) @ slopes - pull)
 
     from scipy.optimize import brentq
@@ -263,41 +275,20 @@ CHUNK = 4096
 """How many places are looked at at a time: bounds the memory."""
 
 
-@dataclass(frozen=True)
-class RestLattice:
-    """The lattice of the fluid at rest, and the smoothing kernel of sums over it."""
-
-    kernel: SmoothingKernel
-    spacing: float
-    """[m]"""
-    support: float
-    """[m]"""
-
-    def sums(self, separations: np.ndarray) -> np.ndarray:
-        """(m, 1 + d) W, and the gradient of W times the spacing, at separations (m, d) [m], both over the sum of W on
-        the lattice [-]."""
-        dimension = separations.shape[1]
-        offsets = lattice_offsets(self.spacing, self.support, dimension)
-        total = self.kernel.weight(np.linalg.norm(offsets, axis=1), dimension, self.support).sum()
-        weights = self.kernel.weight(np.linalg.norm(separations, axis=1), dimension, self.support)
-        gradients = self.kernel.gradient(separations, self.support)
-        return np.asarray(np.column_stack([weights, self.spacing * gradients]) / total)
-
-    def missing(self, places: Places, room: Room) -> Points:
-        """(n, 1 + d) the part of the `sums` over a lattice at each of the places that lies outside of a room. A lattice
-        point is outside by as much as its cell is."""
-        dimension = places.points.shape[1]
-        offsets = lattice_offsets(self.spacing, self.support, dimension)
-        cells = places.points[:, None] + offsets @ places.axes
-        raised = places.points + RAISED * self.spacing * places.axes[:, 0]
-        furthest = (RAISED + 0.5) * self.spacing + self.support
-        empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
-        open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * self.spacing
-        shares = np.ones(open_cells.shape)
-        shares[~open_cells] = room.cell_shares(cells[~open_cells], self.spacing)
-        found = (1.0 - shares) @ self.sums(-offsets)
-        found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
-        return np.asarray(found)
+def _missing(lattice: RestLattice, places: Places, room: Room) -> Points:
+    """(n, 1 + d) the part of the `RestLattice.sums` over a lattice at each of the places that lies outside of a room.
+    A lattice point is outside by as much as its cell is."""
+    offsets = lattice.offsets
+    cells = places.points[:, None] + offsets @ places.axes
+    raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
+    furthest = (RAISED + 0.5) * lattice.spacing + lattice.support
+    empty = -room.distance(raised, furthest)  # the radius of a ball around each that nothing is in
+    open_cells = np.linalg.norm(cells - raised[:, None], axis=2) <= empty[:, None] - 0.5 * lattice.spacing
+    shares = np.ones(open_cells.shape)
+    shares[~open_cells] = room.cell_shares(cells[~open_cells], lattice.spacing)
+    found = (1.0 - shares) @ lattice.sums(-offsets)
+    found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
+    return np.asarray(found)
 
 
 Fit = Callable[["csr_array", Points], Points]
@@ -359,7 +350,7 @@ def _demands(
     shape, indices = (len(places), len(walls)), (place.astype(np.int32), wall.astype(np.int32))
     seen = flat[wall, None] * lattice.sums(separations)
     densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
-    missing = lattice.missing(places, room)
+    missing = _missing(lattice, places, room)
     near = ~room.contains(places.points, -lattice.spacing)
     sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
     return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.pairs import check_apart, check_crowding, crowding_of, nearest
+from cortado.discretise.pairs import check_apart, check_crowding, nearest
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.overlaps import NEAREST
 from cortado.scene.parameters.values import Arrays
@@ -44,8 +44,8 @@ class FirstPositions:
         free = positions[: simulation.free_particles]
         if len(free) < 2 or not simulation.scene.forces.pressure:
             return None
-        crowding = crowding_of(free, simulation.smoothing, lattice.support, lattice.volume, period)
-        found = check_crowding(crowding, spacing, "particles at initial_positions")
+        of_lattice = simulation.smoothing, lattice.support, lattice.volume, spacing
+        found = check_crowding("particles at initial_positions", free, *of_lattice, period)
         least = nearest(free).min() / spacing
         if found is None and least < NEAREST:
             wanted = f"at least {NEAREST:g} of them"

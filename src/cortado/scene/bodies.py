@@ -5,7 +5,6 @@ Their particles are then moved until the fluid is at rest everywhere: `cortado.d
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import TypeGuard
 
 import numpy as np
@@ -131,17 +130,12 @@ class Surroundings:
         walls = np.clip(0.5 + body.room.distance(points, body.spacing) / body.spacing, 0.0, 1.0)
         return points, np.clip(1.0 - fluid - walls, 0.0, 1.0)
 
-    def _images(self, points: Points) -> list[Points]:
-        """Points (n, d) and those a period from them."""
-        shifts = product(*[(0.0, -length, length) if length else (0.0,) for length in self.lengths])
-        return [points + np.array(shift) for shift in shifts]
-
     def _distance(self, body: CutBody, points: Points, reach: float) -> Points:
-        return np.min([body.distance(image, reach) for image in self._images(points)], axis=0)
+        return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
 
     def _shares(self, points: Points, spacing: float) -> Points:
         """(n,) the part of the cell around each of the points that is fluid."""
-        found = sum(body.shares(image) for body in self.bodies for image in self._images(points))
+        found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
         reach = spacing * np.sqrt(points.shape[1])
         point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
         separations = np.abs(apart(points[point] - self.staying[particle], self.lengths))

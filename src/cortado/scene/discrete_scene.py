@@ -15,7 +15,7 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.packing import Packing
-from cortado.discretise.pairs import check_crowding, crowding_of
+from cortado.discretise.pairs import check_crowding
 from cortado.discretise.room import Domain, Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
@@ -101,10 +101,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     points are packed too densely; warns where the fluid has another mass than was asked for."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
-    layers = wall_layers(kernel, spacing, support, dimension)
+    at_rest = RestLattice(kernel, spacing, support, dimension)
+    layers = wall_layers(at_rest)
     lattice = Lattice.of(kernel, spacing, support, dimension, scene.container.domain(dimension))
     fluid = fluid_particles(scene)
-    at_rest = RestLattice(kernel, spacing, support)
     walls = walls_of(scene, layers, at_rest)
     fluid = _packed(fluid, walls, at_rest, *period(scene))
     masses = FluidMasses.of(scene, fluid)
@@ -116,8 +116,8 @@ def discretise(scene: Scene) -> DiscreteScene:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
     fluid = replace(fluid, velocities=_velocities(scene, fluid))
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
-        crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
-        told = check_crowding(crowding, spacing, "the points of the fluid")
+        of_lattice = kernel, support, lattice.volume, spacing
+        told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, period(scene))
         if told is not None:
             warn(told)
     return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, period(scene)[1])

@@ -10,7 +10,7 @@ from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
-from cortado.discretise.walls import Places, Planes, RestLattice, WallLayers, even_changes, uneven_changes, wall_weights
+from cortado.discretise.walls import Places, RestLattice, WallLayers, even_changes, uneven_changes, wall_weights
 from cortado.errors import InputError
 from cortado.scene.containers import Container, NoContainer
 from cortado.scene.motions import moving, wall_numbers
@@ -147,7 +147,7 @@ def _weighed(
     """Wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside`` and
     those about solids."""
     room, spacing, reach = surface.room, lattice.spacing, lattice.support
-    points = surface.walls(layers, Planes(lattice.kernel, spacing, reach, room.dimension))
+    points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
     places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
     walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
