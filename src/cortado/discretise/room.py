@@ -1,7 +1,8 @@
 """Where fluid may be: in the region of a container, outside of solids, in a period that repeats."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Self
 
@@ -66,6 +67,16 @@ class Region:
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
+    def sides(self) -> Iterator[Callable[[Points], Points]]:
+        """For each side at a finite place, the function of points (n, d) [m] that gives their distances (n,) from it,
+        positive inside [m]."""
+        for axis in np.flatnonzero(self.across == 0.0).tolist():
+            for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
+                if np.isfinite(at):
+                    yield partial(_from_plane, axis=axis, at=at, inwards=inwards)
+        if np.isfinite(self.radius):
+            yield lambda points: np.asarray(self.radius - self._from_axis(points))
+
     def nearest(self, points: Points) -> Points:
         """(n, d) [m] the points of the region nearest to points (n, d) [m]."""
         boxed = np.clip(points, self.lower, self.upper)
@@ -115,6 +126,10 @@ class Region:
         """The region without sides along axes with a period; ``periods`` (d,) [m] are 0 along the others."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
+
+
+def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
+    return np.asarray(inwards * (points[:, axis] - at))
 
 
 ALONG = 1e-3
