@@ -371,14 +371,14 @@ def command(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="a word in the names of rows, or texts")
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args(arguments)
+    old = {} if given.write else json.loads(given.compare.read_text(encoding="utf-8"))
+    old = {name: one for name, one in old.items() if given.only in name}
     new = frozen(given.only, given.processes)
     if given.write:
         kept = json.loads(given.write.read_text()) if given.only and given.write.exists() else {}
         given.write.write_text(json.dumps(kept | new, indent=0) + "\n", encoding="utf-8")
         print(f"{len(new)} rows in {given.write}")
         return 0
-    old = json.loads(given.compare.read_text(encoding="utf-8"))
-    old = {name: one for name, one in old.items() if given.only in name}
     found = list(differences(old, new, given.bits))
     print(*found, f"rows: {len(new)}, differences: {len(found)}", sep="\n")
     return 1 if found else 0
