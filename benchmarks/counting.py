@@ -6,7 +6,7 @@ from typing import Any
 
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass
 from cortado.rollout.rollout import BackwardStep, Observer
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 
 BACKWARD = 3
 """Forward steps that a step back counts as: it computes the step once more, and has twice its neighbour sums."""

@@ -18,7 +18,7 @@ from cortado.losses import Frames
 from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.scene import Scene
 from experiments.reference_losses import reference_loss
 

@@ -45,7 +45,7 @@ from cortado.cli import main
 from cortado.cli.commands.new import new_scene, templates
 from cortado.cli.subcommands import CORTADO
 from cortado.optimisation.inverse.file_schema import file_schema
-from cortado.scene.parameters.parameter import Role
+from cortado.scene.parameters import Role
 from scenes import jet, plane, plane_of_three, scene, two_layers
 from test_free_bodies import RAFT
 from test_free_bodies import plane as with_bodies

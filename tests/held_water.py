@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 
 from cortado import Scene, Simulation
+from cortado.scene.fields import rotation_matrix
 from cortado.scene.solid_shapes import BoxSolid, CupSolid, MeshSolid
 from cortado.scene.solids import SolidTable
-from cortado.scene.turns import rotation_matrix
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
 GRAVITY = 9.81

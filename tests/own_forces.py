@@ -5,8 +5,8 @@ from functools import cache
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.scene.parameters.known import TIME
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameter_values import TIME
+from cortado.scene.parameters import Axis, Parameter
 
 
 @cache

@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.parts import Carried, Part, PartAdjoint, PartTangent
 
 U = StateField("remembered_velocities", "m/s", Entry.VECTOR, first="initial_velocities")

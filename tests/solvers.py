@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent

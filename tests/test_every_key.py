@@ -14,7 +14,7 @@ import trimesh
 from cortado import CortadoError, Scene, Simulation
 from cortado.pictures.painter import colours_of, painter
 from cortado.runs.pace import Pace
-from cortado.scene.camera_paths import Moment, View
+from cortado.scene.appearance import Moment, View
 from cortado.scene.model import SceneTables
 from every_key import given, key_at, keys_of, places, put, same, told
 from scenes import jet, plane, plane_of_three, scene

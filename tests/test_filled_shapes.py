@@ -7,7 +7,7 @@ import trimesh
 
 from cortado import Scene, SceneError, Simulation
 from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.turns import rotation_matrix
+from cortado.scene.fields import rotation_matrix
 from test_packing import densities
 
 SPACING = 0.05

@@ -18,9 +18,7 @@ from cortado.pictures.shown_run import ShownRun, ages, is_out, vorticity
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.near_particles import Particles
 from cortado.pictures.tracing.shadow import FloorShadow
-from cortado.scene.camera_paths import Moment, View
-from cortado.scene.lights import LIGHTS
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import LIGHTS, Moment, Picture, View
 from scenes import jet, plane, pour, scene
 
 SMALL = {"width": 160, "height": 90}

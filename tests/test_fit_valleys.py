@@ -14,7 +14,7 @@ from cortado.optimisation.fitting.bar_slopes import over_the_bars
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
 from cortado.optimisation.fitting.other_starts import other_starts
-from cortado.scene.parameters.parameter import Range
+from cortado.scene.parameters import Range
 
 TIMES = np.linspace(0.0, 2.0, 40)
 SIZE = 0.01

@@ -23,7 +23,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
-from cortado.scene.parameters.reference_density import (
+from cortado.scene.parameter_values import (
     reference_density,
     reference_density_adjoint,
     reference_density_tangent,

@@ -233,7 +233,7 @@ def test_import_is_light():
 
 WITHOUT_WARP = [
     "errors",
-    "scene.parameters.values",
+    "scene.parameter_values",
     "discretise.calibration",
     "scene.scene",
     "scene.discrete_scene",

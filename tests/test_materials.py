@@ -13,7 +13,7 @@ from cortado.pictures.tracing.liquid_surface import liquid_surface
 from cortado.pictures.tracing.near_particles import Particles
 from cortado.pictures.tracing.space import State, environment_of
 from cortado.pictures.tracing.wetting import particles_of
-from cortado.scene.materials import FINISHES, LIQUIDS
+from cortado.scene.appearance import FINISHES, LIQUIDS
 
 DARK = (0.06, 0.06, 0.06)
 FRONT = {"camera": [0.03, 0.03, 0.5], "look_at": [0.03, 0.03, 0.01], "field_of_view": 12.0}

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses
-from cortado.scene.parameters.reference_density import reference_density
+from cortado.scene.parameter_values import reference_density
 from cortado.sph.free_energy import FreeEnergy
 from finite_differences import decades, distance
 from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers

@@ -10,10 +10,10 @@ from cortado.losses import CentreOfMass
 from cortado.pictures.run_pictures import run_page
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.discrete_scene import discretise
+from cortado.scene.fields import rotation_matrix
 from cortado.scene.motions import greatest_speed
+from cortado.scene.scene_warnings import standing_sentences
 from cortado.scene.stability import stability_limits
-from cortado.scene.standing_solids import standing_sentences
-from cortado.scene.turns import rotation_matrix
 from scenes import jet
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
@@ -350,7 +350,7 @@ def test_a_path_bounds_all_steps_where_nothing_else_does():
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
     """With walls that weigh nothing; a larger one comes to it sooner, by what it reaches further down."""
-    from cortado.scene import walls
+    from cortado.scene import discrete_scene as walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
     falling = {"name": "block", "shape": "box", "lower": [0.2, 0.45], "upper": [0.4, 0.65], "motion": "path"}

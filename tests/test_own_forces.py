@@ -7,7 +7,7 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, gradients
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter
 from own_forces import Breeze
 from scenes import plane, splash
 

@@ -15,7 +15,7 @@ import pytest
 
 import cortado
 from cortado import ComputationError, InputError, Problem, Scene, SceneError, Simulation, load_scene, losses, reference
-from cortado.scene.package_parts import guarded
+from cortado.scene.packages import guarded
 from own_forces import Breeze
 from packages import install, on_path
 from solvers import MakeRemembering
@@ -140,7 +140,7 @@ def test_a_scene_without_them_reads_no_entry_points(tmp_path, monkeypatch):
     def read(**group):
         raise AssertionError
 
-    monkeypatch.setattr("cortado.scene.entry_points.entry_points", read)
+    monkeypatch.setattr("cortado.scene.packages.entry_points", read)
     monkeypatch.setattr(importlib.metadata, "entry_points", read)
     (tmp_path / "scene.toml").write_text(SCENE + OURS)
     assert Simulation(tmp_path / "scene.toml").run(1).positions.shape == (2, 64, 2)

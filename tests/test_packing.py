@@ -13,7 +13,7 @@ from cortado.discretise.room import Region
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.sampling import period
+from cortado.scene.fluid_particles import period
 from cortado.scene.scene import Scene
 
 SPACING = 0.05

@@ -7,10 +7,8 @@ import pytest
 
 from cortado import InputError, Problem, Simulation, losses
 from cortado.gradients import Exact
-from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.registry import BY_NAME, PARAMETERS, names
-from cortado.scene.parameters.table import markdown
-from cortado.scene.parameters.values import scene_values
+from cortado.scene.parameter_values import scene_values
+from cortado.scene.parameters import BY_NAME, PARAMETERS, Role, markdown, names
 from scenes import plane, plane_of_three, scene
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "parameters.md"

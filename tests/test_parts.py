@@ -7,7 +7,7 @@ import cortado
 from cortado import Problem, Simulation, gradients
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameters import Axis
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Carried, Part
 from remembering_force import TAU, Memory, MemoryForce, U

@@ -8,8 +8,7 @@ import pytest
 
 from cortado import InputError, Problem, Simulation, losses, reference
 from cortado.reference import Terms
-from cortado.scene.discrete_scene import discretise
-from cortado.scene.walls import mirrors_of
+from cortado.scene.discrete_scene import discretise, mirrors_of
 from cortado.solvers.projection.lattice import coarse_grid
 from reference_projection import Projection
 from scenes import plane, scene

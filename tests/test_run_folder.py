@@ -24,7 +24,7 @@ from cortado.files.terminal import track
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.pictures.report import Section, write_report, written
 from cortado.runs.run_folder import RunFolder
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 
 SCENE = '{"name": "drop", "dimension": 2}'
 COMMAND = ["cortado", "run", "drop.toml"]

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from cortado import CortadoWarning, Simulation
 from cortado.errors import InputError, SceneError, unwarned
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.sampling import fluid_particles, period
+from cortado.scene.fluid_particles import fluid_particles, period
 from cortado.scene.scene import Scene
 from test_packing import densities
 

@@ -19,8 +19,7 @@ from cortado.errors import CortadoWarning, DivergedError, InputError, MassWarnin
 from cortado.losses import CentreOfMass
 from cortado.problem import Problem
 from cortado.scene.fluids import BoxFluid
-from cortado.scene.mixture import MixtureTable
-from cortado.scene.model import DiscretisationTable
+from cortado.scene.model import DiscretisationTable, MixtureTable
 from cortado.scene.scene import Scene, load_scene, scene_from_dict
 from cortado.scene.stability import stability_limit, stability_limits
 from cortado.scene.toml import read_toml

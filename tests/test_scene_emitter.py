@@ -11,7 +11,7 @@ from cortado import Problem, Simulation, losses
 from cortado.discretise.shapes import across, disc
 from cortado.errors import CortadoWarning, SceneError
 from cortado.scene.emitter import EmitterTable
-from cortado.scene.sampling import fluid_particles
+from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.scene import Scene
 from cortado.scene.stability import stability_limit
 

@@ -6,8 +6,8 @@ import pytest
 
 from bad_scenes import GOOD_SCENE, MIXTURE, plane
 from cortado.errors import SceneError
-from cortado.scene.mixture import MixtureTable
-from cortado.scene.sampling import fluid_particles
+from cortado.scene.fluid_particles import fluid_particles
+from cortado.scene.model import MixtureTable
 from cortado.scene.scene import Scene, scene_from_dict
 
 PHASES = [{"name": name, "rest_density": 1000, "viscosity": 0.001} for name in ("water", "oil", "ink")]

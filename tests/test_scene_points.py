@@ -9,7 +9,7 @@ import pytest
 from bad_scenes import GOOD_SCENE, assert_one_sentence, plane
 from cortado.errors import InputError, SceneError
 from cortado.files.vtkhdf import TrajectoryWriter
-from cortado.scene.points import read_points
+from cortado.scene.point_files import read_points
 from cortado.scene.scene import Scene, load_scene
 
 
@@ -188,7 +188,7 @@ def test_only_regular_files_are_read(tmp_path):
 
 
 def test_a_file_that_takes_for_ever_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("cortado.scene.points.SECONDS", 0.01)
+    monkeypatch.setattr("cortado.scene.point_files.SECONDS", 0.01)
     (tmp_path / "a.vtk").write_bytes(LEGACY)
     with pytest.raises(InputError, match="was not read within 0 s; it may be damaged"):
         read_points(str(tmp_path / "a.vtk"), 3)

@@ -14,7 +14,7 @@ from cortado.particles.arrays import to_device
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
-from cortado.scene.render import Render
+from cortado.scene.appearance import Render
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.simulation import Simulation
 from scenes import plane, plane_of_three, scene

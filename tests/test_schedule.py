@@ -11,8 +11,8 @@ from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
 from cortado.certificate import certify
 from cortado.cli.commands.run_summary import Energy, RunSummary
-from cortado.scene.in_words import scene_in_words
-from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameter_values import Tilt
+from cortado.scene.scene import scene_in_words
 from cortado.scene.schedule import Course
 from cortado.scene.stability import stability_limit
 from experiments.experiment_files import load_experiment

@@ -12,7 +12,7 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimisers import LBFGS, Adam
 from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
-from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameter_values import Tilt
 
 
 @pytest.fixture

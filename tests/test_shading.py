@@ -30,7 +30,7 @@ from cortado.pictures.tracing.trace import find_contrast
 from cortado.pictures.tracing.wetting import particles_of, wetting
 from cortado.runs.pace import Pace, pace_of
 from cortado.runs.run_folder import RunFolder
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 
 SMALL = {"width": 96, "height": 64}
 FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])

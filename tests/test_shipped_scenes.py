@@ -10,7 +10,7 @@ from cortado.cli.commands.new import new_scene, templates
 from cortado.errors import CortadoWarning
 from cortado.optimisation.inverse.task import load_task
 from cortado.rollout.parameter_checks import unstable_sentence
-from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameter_values import Tilt
 from cortado.scene.scene import load_scene
 
 ROOT = Path(__file__).parents[1]

@@ -16,8 +16,8 @@ from cortado.pictures.run_pictures import shown_as
 from cortado.pictures.shown_run import ShownRun, coloured_by
 from cortado.pictures.side_by_side import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
-from cortado.scene.picture import Picture
-from cortado.scene.units import unit_of
+from cortado.scene.appearance import Picture
+from cortado.scene.toml import unit_of
 from scenes import plane, scene
 
 SMALL = {"width": 256, "height": 144}

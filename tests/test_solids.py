@@ -9,7 +9,6 @@ from cortado.discretise.pairs import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.room import solids_of
 from cortado.scene.solid_shapes import (
     BoxSolid,
     CapsuleSolid,
@@ -18,6 +17,7 @@ from cortado.scene.solid_shapes import (
     PolygonSolid,
     SphereSolid,
 )
+from cortado.scene.solids import solids_of
 
 SOLIDS = {
     "rectangle": BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3),
@@ -226,7 +226,7 @@ def test_a_cup_that_leans_holds_water():
 
 def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
     """With walls that weigh nothing."""
-    from cortado.scene import walls
+    from cortado.scene import discrete_scene as walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
     above = {"shape": "box", "lower": [0.5, 0.4], "upper": [0.7, 0.6], "phase": "water"}

@@ -11,7 +11,7 @@ import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
 from cortado.cli.commands.run import RunRequest, run_scene
 from cortado.runs.recording import EverySteps
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter
 from cortado.scene.solvers import PackageSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.particles import ParticleSolver

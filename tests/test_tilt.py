@@ -6,7 +6,7 @@ import pytest
 import cortado
 from cortado import InputError, Problem, Simulation, losses
 from cortado.optimisation.transforms import TimeInterpolation, Transformed
-from cortado.scene.parameters.tilt import SMALL, Tilt
+from cortado.scene.parameter_values import SMALL, Tilt
 from finite_differences import decades, distance, plateau
 from scenes import plane, scene, splash
 

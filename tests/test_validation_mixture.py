@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from cortado import Scene, Simulation, Trajectory
 from cortado.discretise.calibration import shear_factor
-from cortado.scene.parameters.reference_density import reference_density
+from cortado.scene.parameter_values import reference_density
 
 
 def resting(

@@ -17,7 +17,7 @@ from cortado.device.launching import watched
 from cortado.discretise.shapes import Points
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import painter
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 
 WATER = 0.1, 0.32, 0.62

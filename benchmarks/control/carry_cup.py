@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado import Problem, Scene
 from cortado.optimisation.transforms import Affine
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .carry import Carry
 from .task import WATER, Controls, Score, scene_of

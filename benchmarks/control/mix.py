@@ -13,7 +13,7 @@ import numpy as np
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 

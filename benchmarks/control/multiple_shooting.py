@@ -10,7 +10,7 @@ from cortado import InputError, Problem, gradients, optimise, optimisers
 from cortado.errors import ComputationError, DivergedError
 from cortado.losses import Frames, Loss, Snapshot
 from cortado.losses.loss import Adjoint, by_field
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .objective import BudgetSpent, Objective
 from .task import GRAVITY

@@ -11,7 +11,7 @@ from cortado import DivergedError, Problem
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
 from cortado.optimisation.fixed_parameters import FixedParameters
 from cortado.optimisation.transforms import Transformed
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from ..counting import Counted, Steps
 from .task import Task

@@ -14,7 +14,7 @@ from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .task import WATER, Controls, Score, Task, blocks_of, scene_of
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Image
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 

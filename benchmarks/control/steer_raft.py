@@ -13,7 +13,7 @@ import numpy as np
 from cortado import Problem, Scene, Simulation
 from cortado.losses import SolidPose
 from cortado.optimisation.transforms import Affine
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .task import WATER, Controls, Score, Task, scene_of
 

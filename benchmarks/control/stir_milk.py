@@ -13,7 +13,7 @@ import numpy as np
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Frames, Image
 from cortado.optimisation.transforms import Affine
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 from .task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 

@@ -13,7 +13,7 @@ import numpy as np
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames, Loss
 from cortado.optimisation.transforms import Affine
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 GRAVITY = 9.81
 """[m/s2]"""

@@ -18,7 +18,7 @@ from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import OfLost, Residual, without_lost
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import add_to_row
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Rollout
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.trajectory import noted
-from cortado.scene.parameters.values import NAMES, UNITS, Arrays, Values, require_points
+from cortado.scene.parameter_values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 from cortado.words import counted
@@ -46,7 +46,7 @@ class Problem:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
     - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], how far the scene's gravity leans, with its
-      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.scene.parameters.tilt.Tilt`;
+      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.scene.parameter_values.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];

@@ -40,10 +40,9 @@ from cortado.runs.quantities.moment import Moment
 from cortado.runs.recording import recorded
 from cortado.runs.sensors.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.distance import check_distance
-from cortado.scene.parameters.values import OVER_TIME, scene_values
-from cortado.scene.quantities import check_readable
+from cortado.scene.discrete_scene import DiscreteScene, check_distance, discretise
+from cortado.scene.parameter_values import OVER_TIME, scene_values
+from cortado.scene.quantity_names import check_readable
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN

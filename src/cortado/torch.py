@@ -18,7 +18,7 @@ from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.host_states import Given, States
 from cortado.runs.sensors.sensor import Sensor
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 from cortado.simulation import Simulation
 
 __all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "state", "step", "value"]

@@ -18,7 +18,7 @@ from cortado.runs.quantities.moment import Moment, Recorder
 from cortado.runs.sensors.placement import sensors_of, warn_of_places
 from cortado.runs.sensors.readings import Readings, SensorLog
 from cortado.runs.sensors.sensor import Sensor
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 
 class Watched(Steppable, Protocol):

@@ -6,12 +6,11 @@ import numpy as np
 
 from cortado.discretise.calibration import SKIN, stress_control
 from cortado.errors import InputError, shown
-from cortado.scene.discrete_scene import DiscreteScene
-from cortado.scene.parameters.registry import BY_NAME
+from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
+from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
-from cortado.scene.walls import mirrors_of
 from cortado.solvers.projection.lattice import coarse_grid, endless, lattice_constants
 from cortado_reference.engine import extension
 

@@ -11,8 +11,8 @@ from cortado.device.threads import usable_cores
 from cortado.discretise.room import TOLERANCE
 from cortado.errors import DivergedError, InputError, shown
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.parameters.registry import BY_NAME
-from cortado.scene.parameters.values import checked_value
+from cortado.scene.parameter_values import checked_value
+from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import ProjectionSolver
 from cortado.scene.stability import divergence_advice

@@ -33,8 +33,8 @@ from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
 from cortado.runs.run_files import as_json, finite
-from cortado.scene.parameters.parameter import Range, Role
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
+from cortado.scene.parameters import Range, Role
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.words import counted

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.certificate.loss_history import LossHistory
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.words import ShortRepr
 
 STEPS = tuple(10.0**-k for k in range(3, 9))

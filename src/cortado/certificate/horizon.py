@@ -12,8 +12,8 @@ from cortado.gradients import AdjointViscosity, EnsembleMean, Exact, GradientEst
 from cortado.gradients.estimator import NO_RUN
 from cortado.problem import Problem
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
+from cortado.scene.parameters import Axis, Parameter, Range, Role
 from cortado.words import ShortRepr
 
 PERTURBATION = 0.05

@@ -26,7 +26,7 @@ from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 

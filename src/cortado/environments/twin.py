@@ -16,7 +16,7 @@ from cortado.losses import Frames
 from cortado.optimisation.fixed_parameters import FixedParameters
 from cortado.optimisation.transforms import Affine, Transformed
 from cortado.problem import Problem
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 

@@ -23,7 +23,7 @@ from cortado.gradients.estimator import (
 )
 from cortado.gradients.reverse_mode import AdjointViscosity, Exact, ImplicitPressure, Tape
 from cortado.rollout.rollout import OBSERVED, Observer
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 
 __all__ = [
     "AdjointEstimator",

@@ -25,7 +25,7 @@ from cortado.gradients.estimator import (
 from cortado.gradients.reverse_mode import AdjointViscosity
 from cortado.rollout.rollout import Observer
 from cortado.scene.fields import as_number
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 
 MOST_SAMPLES = 100_000
 """Samples of an ensemble; more are taken for a mistake."""

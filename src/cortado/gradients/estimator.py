@@ -13,7 +13,7 @@ from cortado.errors import DivergedError, InputError, OutOfRangeError, shown
 from cortado.executors import Executor, OnResult
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 from cortado.solvers.solver import Counts
 from cortado.words import counted, sized
 

@@ -14,7 +14,7 @@ from cortado.particles.state import Parameters, State
 from cortado.rollout.adjoint_step import AdjointStep, ResumingStep
 from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.scene.fields import as_number
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 from cortado.solvers.solver import Counts
 
 

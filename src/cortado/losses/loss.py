@@ -17,7 +17,7 @@ from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.quantities import check_readable
+from cortado.scene.quantity_names import check_readable
 from cortado.scene.solids import SolidTable
 from cortado.words import counted
 

@@ -26,8 +26,8 @@ from cortado.losses.loss import (
     moment_of,
 )
 from cortado.particles.state import State
-from cortado.scene.parameters.values import Arrays
-from cortado.scene.quantities import check_readable
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.quantity_names import check_readable
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"

@@ -10,7 +10,7 @@ from cortado.errors import InputError, shown, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_estimator, evaluated, without_runs
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 from cortado.words import counted
 
 

@@ -18,7 +18,7 @@ from cortado.optimisation.promises import Promises
 from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
 from cortado.optimisation.result import Parameters, Record
 from cortado.rollout.rollout import Observer
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 
 GREATEST_GRADIENT = 1e150
 """Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow."""

@@ -6,7 +6,7 @@ from typing import Any
 from cortado.errors import DivergedError
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass
 from cortado.problem import Problem
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 
 
 class FixedParameters:

@@ -18,7 +18,7 @@ from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer
-from cortado.scene.parameters.values import Arrays, Values, check_known, require_points
+from cortado.scene.parameter_values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
 """Smaller fractions are replaced by this one where their coordinates are computed: that of 0 is minus infinity."""

@@ -8,7 +8,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.fixed import Staying
-from cortado.scene.parameters.known import argument
+from cortado.scene.parameter_values import argument
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters import Axis, Parameter
 
 
 class Entry(Enum):

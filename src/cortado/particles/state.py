@@ -11,8 +11,8 @@ from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction, sum_of
 from cortado.particles.arrays import Arrays, components, padded, zeros
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.known import REGISTRY, Known
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameter_values import REGISTRY, Known
+from cortado.scene.parameters import Axis
 
 
 class State(Arrays):

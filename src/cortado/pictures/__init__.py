@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from cortado.pictures.image_files import read_picture as read_picture
     from cortado.pictures.image_files import rosetta as rosetta
     from cortado.pictures.image_files import write_picture as write_picture
-    from cortado.scene.camera_paths import Dolly as Dolly
-    from cortado.scene.camera_paths import Follow as Follow
-    from cortado.scene.camera_paths import Keyframes as Keyframes
-    from cortado.scene.camera_paths import Orbit as Orbit
+    from cortado.scene.appearance import Dolly as Dolly
+    from cortado.scene.appearance import Follow as Follow
+    from cortado.scene.appearance import Keyframes as Keyframes
+    from cortado.scene.appearance import Orbit as Orbit
 
 _PATHS = ("Dolly", "Follow", "Keyframes", "Orbit")
 _FILES = ("COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture")
@@ -23,7 +23,7 @@ __all__ = [*_PATHS, *_FILES]
 
 if not TYPE_CHECKING:
     __getattr__ = getter(
-        __name__, dict.fromkeys(_FILES, "image_files") | dict.fromkeys(_PATHS, "cortado.scene.camera_paths")
+        __name__, dict.fromkeys(_FILES, "image_files") | dict.fromkeys(_PATHS, "cortado.scene.appearance")
     )
 
 

@@ -22,7 +22,7 @@ from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.space import SpacePainter, State
 from cortado.pictures.tracing.steady import WINDOW
 from cortado.runs.pace import Film, Pace
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 
 Ahead = Callable[[Iterator[Points]], Iterator[Points]]

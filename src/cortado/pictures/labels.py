@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.files.image_encoding import from_srgb
-from cortado.scene.quantities import QUANTITIES
+from cortado.scene.quantity_names import QUANTITIES
 
 FINER = 3
 """How many times finer than pixels lines are drawn, for smooth edges."""

@@ -20,7 +20,7 @@ from cortado.pictures.shown_solids import solid_outline
 from cortado.problem import Problem
 from cortado.runs.pace import Film
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.values import UNITS
+from cortado.scene.parameter_values import UNITS
 from cortado.simulation import Simulation
 
 IN_MOTION = 1_000_000

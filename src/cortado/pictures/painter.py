@@ -11,7 +11,7 @@ from cortado.pictures.plane import PlanePainter, PlaneStage
 from cortado.pictures.stage import Stage
 from cortado.pictures.tracing.near_particles import mixed
 from cortado.pictures.tracing.space import SpacePainter
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 
 

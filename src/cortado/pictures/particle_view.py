@@ -18,8 +18,8 @@ from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.stage import upright
+from cortado.scene.common_shapes import INDEX_OF_AXIS
 from cortado.scene.containers import CylinderContainer
-from cortado.scene.fluids import INDEX_OF_AXIS
 from cortado.scene.scene import Scene
 
 MOST_BYTES = 2_200_000

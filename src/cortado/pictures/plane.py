@@ -15,8 +15,8 @@ from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_so
 from cortado.pictures.stage import fluid_extent, thinned
 from cortado.pictures.tracing.space import State
 from cortado.pictures.tracing.wetting import mirrored
+from cortado.scene.appearance import Picture
 from cortado.scene.containers import BoxContainer
-from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 
 LIGHT = (-0.45, 0.70, 0.55)

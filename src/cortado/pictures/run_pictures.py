@@ -27,12 +27,11 @@ from cortado.pictures.stage import Stage
 from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Film, pace_of
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.scene.camera_paths import CameraPath
-from cortado.scene.parameters.parameter import Axis
-from cortado.scene.picture import Picture
-from cortado.scene.quantities import NAMES
+from cortado.scene.appearance import CameraPath, Picture
+from cortado.scene.parameters import Axis
+from cortado.scene.quantity_names import NAMES
 from cortado.scene.scene import Scene, as_scene
-from cortado.scene.sentences import field_name
+from cortado.scene.tables import field_name
 from cortado.simulation import Simulation
 
 

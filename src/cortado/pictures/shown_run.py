@@ -22,9 +22,8 @@ from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.space import State
 from cortado.runs.solid_motion import SolidMotions, posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.camera_paths import Moment, View
-from cortado.scene.picture import Picture
-from cortado.scene.quantities import sizes
+from cortado.scene.appearance import Moment, Picture, View
+from cortado.scene.quantity_names import sizes
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.version import __version__

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Faces, Hollow, Placed, Solid
-from cortado.scene.materials import Finish
+from cortado.scene.appearance import Finish
 from cortado.scene.scene import Scene
 
 Numbers = NDArray[np.int64]

@@ -25,9 +25,9 @@ from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Film, pace_of
 from cortado.runs.run_files import computed
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, as_scene
-from cortado.scene.units import unit_of
+from cortado.scene.toml import unit_of
 
 
 @public

@@ -9,11 +9,9 @@ import numpy as np
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids, union
-from cortado.scene.camera_paths import View
+from cortado.scene.appearance import LIQUIDS, Picture, View
+from cortado.scene.common_shapes import INDEX_OF_AXIS
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
-from cortado.scene.fluids import INDEX_OF_AXIS
-from cortado.scene.materials import LIQUIDS
-from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 
 DROPS = 0.002

@@ -10,10 +10,10 @@ from cortado.discretise.smoothing import SmoothingKernel
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
 from cortado.render.views import TopView, View, Volume
+from cortado.scene.appearance import Render
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.render import Render
 from cortado.scene.scene import Scene
-from cortado.scene.sentences import sentences
+from cortado.scene.tables import sentences
 
 UP = {2: 2, 3: 1}
 """The axis that points upwards, by dimension; in 2-D the one that the plane lacks."""

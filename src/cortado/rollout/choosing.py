@@ -11,7 +11,7 @@ from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import greatest_step, step_bounds
 from cortado.rollout.step_sizes import ChosenSteps
 from cortado.rollout.travel import Travel, moved_by
-from cortado.scene.parameters.values import Arrays, stacked
+from cortado.scene.parameter_values import Arrays, stacked
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
 

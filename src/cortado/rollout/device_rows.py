@@ -17,8 +17,8 @@ from cortado.particles.state import Parameters
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import OfLost
 from cortado.rollout.scene_parameters import Simulated
-from cortado.scene.parameters.parameter import Axis, Role
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
+from cortado.scene.parameters import Axis, Role
 
 
 class DeviceRows:

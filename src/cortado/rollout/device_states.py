@@ -15,7 +15,7 @@ from cortado.rollout.host_states import HostStates, States, clocks_after, requir
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import OfLost
 from cortado.rollout.rollout import Rollout
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.restart import RestartState
 
 

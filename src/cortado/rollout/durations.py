@@ -14,7 +14,7 @@ from cortado.rollout.scene_parameters import SceneParameters, Simulated
 from cortado.rollout.step_bounds import step_bounds
 from cortado.rollout.step_sizes import ChosenSteps
 from cortado.rollout.travel import Travel, moved_by
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.solvers import COURANT
 from cortado.scene.stability import stability_limits
 

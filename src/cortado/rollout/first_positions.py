@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from cortado.discretise.pairs import check_apart, check_crowding, nearest
 from cortado.rollout.scene_parameters import Simulated
-from cortado.scene.overlaps import NEAREST
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.checks import NEAREST
+from cortado.scene.parameter_values import Arrays
 
 MOVED = 0.05
 """In spacings: positions that have moved by less along every axis since they were judged are not judged again. A

@@ -15,7 +15,7 @@ from cortado.rollout.residual import OfLost, without_lost
 from cortado.rollout.restarts import one_for_each
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import Simulated
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.restart import Clock, RestartState
 
 States = RestartState | tuple[RestartState, ...]

@@ -8,10 +8,9 @@ import numpy as np
 from cortado.device.precision import Precision
 from cortado.discretise.room import TOLERANCE, Room
 from cortado.errors import InputError, OutOfRangeError
-from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.parameter import Range
-from cortado.scene.parameters.values import Arrays
-from cortado.scene.room import room_of
+from cortado.scene.model import room_of
+from cortado.scene.parameter_values import Arrays, Known
+from cortado.scene.parameters import Range
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
 

@@ -17,11 +17,11 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import greatest_step
 from cortado.rollout.supply import dry_sentence
-from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
+from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
+from cortado.scene.parameters import Role
 from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.scene_warnings import parameter_sentence
 from cortado.scene.stability import divergence_advice
-from cortado.scene.viscous_forms import parameter_sentence
 
 STATE_TIME = "time"
 """What the time of a state is called among derivatives with respect to its fields."""

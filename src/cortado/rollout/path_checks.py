@@ -6,11 +6,11 @@ import numpy as np
 
 from cortado.particles.state import State
 from cortado.rollout.travel import Travel, moved_by
+from cortado.scene.discrete_scene import WHOLE
 from cortado.scene.motions import displacement_name, position_name, scale_name, told
-from cortado.scene.parameters.parameter import Changing
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.parameters import Changing
 from cortado.scene.scene import Scene
-from cortado.scene.walls import WHOLE
 
 FURTHEST = 1.0
 """In spacings: solids that go further in a step pass over fluid, which is in them then."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.parameters.parameter import Changing
-from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameter_values import Tilt
+from cortado.scene.parameters import Changing
 from cortado.scene.scene import Scene
 from cortado.scene.schedule import Course
 from cortado.scene.stability import gravity_limits

@@ -7,7 +7,7 @@ import numpy as np
 from cortado.particles.state import Parameters, State
 from cortado.rollout.evaluation import PutAside
 from cortado.rollout.rollout import Rollout
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 OfLost = Mapping[int, float]
 """By the numbers of the scenes of a batch that were lost what derivatives of them are: 0 where only zeros were given,

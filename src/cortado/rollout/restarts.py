@@ -11,8 +11,8 @@ from cortado.discretise.pairs import check_apart, nearest
 from cortado.errors import InputError, shown
 from cortado.rollout.parameter_checks import outside, place_in_words
 from cortado.rollout.scene_parameters import DENSITY, Simulated
+from cortado.scene.model import resting_room
 from cortado.scene.restart import Clock, Origin, RestartState
-from cortado.scene.room import resting_room
 
 SAME = 1e-6
 """Relative: two numbers that differ by less are the same, as one of them may have been rounded to float32."""

@@ -16,15 +16,16 @@ from cortado.particles.fields import first_values
 from cortado.particles.state import State
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.motions import Steady
-from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.parameter import Axis, Changing, Source
-from cortado.scene.parameters.reference_density import (
+from cortado.scene.parameter_values import (
+    Arrays,
+    Known,
+    Tilt,
     reference_density,
     reference_density_adjoint,
     reference_density_tangent,
+    scene_values,
 )
-from cortado.scene.parameters.tilt import Tilt
-from cortado.scene.parameters.values import Arrays, scene_values
+from cortado.scene.parameters import Axis, Changing, Source
 from cortado.scene.restart import Clock, RestartState
 from cortado.sph.makers import ForceMaker
 

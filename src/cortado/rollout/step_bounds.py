@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.scene.model import SceneTables
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.stability import chosen_limits, gravity_limits, stability_limits
 
 

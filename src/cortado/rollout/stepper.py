@@ -23,7 +23,7 @@ from cortado.rollout.residual import Residual, of_lost, without_lost
 from cortado.rollout.restarts import check_directions
 from cortado.rollout.rollout import BackwardStep, Rollout
 from cortado.rollout.scene_parameters import Simulated
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 from cortado.solvers.solver import Solver
 from cortado.words import counted, sized
 

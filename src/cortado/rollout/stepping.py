@@ -7,7 +7,7 @@ from cortado.device.threads import Turn, in_turn
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.host_states import Given, States
 from cortado.rollout.stepper import Steppable, Stepper
-from cortado.scene.parameters.values import Arrays, Values
+from cortado.scene.parameter_values import Arrays, Values
 
 KEPT = 4
 """Numbers of steps whose arrays and graphs a simulation keeps for the next call."""

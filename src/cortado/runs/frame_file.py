@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.files import vtkhdf
-from cortado.scene.quantities import QUANTITIES
+from cortado.scene.quantity_names import QUANTITIES
 from cortado.scene.restart import Origin
 
 SAME = 1e-9

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import warn
 from cortado.on_top import on_top
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.words import counted
 
 SHORTEST, LONGEST = 4.0, 10.0

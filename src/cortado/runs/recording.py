@@ -14,7 +14,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_file import Marks
 from cortado.runs.solid_motion import solid_motions
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock
 from cortado.scene.scene import Scene
 from cortado.words import counted

@@ -27,7 +27,7 @@ from cortado.runs.run_files import (
     session,
 )
 from cortado.runs.sensors.readings import Readings, as_csv, from_csv
-from cortado.scene.parameters.values import NAMES
+from cortado.scene.parameter_values import NAMES
 from cortado.scene.scene import Scene
 
 _FORMAT = 2

@@ -22,7 +22,7 @@ from cortado.runs.frame_file import FRACTION, Marks, append_frame, fraction_name
 from cortado.runs.pace import Film
 from cortado.runs.sensors.readings import Readings
 from cortado.runs.solid_motion import SolidMotions, motions_in
-from cortado.scene.quantities import QUANTITIES, check_quantity
+from cortado.scene.quantity_names import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
 from cortado.words import counted

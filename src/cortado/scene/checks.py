@@ -1,5 +1,8 @@
 """What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises a `field_error`."""
 
+from itertools import product
+from typing import Any
+
 import numpy as np
 from pydantic_core import PydanticCustomError
 
@@ -7,22 +10,150 @@ from cortado.device.memory import sampling_parts, shortage
 from cortado.discretise.mesh_files import read_mesh
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
+from cortado.scene.common_shapes import MeshShape
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import MISSING, FieldPath, field_error
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
-from cortado.scene.free_bodies import check_free
-from cortado.scene.mixture import MixtureTable
-from cortado.scene.model import SceneTables
-from cortado.scene.outlines import MeshShape
-from cortado.scene.overlaps import check_distinct, check_overlaps
-from cortado.scene.parameters.registry import BY_NAME
-from cortado.scene.room import room_of
-from cortado.scene.sensors import SolidLoadTable
-from cortado.scene.sentences import point_in_words
+from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable, room_of
+from cortado.scene.motions import free
+from cortado.scene.parameters import BY_NAME
 from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
+from cortado.scene.tables import field_name, point_in_words
+
+DEEPEST = 0.25
+"""In spacings: how deep bodies may begin in walls and in each other."""
+FINE, MOST = 0.5, 40
+"""In spacings: how far apart the points are by which a body is looked at, of which there are at most so many along an
+axis."""
+
+
+def check_free(scene: SceneTables) -> None:
+    """Bodies are moved by the projection alone, and begin outside of walls and of each other."""
+    bodies = free(scene.solid)
+    if not bodies:
+        return
+    if scene.solver.kind != "projection":
+        wanted = (
+            f'"projection", as the solid {bodies[0].name!r} is free, and pressures that are not shared with it move it'
+        )
+        raise field_error(("solver", "kind"), scene.solver.kind, wanted)
+    if not scene.forces.pressure:
+        raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
+    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    region = scene.container.region(scene.dimension).opened(lengths)
+    for index, table in enumerate(scene.solid):
+        if table.motion != "free":
+            continue
+        points = _points_within(table.solid(), FINE * spacing)
+        depths = [("the container", region.distance(points))]
+        for other in scene.solid:
+            if other is not table:
+                near = _nearest_images(points, np.mean(other.solid().extent(), axis=0), lengths)
+                depths.append((f"the solid {other.name!r}", -other.solid().distance(near)))
+        for name, depth in depths:
+            if depth.max() > DEEPEST * spacing:
+                place = point_in_words(points[depth.argmax()])
+                wanted = f"at most a quarter of a spacing, {DEEPEST * spacing:g} m, in it"
+                raise field_error(("solid", index), Words(f"{depth.max():g} m deep in {name} at {place}"), wanted)
+
+
+def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
+    """The images of points (n, d) that are nearest to a middle (d,), for periods (d,), 0 along axes without one."""
+    periods = np.where(lengths > 0.0, lengths, np.inf)
+    return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
+
+
+def _points_within(solid: Solid, step: float) -> Points:
+    """(n, d) the corners of a solid, and points of a lattice in it."""
+    sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
+    points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
+    return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
+
+
+NEAREST = 0.5
+"""In spacings: particles that start nearer to each other overlap."""
+DENSEST = 0.9
+"""Of the number density within a fluid: a particle that starts where another body has so much is inside of it, however
+the two lattices lie. In a corner of the other body, half a spacing away, there is at most 7/8 of it."""
+SUPPORT, NEIGHBOURS = 2.0, 40
+"""By which the number density is computed: the support [spacings], and more particles than there are within it."""
+
+
+def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
+    """The points of a file may overlap each other; those of a lattice cannot."""
+    if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
+        return
+    points = fluid.points()
+    distinct, counts = np.unique(points, axis=0, return_counts=True)
+    if len(distinct) < len(points):
+        raise field_error(path, *_overlap("itself", distinct[np.argmax(counts)], spacing))
+    from scipy.spatial import cKDTree
+
+    distances = cKDTree(points).query(points, k=[2])[0].ravel()
+    if distances.min() < _least_distance(spacing):
+        raise field_error(path, *_overlap("itself", points[np.argmin(distances)], spacing))
+
+
+def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
+    """Between different bodies, and between a body and the periodic images of all; ``lengths`` (d,) of a period [m]."""
+    paths, bodies = zip(*placed, strict=True)
+    lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
+    shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
+    for second, shift in product(range(len(bodies)), shifts):
+        last = second + 1 if shift.any() else second
+        gaps = np.maximum(lower[:last] - upper[second] - shift, lower[second] + shift - upper[:last])
+        for first in np.nonzero((gaps < _least_distance(spacing)).all(axis=1))[0]:
+            place = _meeting(bodies[first], bodies[second], shift, spacing)
+            if place is not None:
+                raise field_error(paths[second], *_overlap(field_name(paths[first]), place, spacing))
+
+
+def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
+    """(d,) where a particle of one body is too near to those of the other, the second one shifted; None if nowhere."""
+    from scipy.spatial import cKDTree
+
+    one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
+    other = _near(second.particles(spacing) + shift, first.extent(spacing), spacing)
+    if not len(one) or not len(other):
+        return None
+    distances = cKDTree(one).query(other)[0]
+    if distances.min() < _least_distance(spacing):
+        return other[np.argmin(distances)]
+    for points, body in ((other, one), (one, other)):
+        tree = cKDTree(body)
+        close = points[tree.query(points)[0] < spacing * (1.0 - 1e-6)]
+        density = _density(tree, close, spacing)
+        if density.max(initial=0.0) > DENSEST:
+            return close[np.argmax(density)]
+    return None
+
+
+def _near(points: Points, extent: Any, spacing: float) -> Points:
+    """(n, d) those points that are in a box or within the support of a particle in it."""
+    reach = SUPPORT * spacing
+    return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
+
+
+def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
+    """(n,) number density of the particles of a tree at points (n, d), over that within a fluid."""
+    dimension = points.shape[1]
+    distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
+    return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
+
+
+def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
+    wanted = f"at least half a spacing, {NEAREST * spacing:g} m, from it everywhere"
+    return Words(f"overlapping {other} at {point_in_words(place)}"), wanted
+
+
+def _least_distance(spacing: float) -> float:
+    return NEAREST * spacing * (1.0 - 1e-6)
+
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9

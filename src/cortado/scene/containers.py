@@ -14,9 +14,9 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.discretise.walls import Places, box_places, box_walls, cup_places, cup_walls, short_box
 from cortado.errors import Words
+from cortado.scene.appearance import FINISHES, Finish
+from cortado.scene.common_shapes import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
-from cortado.scene.materials import FINISHES, Finish
 from cortado.scene.tables import Table
 
 

@@ -3,10 +3,13 @@
 It is the same for every device, every precision and every engine.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.calibration import (
     lattice_laplacian_correction,
@@ -16,19 +19,179 @@ from cortado.discretise.calibration import (
 )
 from cortado.discretise.packing import Packing
 from cortado.discretise.pairs import check_crowding
-from cortado.discretise.room import Domain, Region
+from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
-from cortado.discretise.walls import RestLattice, WallLayers, wall_layers
-from cortado.errors import MassWarning, warn
-from cortado.scene.bodies import Surroundings
-from cortado.scene.fluid_masses import FluidMasses
+from cortado.discretise.solid import Placed
+from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
+from cortado.discretise.walls import (
+    Places,
+    RestLattice,
+    WallLayers,
+    even_changes,
+    uneven_changes,
+    wall_layers,
+    wall_weights,
+)
+from cortado.errors import InputError, MassWarning, warn
+from cortado.scene.containers import Container, NoContainer
+from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles, period
 from cortado.scene.fluids import PointsFluid
-from cortado.scene.sampling import FluidSample, fluid_particles, period
+from cortado.scene.model import resting_room
+from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
-from cortado.scene.standing_solids import standing_sentences
-from cortado.scene.thin_walls import thin_sentences
-from cortado.scene.walls import Walls, walls_of
+from cortado.scene.scene_warnings import standing_sentences, thin_sentences
+from cortado.scene.solids import SolidTable
+from cortado.scene.solvers import ProjectionSolver
+
+if TYPE_CHECKING:
+    from cortado.device.precision import Precision
+
+WHOLE = 1e-6
+"""By how much, relative, a solid may be shorter than a period that it fills."""
+NEAREST_PLACE = 0.4
+"""In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Wall particles, those at rest first."""
+
+    positions: Points
+    """(b, d) [m], at the start"""
+    weights: Points
+    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+    feet: Points
+    """(b, d) from each to the nearest point of its surface [m]."""
+    sticks: NDArray[np.bool_]
+    """(b,) whether fluid has no slip along each."""
+    slides: Points
+    """(b, d) how fast their surface slides along the solid, in its own frame [m/s]"""
+    solid: NDArray[np.int64]
+    """(b,) whose they are: `wall_numbers` of solids; -1 of those of the container."""
+
+    @classmethod
+    def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
+        """Those of the container, with the weights that were found; whether all stick, or each of them (b,)."""
+        grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
+        return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
+
+    @classmethod
+    def joined(cls, parts: Sequence["Walls"]) -> "Walls":
+        """One behind the other."""
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
+
+
+def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
+    container = _container(scene, layers, lattice)
+    still = [_kept(scene, container, layers, lattice)]
+    if container.room.solids:
+        still.append(_around(scene, container, still[0], layers, lattice))
+    periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
+    return Walls.joined([*still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+
+
+def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
+    """The walls of the container as they are without solids, in layers of even particles."""
+    points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
+    solids = scene.container.solids(scene.dimension, lattice.support)
+    return ContainerWalls(points, solids, resting_room(scene), lattice.spacing, lattice.support)
+
+
+def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of them that solids at rest leave."""
+    from scipy.spatial import cKDTree
+
+    points, dimension = container.points.some(container.stay), scene.dimension
+    if not len(points):
+        return Walls.of(points, points.flat, scene.container.sticks)
+    short, folded = scene.container.shortened(lattice.spacing, lattice.support)
+    sought = _even_points(short, dimension, layers, lattice.spacing)
+    lower, lengths = short.periods(dimension)
+    room = Room(short.region(dimension).opened(lengths), (), lengths)
+    places = short.places(dimension, lattice.spacing, lattice.support)
+    weights = wall_weights(sought.positions, sought.flat, places, lattice, room, lower, even_changes)
+    same = cKDTree(sought.positions).query(folded(points.positions))[1]
+    return Walls.of(points, weights[same], scene.container.sticks)
+
+
+def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
+    """The wall particles of a container."""
+    particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
+    positions = np.concatenate(particles)
+    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+    region = container.region(dimension).opened(container.periods(dimension)[1])
+    return WallPoints(positions, flat, region.nearest(positions) - positions)
+
+
+def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of all solids at rest and of the container near them, of what fluid can touch of them together."""
+    room, (lower, _) = container.room, scene.container.periods(scene.dimension)
+    resting = [solid for solid in scene.solid if not solid.moves]
+    images = [room.images(solid) for solid in room.solids]
+    tables: list[Container | SolidTable] = [scene.container for _ in container.solids]
+    tables += [table for table, several in zip(resting, images, strict=True) for _ in several]
+    solids = [image for several in images for image in several]
+    surface = ExposedSurface.of(container, solids, lower)
+    for table in resting:
+        if not any(tables[number] is table for number in np.unique(surface.owner)):
+            raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
+    beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
+    beside = beside.some(container.is_near(beside.points, lattice.support))
+    points, weights = _weighed(surface, beside, kept, layers, lattice)
+    owners, numbers = surface.owners(points), wall_numbers(scene.solid)
+    found = Walls.of(points, weights, np.array([table.sticks for table in tables])[owners])
+    of_tables = [-1 if isinstance(table, Container) else numbers[table.name] for table in tables]
+    return replace(found, solid=np.array(of_tables)[owners])
+
+
+def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period.
+
+    They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
+    how it is turned.
+    """
+    dimension, turn = len(periods), table.turn(len(periods))
+    lower, upper = table.solid().extent()
+    filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
+    solid = Placed(table.own_solid(), np.zeros(dimension), turn) if filled.any() else table.own_solid()
+    room, begins = Room(Region.everywhere(dimension), (solid,), filled), solid.extent()[0]
+    nothing = _even_points(NoContainer(), dimension, layers, lattice.spacing)
+    container = ContainerWalls(nothing, (), room, lattice.spacing, lattice.support)
+    surface = ExposedSurface.of(container, room.images(solid), begins)
+    beside, kept = Places.upright(nothing.positions), Walls.of(nothing, nothing.flat, False)
+    points, weights = _weighed(surface, beside, kept, layers, lattice)
+    frame = np.eye(dimension) if filled.any() else turn
+    placed = replace(points, positions=table.middle() + points.positions @ frame.T, feet=points.feet @ frame.T)
+    found = Walls.of(placed, weights, table.sticks)
+    slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
+    return replace(found, slides=slides, solid=np.full(len(points), number))
+
+
+def _weighed(
+    surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
+) -> tuple[WallPoints, Points]:
+    """Wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside`` and
+    those about solids."""
+    room, spacing, reach = surface.room, lattice.spacing, lattice.support
+    points = surface.walls(layers, lattice)
+    about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
+    places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
+    walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
+    found = wall_weights(walls, flat, places, lattice, room, surface.lower, uneven_changes, len(kept.weights))
+    return points, found[: len(points)]
+
+
+def mirrors_of(scene: Scene) -> tuple[Points, Points]:
+    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
+    does, as with solvers that know of no images."""
+    nowhere = np.full(3, np.inf)
+    if not isinstance(scene.solver, ProjectionSolver):
+        return -nowhere, nowhere
+    lower, upper = scene.container.mirrors(scene.dimension, scene.discretisation.support_radius)
+    flat = (0, 3 - scene.dimension)
+    return np.pad(lower, flat, constant_values=-np.inf), np.pad(upper, flat, constant_values=np.inf)
 
 
 @dataclass(frozen=True)
@@ -140,3 +303,15 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
     fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
     found, kept = Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)
     return replace(fluid.some(kept), positions=found)
+
+
+def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
+    """Far from the origin, positions are rounded to coarse steps; raises `InputError`."""
+    spacing = scene.discretisation.spacing
+    furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
+    if furthest > precision.furthest:
+        raise InputError(
+            f"The scene reaches {furthest:.3g} spacings of {spacing:g} m from the origin, but must be within "
+            f"{precision.furthest:g} in {precision.name}, which rounds positions there to steps of "
+            f"{furthest * np.finfo(precision.numpy).eps:.1g} spacings: move it to the origin, or use another precision."
+        )

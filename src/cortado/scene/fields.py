@@ -1,7 +1,7 @@
 """The types of the fields of a scene, for pydantic.
 
 A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks its value, and describes it in the JSON
-schema of its table. From this schema `cortado.scene.sentences` makes the sentences of errors, so that the checks, the
+schema of its table. From this schema `cortado.scene.tables` makes the sentences of errors, so that the checks, the
 sentences and the help of an editor always agree.
 """
 
@@ -12,7 +12,8 @@ from numbers import Real
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from cortado.errors import Words
@@ -123,3 +124,34 @@ def as_number(value: Any) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
+
+
+Angle = Annotated[float, quantity("rad")]
+
+
+def _in_a_list(value: Any) -> Any:
+    return [value] if isinstance(value, (int, float)) else value
+
+
+Rotation = Annotated[tuple[Angle, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
+Turning = Annotated[
+    tuple[Annotated[float, quantity("rad/s")], ...],
+    Field(min_length=1, max_length=3, fail_fast=True),
+    BeforeValidator(_in_a_list),
+]
+
+
+def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
+    """A rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
+    if value is not None and len(value) != 2 * dimension - 3:
+        wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
+        raise field_error(path, value, wanted)
+
+
+def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
+    """(d, d) of a rotation vector [rad], or in 2-D of an angle."""
+    from scipy.spatial.transform import Rotation as Turn
+
+    if len(rotation) == 1:
+        return np.asarray(Turn.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
+    return np.asarray(Turn.from_rotvec(rotation).as_matrix())

@@ -1,22 +1,39 @@
-"""The shapes that fluid may have, each with its particles."""
+"""The shapes that bodies of fluid may have, each with its particles."""
 
 from abc import abstractmethod
-from pathlib import Path
-from typing import Annotated, Literal, Self
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from cortado.discretise.primitives import Box, Revolved, Round
+from cortado.discretise.primitives import block_around, points_inside
 from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
-from cortado.discretise.solid import Solid
-from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
-from cortado.scene.points import read_points
+from cortado.discretise.solid import Placed, Solid
+from cortado.scene.common_shapes import (
+    INDEX_OF_AXIS,
+    BoxShape,
+    CylinderShape,
+    MeshShape,
+    PolygonShape,
+    SphereShape,
+    beside_scene,
+)
+from cortado.scene.fields import (
+    FieldPath,
+    Length,
+    Rotation,
+    Text,
+    Turning,
+    Vector,
+    check_turn,
+    quantity,
+    rotation_matrix,
+)
+from cortado.scene.point_files import read_points
 from cortado.scene.tables import Table
-from cortado.scene.turns import Rotation, Turning, check_turn
 
-INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 ALIGNED = 1e-3
 """In spacings: by how much a surface may be off the faces of cells that it does not cut."""
 
@@ -127,7 +144,7 @@ class RegionFluid(LatticeFluid):
 
 
 class Turnable(RegionFluid):
-    """A body that may be turned, which then cuts cells of the lattice: `cortado.scene.filled_shapes`."""
+    """A body that may be turned, which then cuts cells of the lattice: `cortado.scene.fluids`."""
 
     rotation: Rotation | None = None
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
@@ -138,22 +155,11 @@ class Turnable(RegionFluid):
         return super().in_dimension(dimension, path)
 
 
-class BoxFluid(Turnable):
+class BoxFluid(BoxShape, Turnable):
     """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned. Where a side is no
     whole multiple of the spacing, they are up to 3 % further apart along some axes and closer along others, so that the
     box has the mass of its volume within 0.3 %. Where no such lattice is, they are packed, which takes up to 0.8 % off
     the mass; `describe` and a run then say both masses."""
-
-    shape: Literal["box"] = "box"
-    lower: Vector[Length]
-    """(d,) Corner with the least coordinates, before it is turned [m]."""
-    upper: Vector[Length]
-    """(d,) Corner with the greatest coordinates [m]."""
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        check_order(self.lower, self.upper)
-        return self
 
     def block(self, spacing: float) -> Block:
         return block_filling(self.lower, self.upper, spacing)
@@ -188,41 +194,23 @@ class RoundFluid(RegionFluid):
         return True
 
 
-class SphereFluid(RoundFluid):
+class SphereFluid(SphereShape, RoundFluid):
     """A sphere, or a disc in 2-D."""
-
-    shape: Literal["sphere"] = "sphere"
-    centre: Vector[Length]
-    """(d,) Middle [m]."""
-    radius: Annotated[float, quantity("m", gt=0.0)]
-    """From the middle to the surface [m]."""
 
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
     def volume(self, spacing: float) -> float:
-        return Round(np.zeros(len(self.centre)), self.radius).moments().volume
+        return self.shape_about()[0].moments().volume
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         return Region.ball(np.array(self.centre), self.radius).distance(points)
 
 
-class CylinderFluid(Turnable, RoundFluid):
+class CylinderFluid(CylinderShape, Turnable, RoundFluid):
     """A cylinder, in 3-D."""
 
-    shape: Literal["cylinder"] = "cylinder"
-    base: Vector[Length]
-    """(3,) Middle of the bottom [m]."""
-    radius: Annotated[float, quantity("m", gt=0.0)]
-    """From the axis to the side [m]."""
-    height: Annotated[float, quantity("m", gt=0.0)]
-    """From the base, along the axis [m]."""
-    axis: Literal["x", "y", "z"] = "y"
-    """The axis of space along which it stands, before it is turned."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        refuse_plane(dimension, path, '"box", "sphere" or "points"')
-        return super().in_dimension(dimension, path)
+    instead: ClassVar = '"box", "sphere" or "points"'
 
     def block(self, spacing: float) -> Block:
         axis = INDEX_OF_AXIS[self.axis]
@@ -281,33 +269,86 @@ class PointsFluid(Fluid):
         return self.points().copy()
 
 
-def beside_scene(file: str, info: ValidationInfo) -> str:
-    """The absolute name of a file that a scene names, which is beside the scene's own."""
-    folder = Path((info.context or {}).get("folder", "."))
-    try:
-        return str((folder / file).absolute())
-    except (OSError, ValueError):
-        raise field_error((), file, "the name of a file") from None
+class Filled(Turnable):
+    """A body of fluid that fills a solid shape; its particles are packed unless its surface goes along cells of the
+    lattice from the lower corner of the box around it."""
+
+    @abstractmethod
+    def shape_about(self) -> tuple[Solid, Points]:
+        """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
+
+    def body(self) -> Placed:
+        """The shape in its place."""
+        shape, middle = self.shape_about()
+        return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
+
+    def block(self, spacing: float) -> Block:
+        return block_around(self.body(), spacing)
+
+    def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
+        return self.body().distance_up_to(points, reach)
+
+    def volume(self, spacing: float) -> float:
+        return self.shape_about()[0].moments().volume
+
+    def particles(self, spacing: float) -> Points:
+        return points_inside(self.body(), spacing)
+
+    def witnesses(self, spacing: float) -> Points:
+        return self.particles(spacing)
+
+    def lattice(self, spacing: float, reach: float) -> Points:
+        return RegionFluid.lattice(self, spacing, reach)
+
+    def cuts_cells(self, spacing: float) -> bool:
+        points = self.block(spacing).grown(1).points()
+        return bool((np.abs(self.distance(points, spacing, spacing)) < (0.5 - ALIGNED) * spacing).any())
 
 
-def box_about(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[Solid, Points]:
-    """A box about its middle, and where that is, (d,) [m]."""
-    return Box(0.5 * np.subtract(upper, lower)), 0.5 * np.add(lower, upper)
+class FilledShape(Filled):
+    """One with a place of its own."""
+
+    position: tuple[Length, ...] | None = None
+    """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
+
+    def body(self) -> Placed:
+        placed = super().body()
+        return placed if self.position is None else replace(placed, position=np.array(self.position))
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        self.check_components(("position",), dimension, path)
+        return super().in_dimension(dimension, path)
 
 
-def cylinder_about(base: tuple[float, ...], radius: float, height: float, axis: str) -> tuple[Solid, Points]:
-    """A cylinder about its middle, and where that is, (3,) [m]."""
-    along = INDEX_OF_AXIS[axis]
-    return Revolved(Box(np.array([radius, 0.5 * height])), along), np.array(base) + 0.5 * height * np.eye(3)[along]
+class TurnedBox(Filled, BoxFluid):
+    """A box of fluid with a rotation."""
+
+    shape_about = BoxShape.shape_about
 
 
-def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Every component of upper must be greater than that of lower."""
-    if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
-        raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
+class TurnedCylinder(Filled, CylinderFluid):
+    """A cylinder of fluid with a rotation."""
+
+    shape_about = CylinderShape.shape_about
 
 
-def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
-    """A cylinder needs three dimensions."""
-    if dimension == 2:
-        raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")
+def turned(fluid: Fluid) -> Fluid:
+    """The same body of fluid; one that has a rotation where it can do without, as one that is packed."""
+    kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
+    kind = kinds.get(type(fluid))
+    if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:
+        return fluid
+    return kind.model_construct(fluid.model_fields_set, **dict(fluid))
+
+
+class PolygonFluid(PolygonShape, FilledShape):
+    """What a polygon holds, in 2-D."""
+
+
+class MeshFluid(MeshShape, FilledShape):
+    """What a mesh of triangles holds, in 3-D."""
+
+
+AnyFluid = Annotated[
+    BoxFluid | CylinderFluid | SphereFluid | PointsFluid | MeshFluid | PolygonFluid, Field(discriminator="shape")
+]

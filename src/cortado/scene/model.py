@@ -3,27 +3,264 @@
 Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
 """
 
+import unicodedata
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
+from cortado.discretise.room import Room
+from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
+from cortado.scene.common_shapes import check_order
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
-from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
-from cortado.scene.filled_shapes import AnyFluid, turned
-from cortado.scene.materials import LIQUIDS, Coloured
-from cortado.scene.mixture import MixtureTable
-from cortado.scene.package_tables import AnyForces
-from cortado.scene.parameters.registry import PARAMETERS
-from cortado.scene.picture import Picture
-from cortado.scene.render import Render
-from cortado.scene.rheology import AnyRheology
+from cortado.scene.fields import (
+    Colour,
+    FieldPath,
+    Flag,
+    Length,
+    OneOf,
+    Several,
+    Text,
+    Vector,
+    count,
+    field_error,
+    quantity,
+)
+from cortado.scene.fluids import AnyFluid, turned
+from cortado.scene.packages import AnyForces
+from cortado.scene.parameters import PARAMETERS
 from cortado.scene.schedule import Schedule
-from cortado.scene.sensors import AnySensor
 from cortado.scene.solid_shapes import AnySolid
+from cortado.scene.solids import solids_of
 from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.tables import Table
+
+SHORTEST = 40.0
+"""Regularisation [s] that a fluid with a yield stress has at least, if it is not given: what does not yield creeps at
+2.5 % of its depth in a second at most. Beside a longer one the edge of a plug is less sharp than 40 particles across
+resolve: its speed between plates is off by 0.8 % with 40 s, by 2.7 % with 100 s."""
+
+
+class RheologyTable(Table):
+    """A law of viscosity; its numbers are parameters, such as ``carreau.flow_index``."""
+
+    kind: str
+    """Name of the law."""
+
+    def numbers(self, viscosity: float) -> dict[str, float]:
+        """The parameters of the law, for the viscosity of the phase [Pa s]."""
+        return {name: value for name, value in self.model_dump().items() if name != "kind"}
+
+    def thickest(self, viscosity: float) -> float:
+        """The greatest viscosity of the fluid [Pa s], for that of the phase."""
+        return viscosity
+
+
+class Thinning(RheologyTable):
+    """What laws with a power of the shear rate have in common."""
+
+    flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
+    """n [-]: below 1 the fluid gets thinner where it is sheared, above 1 thicker."""
+    least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
+    """Added to the shear rate in squares [1/s], so that the viscosity at rest is finite."""
+
+    def thickest(self, viscosity: float) -> float:
+        return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
+
+
+class PowerLaw(Thinning):
+    """eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the consistency, which is
+    that at a shear rate of 1/s."""
+
+    kind: Literal["power_law"] = "power_law"
+    """Name of the law."""
+
+
+class Carreau(RheologyTable):
+    """eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time shear rate)^2)^((flow_index -
+    1) / 2), of Carreau (1972): viscosity is that at rest."""
+
+    kind: Literal["carreau"] = "carreau"
+    """Name of the law."""
+    relaxation_time: Annotated[float, quantity("s", ge=0.0)]
+    """lambda [s]: the viscosity changes at shear rates beyond 1 / lambda."""
+    flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
+    """n [-]."""
+    infinite_viscosity: Annotated[float, quantity("Pa s", ge=0.0)] = 0.0
+    """The viscosity at a large shear rate [Pa s]."""
+
+    def thickest(self, viscosity: float) -> float:
+        return max(viscosity, self.infinite_viscosity)
+
+
+class Yielding(RheologyTable):
+    """What laws with a yield stress have in common."""
+
+    yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
+    """Below it the fluid hardly flows [Pa]."""
+    regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
+    """m of Papanastasiou (1987) [s]: at rest the viscosity is finite, yield_stress m more, so that fluid which does not
+    yield creeps, at its depth / m at most; the longer of 40 s and 100 viscosity / yield_stress if left out."""
+
+    def numbers(self, viscosity: float) -> dict[str, float]:
+        growth = self.regularisation
+        if growth is None:
+            growth = max(100.0 * viscosity / self.yield_stress if self.yield_stress > 0.0 else 0.0, SHORTEST)
+        return {**super().numbers(viscosity), "regularisation": growth}
+
+    def thickest(self, viscosity: float) -> float:
+        return super().thickest(viscosity) + self.yield_stress * self.numbers(viscosity)["regularisation"]
+
+
+class Bingham(Yielding):
+    """eta = viscosity + yield_stress (1 - exp(-m shear rate)) / shear rate, of Bingham, as Papanastasiou (1987) makes
+    it smooth: viscosity is that of the fluid once it flows."""
+
+    kind: Literal["bingham"] = "bingham"
+    """Name of the law."""
+
+
+class HerschelBulkley(Yielding, Thinning):
+    """The sum of a power law and of a yield stress, as of Bingham's: viscosity is the consistency."""
+
+    kind: Literal["herschel_bulkley"] = "herschel_bulkley"
+    """Name of the law."""
+
+
+AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
+"""A law of viscosity by its ``kind``."""
+
+
+def greatest_viscosity(phase: Any, viscosity: float) -> float:
+    """Of a phase [Pa s], for what its key viscosity, or a parameter in its place, says [Pa s]."""
+    return viscosity if phase.rheology is None else float(phase.rheology.thickest(viscosity))
+
+
+class MixtureTable(Table):
+    """The Cahn-Hilliard equation that the mass fractions follow (Yang et al. 2015); the scene's phases, in order."""
+
+    free_energy: Literal["double_well", "miscible"] = "double_well"
+    """"double_well": phases separate, into pure ones; "miscible": they mix, by Fick's law."""
+    strength: Annotated[float, quantity(gt=0.0)] = 1.0
+    """Factor of the free energy, alpha."""
+    mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0
+    """How fast phases diffuse, M [m2/s]; at 0 nothing diffuses, and each particle keeps its phase."""
+    mobility_form: Literal["degenerate", "constant"] = "degenerate"
+    """"degenerate": phases exchange only where they touch; "constant": everywhere alike."""
+    interface_width: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Width of an interface, epsilon [m]; one spacing if left out. From 10 % to 90 % it is 4.39 epsilon / sqrt(alpha)
+    wide."""
+
+    def width(self, spacing: float) -> float:
+        """The interface width [m] of a scene of a spacing [m]."""
+        return spacing if self.interface_width is None else self.interface_width
+
+
+Reach = Annotated[float, quantity("m", gt=0.0)] | None
+Corner = tuple[Length, ...] | None
+
+
+class SensorTable(Table):
+    """Something that reads numbers of the fluid in every step."""
+
+    name: Text
+    """What its columns in sensors.csv begin with."""
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str) -> str:
+        """A spreadsheet runs a cell that begins with one of these signs, wide ones too, as a formula."""
+        plain = unicodedata.normalize("NFKC", name).strip()
+        if plain[:1] in tuple("=+-@") or not name.isprintable():
+            wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
+            raise field_error((), name, wanted)
+        return name
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        self.check_components(("lower", "upper", "about"), dimension, path)
+        return super().in_dimension(dimension, path)
+
+
+class PressureProbeTable(SensorTable):
+    """The mean pressure of the particles around a point."""
+
+    kind: Literal["pressure_probe"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) the point [m]."""
+    radius: Reach = None
+    """How far away particles count [m]; the support radius if left out."""
+
+
+class WaveGaugeTable(SensorTable):
+    """How high the surface of the fluid is at a place: the level to which its volume in a column fills the room that
+    solids leave there."""
+
+    kind: Literal["wave_gauge"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) a point of the middle of the column [m]; its height does not matter."""
+    floor: Length = 0.0
+    """From where on the column is filled [m], against gravity: the bottom of the container as a rule."""
+    radius: Reach = None
+    """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
+
+
+class FlowRateTable(SensorTable):
+    """Volume of fluid that goes through a plane in a second."""
+
+    kind: Literal["flow_rate"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) a point of the plane [m]."""
+    normal: Vector[Annotated[float, quantity()]]
+    """(d,) the direction in which the flow is positive."""
+    reach: Reach = None
+    """Half of the thickness of the layer that counts [m]; two support radii, but at least five spacings, if left
+    out."""
+
+    @field_validator("normal")
+    @classmethod
+    def _check_normal(cls, normal: tuple[float, ...]) -> tuple[float, ...]:
+        if not any(normal):
+            raise field_error((), normal, "a vector that is not zero")
+        return normal
+
+
+class WallForceTable(SensorTable):
+    """The force, and its torque, with which the fluid in a region pushes the walls."""
+
+    kind: Literal["wall_force"]
+    """Which sensor it is."""
+    lower: Corner = None
+    """(d,) lower corner of the region [m]; without an end there if left out."""
+    upper: Corner = None
+    """(d,) upper corner of the region [m]; without an end there if left out."""
+    about: Corner = None
+    """(d,) the point of the torque [m]; the origin if left out."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.lower is not None and self.upper is not None:
+            check_order(self.lower, self.upper)
+        return self
+
+
+class SolidLoadTable(SensorTable):
+    """The force of the fluid on a solid, and its torque about the solid's position."""
+
+    kind: Literal["solid_load"]
+    """Which sensor it is."""
+    solid: Text
+    """The name of the solid."""
+
+
+AnySensor = Annotated[
+    PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable, Field(discriminator="kind")
+]
+
 
 OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
 """Tables that a scene file may hold for other modules."""
@@ -192,3 +429,15 @@ class SceneTables(Table):
         if "dimension" not in info.data:
             return tables
         return tuple(table.in_dimension(info.data["dimension"], (index,)) for index, table in enumerate(tables))
+
+
+def room_of(scene: SceneTables) -> Room:
+    """Where fluid of a scene may be at the start: in its container, outside of its solids; nothing closes a period."""
+    lengths = scene.container.periods(scene.dimension)[1]
+    region = scene.container.region(scene.dimension).opened(lengths)
+    return Room(region, solids_of(scene.solid), lengths)
+
+
+def resting_room(scene: SceneTables) -> Room:
+    """The `room_of` a scene with its solids at rest alone."""
+    return replace(room_of(scene), solids=solids_of(tuple(solid for solid in scene.solid if not solid.moves)))

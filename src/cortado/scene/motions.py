@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role, Source
+from cortado.scene.parameters import Axis, Parameter, Range, Role, Source
 from cortado.scene.schedule import along_lines
 from cortado.scene.solids import SolidTable
 

@@ -17,14 +17,14 @@ from cortado.calls import public
 from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
-from cortado.scene.creep import creep_sentence
-from cortado.scene.idle_keys import check_idle, idle_sentences
+from cortado.scene.containers import BoxContainer, CylinderContainer
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
-from cortado.scene.sentences import sentences
+from cortado.scene.scene_warnings import check_idle, creep_sentence, idle_sentences, wall_sentence
 from cortado.scene.stability import broken_limit, longest_step
+from cortado.scene.tables import sentences
 from cortado.scene.toml import put_in, read_toml
-from cortado.scene.viscous_forms import wall_sentence
+from cortado.words import counted
 
 LIGHTEST = 50.0
 """Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
@@ -200,3 +200,39 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
             return Scene.model_validate(data, context={"folder": folder})
     except SceneError as error:
         raise (error.in_file(file) if file else error) from None
+
+
+def scene_in_words(scene: Scene, particles: int) -> str:
+    """What is in a scene that has so many particles, what holds it, and what acts on it; one sentence."""
+    phases = " and ".join(
+        f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
+    )
+    emitter = " of which an emitter gives some," if scene.emitter is not None else ""
+    return (
+        f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} "
+        f"{scene.discretisation.spacing:g} m apart at rest, {_held(scene)}, "
+        f"under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
+    )
+
+
+def vector(components: tuple[float, ...]) -> str:
+    """``(0, -9.81)``"""
+    return f"({', '.join(f'{component:.6g}' for component in components)})"
+
+
+def _scheduled(scene: Scene) -> str:
+    courses = [
+        f"{name.replace('_', ' ')} changes from {course.times[0]:g} s to {course.times[-1]:g} s"
+        for name, course in scene.schedule.courses.items()
+    ]
+    return f"; its {' and '.join(courses)}" if courses else ""
+
+
+def _held(scene: Scene) -> str:
+    container = scene.container
+    if isinstance(container, CylinderContainer):
+        return f"in a cup of radius {container.radius:g} m and height {container.height:g} m"
+    if isinstance(container, BoxContainer):
+        lower, upper = container.extent()
+        return f"in a box of {' × '.join(f'{length:g}' for length in upper - lower)} m"
+    return "in free space"

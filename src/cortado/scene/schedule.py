@@ -9,8 +9,7 @@ from pydantic import Field, create_model, model_validator
 
 from cortado.errors import Words
 from cortado.scene.fields import FieldPath, Several, field_error, quantity
-from cortado.scene.parameters.parameter import Axis, Parameter
-from cortado.scene.parameters.registry import PARAMETERS
+from cortado.scene.parameters import PARAMETERS, Axis, Parameter
 from cortado.scene.tables import Table
 
 

@@ -3,56 +3,91 @@
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
-from cortado.discretise.primitives import Polygon, Revolved, Round
+from cortado.arrays import unit
+from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Solid
+from cortado.errors import Words
+from cortado.scene.common_shapes import INDEX_OF_AXIS, BoxShape, CylinderShape, MeshShape, PolygonShape, SphereShape
+from cortado.scene.containers import Container
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, box_about, check_order, cylinder_about, refuse_plane
-from cortado.scene.outlines import MeshShape, PolygonShape
-from cortado.scene.planes import PlaneSolid
 from cortado.scene.solids import SolidTable
 
+ALONG = 1e-9
+"""Component of a normal along a period, of one that is none."""
+
+
+class PlaneSolid(SolidTable):
+    """All that is behind a plane, such as a slope or a wall, at rest; fluid is on the side that `normal` points to. It
+    has no end, and so needs a container, which it cuts."""
+
+    shape: Literal["plane"] = "plane"
+    position: Vector[Length]
+    """(d,) A point of the plane [m]."""
+    normal: Vector[Annotated[float, quantity()]]
+    """(d,) Away from it into the fluid, of any length."""
+    _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        turned = super().in_dimension(dimension, path)
+        if not any(self.normal):
+            raise field_error((*path, "normal"), self.normal, "a vector that is not 0")
+        if self.side == "inside":
+            raise field_error((*path, "side"), self.side, '"outside": fluid is where the normal of a plane points')
+        if self.rotation is not None:
+            raise field_error((*path, "rotation"), self.rotation, "left out, as normal says how a plane is turned")
+        for name, value in (("motion", self.motion), ("surface_velocity", self.surface_velocity)):
+            if value not in ("fixed", None):
+                raise field_error((*path, name), value, 'left out, as a plane is at rest; a "box" may move')
+        return turned
+
+    def in_container(self, container: Container, path: FieldPath) -> Self:
+        ends, dimension = container.extent(), len(self.position)
+        if ends is None:
+            wanted = "another one in a scene without a container, as a plane has no end: give it a [container] to cut"
+            raise field_error((*path, "shape"), self.shape, f'{wanted}, or take a "box"')
+        along = (container.periods(dimension)[1] > 0.0) & (np.abs(self._unit()) > ALONG)
+        if along.any():
+            where = f"0 along axis {int(np.argmax(along))}, where the container is periodic"
+            raise field_error((*path, "normal"), self.normal, f"{where} and the plane would not meet itself")
+        corners = np.where(self._unit() > 0.0, *ends) - np.array(self.position)
+        if corners @ self._unit() >= 0.0:
+            found = Words("outside of the container, all of which is in front of it")
+            raise field_error((*path, "position"), found, "such that the plane cuts the container")
+        bounded = self.model_copy()
+        object.__setattr__(bounded, "__pydantic_private__", {"_ends": tuple(map(tuple, np.array(ends).tolist()))})
+        return bounded
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        position, unit = np.array(self.position), self._unit()
+        lower, upper = np.array(self._ends or (position - 1.0, position + 1.0))
+        return HalfSpace(unit, 0.0, lower - position, upper - position), position
+
+    def thinnest(self, spacing: float) -> float:
+        return np.inf
+
+    def _unit(self) -> Points:
+        return unit(np.array(self.normal))
+
+
 Size = Annotated[float, quantity("m", gt=0.0)]
-Axis = Literal["x", "y", "z"]
 
 
-class BoxSolid(SolidTable):
+class BoxSolid(BoxShape, SolidTable):
     """A box, or a rectangle in 2-D."""
 
     measures: ClassVar = ("lower", "upper")
-    shape: Literal["box"] = "box"
-    lower: Vector[Length]
-    """(d,) Corner with the least coordinates, before it is turned [m]."""
-    upper: Vector[Length]
-    """(d,) Corner with the greatest coordinates [m]."""
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        check_order(self.lower, self.upper)
-        return self
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        return box_about(self.lower, self.upper)
 
     def thinnest(self, spacing: float) -> float:
         return float(np.subtract(self.upper, self.lower).min())
 
 
-class SphereSolid(SolidTable):
+class SphereSolid(SphereShape, SolidTable):
     """A sphere, or a disc in 2-D."""
 
     measures: ClassVar = ("centre", "radius")
-    shape: Literal["sphere"] = "sphere"
-    centre: Vector[Length]
-    """(d,) Middle [m]."""
-    radius: Size
-    """From the middle to the surface [m]."""
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        centre = np.array(self.centre)
-        return Round(np.zeros_like(centre), self.radius), centre
 
     def thinnest(self, spacing: float) -> float:
         return 2.0 * self.radius
@@ -78,26 +113,11 @@ class CapsuleSolid(SolidTable):
         return 2.0 * self.radius
 
 
-class CylinderSolid(SolidTable):
+class CylinderSolid(CylinderShape, SolidTable):
     """A cylinder, in 3-D."""
 
     measures: ClassVar = ("base", "radius", "height")
-    shape: Literal["cylinder"] = "cylinder"
-    base: Vector[Length]
-    """(3,) Middle of the bottom [m]."""
-    radius: Size
-    """From the axis to the side [m]."""
-    height: Size
-    """From the base, along the axis [m]."""
-    axis: Axis = "y"
-    """The axis of space along which it stands, before it is turned."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        refuse_plane(dimension, path, '"box", "sphere", "capsule", "cup" or "polygon"')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        return cylinder_about(self.base, self.radius, self.height, self.axis)
+    instead: ClassVar = '"box", "sphere", "capsule", "cup" or "polygon"'
 
     def thinnest(self, spacing: float) -> float:
         return min(2.0 * self.radius, self.height)
@@ -116,7 +136,7 @@ class CupSolid(SolidTable):
     """From the bottom, outside, to the rim [m]."""
     thickness: Size
     """Of the side and the bottom [m]."""
-    axis: Axis = "y"
+    axis: Literal["x", "y", "z"] = "y"
     """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
 
     @model_validator(mode="after")

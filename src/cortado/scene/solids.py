@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -11,10 +12,22 @@ from numpy.typing import NDArray
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
+from cortado.scene.appearance import FINISHES, Coloured, Finish
 from cortado.scene.containers import Container
-from cortado.scene.fields import MISSING, Colour, FieldPath, Length, OneOf, Text, field_error, quantity
-from cortado.scene.materials import FINISHES, Coloured, Finish
-from cortado.scene.turns import Rotation, Turning, check_turn, rotation_matrix
+from cortado.scene.fields import (
+    MISSING,
+    Colour,
+    FieldPath,
+    Length,
+    OneOf,
+    Rotation,
+    Text,
+    Turning,
+    check_turn,
+    field_error,
+    quantity,
+    rotation_matrix,
+)
 
 
 class SolidTable(Coloured):
@@ -140,6 +153,12 @@ class SolidTable(Coloured):
             check_turn((*path, name), getattr(self, name), dimension)
         _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
+
+
+@lru_cache(maxsize=8)
+def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
+    """The solids that tables describe, in their order."""
+    return tuple(table.solid() for table in tables)
 
 
 def _times(scale: float, value: Any) -> Any:

@@ -8,7 +8,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from cortado.errors import InputError
 from cortado.scene.fields import Flag, OrWord, Text, count, field_error, quantity
-from cortado.scene.package_tables import Inline, PackageTable
+from cortado.scene.packages import Inline, PackageTable
 from cortado.scene.tables import Table
 
 OWN = ("projection", "pcisph")

@@ -1,20 +1,217 @@
-"""What all tables of a scene have in common.
+"""Tables of a scene: their base class, and the sentences of errors, with words from the JSON schemas of the tables.
 
-A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python.
+A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python. Schemas have the
+docstrings below fields as descriptions, which are read from the source when somebody asks for a schema: pydantic can
+read them as it makes a model, but then every process waits a third of a second for it.
 """
 
-from collections.abc import Iterable, Mapping
+import ast
+import inspect
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import cache
+from itertools import pairwise
+from sys import modules
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from cortado.errors import InputError, Words
-from cortado.scene.docstrings import field_docstrings
-from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
-from cortado.scene.sentences import UNKNOWN, sentences
+from cortado.errors import LONGEST, InputError, SceneError, Words, shown
+from cortado.scene.fields import GREATEST, MISSING, PER_AXIS, FieldPath, field_error, without_numpy
+
+
+def field_docstrings(cls: type) -> dict[str, str]:
+    """The docstrings of fields by name, those of parents included; none of a class without a source."""
+    found: dict[str, str] = {}
+    for one in reversed(cls.__mro__):
+        found |= _of_module(one.__module__).get(one.__qualname__, {})
+    return found
+
+
+@cache
+def _of_module(name: str) -> dict[str, dict[str, str]]:
+    """Those of all classes of a module that are in no other class or function."""
+    try:
+        source = inspect.getsource(modules[name])
+    except (KeyError, OSError, TypeError):
+        return {}
+    return {one.name: _in_body(one) for one in ast.parse(source).body if isinstance(one, ast.ClassDef)}
+
+
+def _in_body(node: ast.ClassDef) -> dict[str, str]:
+    return {
+        field.target.id: inspect.cleandoc(text.value.value)
+        for field, text in pairwise(node.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+    }
+
+
+Schema = Mapping[str, Any]
+MOST_HOMES = 2
+"""Tables that have a key, up to which a sentence names them where the key stands in another table."""
+UNKNOWN = Words("unknown")
+"""What was found of a key that its table does not have."""
+
+
+@contextmanager
+def sentences(model: type[BaseModel]) -> Iterator[None]:
+    """Turn the first error that pydantic reports of a model into a `SceneError`."""
+    try:
+        yield
+    except ValidationError as error:
+        raise _scene_error(error, model) from None
+
+
+def field_name(path: FieldPath) -> str:
+    """``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = part if part.replace("-", "_").isidentifier() and len(part) < LONGEST else shown(part)
+            text += f".{name}" if text else name
+    return text
+
+
+def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
+    first = error.errors(include_url=False)[0]
+    schema, path = _schema_at(model.model_json_schema(), first["loc"])
+    if first["type"] == "scene":
+        own = first["ctx"]["error"]
+        path, sentence = [*path, *own.path], own.sentence
+        if own.found is UNKNOWN and (homes := _homes(model.model_json_schema(), path)):
+            sentence = f"is not a key of {{table}}; did you mean {' or '.join(homes)}?"
+        if sentence:
+            sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
+        return SceneError(None, field_name(path), own.found, own.wanted, sentence)
+    found, words = first["input"], wanted(schema, field_name(path[-1:]))
+    if first["type"] == "missing":
+        found = MISSING
+    elif "discriminator" in schema and isinstance(found, Mapping):
+        union = schema["discriminator"]
+        path, found = [*path, union["propertyName"]], found.get(union["propertyName"], MISSING)
+        words = _any_of(union["mapping"])
+    elif first["type"] in ("float_type", "finite_number"):
+        words = f"a finite number{'' if words.startswith('a ') else f', {words}'}"
+    elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
+        words = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
+    return SceneError(None, field_name(path), found, words)
+
+
+def _homes(whole: Schema, path: FieldPath) -> list[str]:
+    """Where the key at the end of a path stands in other tables of a JSON schema, as ``forces.gravity``; nothing if it
+    stands in none or in many of them."""
+    key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
+    found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
+    words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
+    return words if len(words) <= MOST_HOMES else []
+
+
+def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
+    """The paths of all keys in a part of a JSON schema that is at a path itself: through lists and unions, too."""
+    if "$ref" in part:
+        part = whole["$defs"][part["$ref"].rpartition("/")[2]]
+    for name, field in part.get("properties", {}).items():
+        yield (*path, name)
+        yield from _fields(whole, field, (*path, name))
+    members = [one for kind in ("anyOf", "oneOf", "allOf") for one in part.get(kind, ())]
+    for member in [*members, *([part["items"]] if "items" in part else [])]:
+        yield from _fields(whole, member, path)
+
+
+def _is_out_of_size(number: float, schema: Schema) -> bool:
+    """Whether it is too large or, above 0, too small for any quantity."""
+    tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
+    return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
+
+
+def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
+    """The part of a JSON schema that a location of pydantic's leads to, and the path to it. A location names the member
+    of a union too; a path does not."""
+    part, path = whole, list[str | int]()
+    for step in location:
+        if "discriminator" in part:
+            part = {"$ref": part["discriminator"]["mapping"][step]}
+        elif "oneOf" in part:  # tables, of which a step names one
+            tables = map(_whole, part["oneOf"])
+            part = {one.get("title", one.get("$ref", "").rpartition("/")[2]): one for one in tables}[str(step)]
+        else:
+            part = part["items"] if isinstance(step, int) else part["properties"][step]
+            path.append(step)
+        if "anyOf" in part:  # a value, or nothing; a number, or a word
+            value, other = part["anyOf"]
+            part = {**value, "word": other["const"]} if "const" in other else value
+        part = _whole(part)
+        if "$ref" in part:
+            part = whole["$defs"][part["$ref"].rpartition("/")[2]]
+    return part, path
+
+
+def _whole(part: Schema) -> Schema:
+    """A table that stands where it is used, and not among those that have a name."""
+    return part["allOf"][0] if "allOf" in part else part
+
+
+# ---- words -------------------------------------------------------------------------------------------------------
+
+
+def wanted(schema: Schema, name: str = "") -> str:
+    """What a value must be, in words, from its part of a JSON schema; ``name`` is that of its field."""
+    match schema:
+        case {"enum": names}:
+            return _any_of(names)
+        case {"const": constant}:
+            return _any_of([constant])
+        case {"type": "number", "word": word}:
+            return f'{_limits(schema)} or "{word}"'
+        case {"type": "number"}:
+            return _limits(schema)
+        case {"type": "integer", "minimum": least, "maximum": most}:
+            return f"a whole number from {least} to {most}"
+        case {"type": "boolean"}:
+            return "true or false"
+        case {"type": "string"}:
+            return "a text that is not empty"
+        case {"type": "array", "components": [*first, last]}:
+            return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
+        case {"type": "array", "items": {"$ref": _} | {"discriminator": _} | {"allOf": _}}:
+            return f"a list of at least one table, each written [[{name}]]"
+        case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
+            return f"a list of at most {most} components, each {wanted(items)}"
+        case {"type": "array", "items": items, "maxItems": _}:
+            return f"a list with one component for each axis, each {wanted(items)}"
+        case {"type": "array", "items": items}:
+            least = schema.get("minItems", 0)
+            entries = f" of at least {'one entry' if least == 1 else f'{least} entries'}" if least else ""
+            return f"a list{entries}, each {wanted(items)}"
+        case {"minProperties": _, "properties": properties}:
+            return f"a table of at least one parameter out of {', '.join(properties)}"
+    return "a table"
+
+
+def _any_of(names: Iterable[str]) -> str:
+    return " or ".join(f'"{name}"' for name in names)
+
+
+def _limits(schema: Schema) -> str:
+    """What a number must be."""
+    unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
+    least, most = schema["minimum"], schema["maximum"]
+    limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
+    limits += [f"at least {least:g}{unit}"] if least not in (-GREATEST, 1.0 / GREATEST) else []
+    limits += [f"at most {most:g}{unit}"] if most != GREATEST else []
+    return " and ".join(limits) or f"a number{unit and f' in{unit}'}"
+
+
+def point_in_words(point: Iterable[float]) -> str:
+    """Its coordinates, in brackets."""
+    return f"({', '.join(f'{value:g}' for value in point)})"
+
 
 ALSO_CALLED = {
     **dict.fromkeys(("dt", "step_size"), ("time_step",)),

@@ -1,14 +1,16 @@
-"""From a TOML file and overrides such as ``solver.time_step=0.002`` to a dictionary."""
+"""From a TOML file and overrides such as ``solver.time_step=0.002`` to a dictionary; and the units of keys."""
 
+import json
 import os
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
+from functools import cache
 from typing import Any
 
 from cortado.errors import LONGEST, InputError, SceneError, Words, shown
-from cortado.files.input_files import as_path, content, reason
+from cortado.files.input_files import SCHEMA, as_path, content, reason
 
 MOST_BYTES = 1_000_000
 """Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
@@ -175,3 +177,39 @@ def _value(text: str) -> Any:
     except (ValueError, RecursionError):
         return text
     return parsed["value"] if parsed.keys() == {"value"} else text
+
+
+JsonSchema = dict[str, Any]
+
+
+def unit_of(key: str) -> str:
+    """The unit of the value of a scene that has a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where it
+    has none, or where shapes of a body have different ones."""
+    found = list(_choices(_schema()))
+    for part in key.split("."):
+        found = [choice for one in found for choice in _choices(_part(one, part))]
+    units = {choice["unit"] for one in found for choice in (one, *_choices(one.get("items", {}))) if "unit" in choice}
+    return units.pop() if len(units) == 1 and units != {"-"} else ""
+
+
+@cache
+def _schema() -> JsonSchema:
+    """The shipped one, which `Scene` is compared with in the tests."""
+    read: JsonSchema = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    return read
+
+
+def _part(schema: JsonSchema, part: str) -> JsonSchema:
+    """What an entry of a list, by its number, or of a table may be."""
+    found: JsonSchema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
+    return found
+
+
+def _choices(schema: JsonSchema) -> Iterator[JsonSchema]:
+    """A schema, and those of which it has one or all."""
+    yield schema
+    if "$ref" in schema:
+        yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])
+    for word in ("anyOf", "oneOf", "allOf"):
+        for one in schema.get(word, ()):
+            yield from _choices(one)

@@ -18,13 +18,12 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
 from cortado.scene.containers import NoContainer
-from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
+from cortado.scene.fluid_particles import reserve_offset
 from cortado.scene.motions import moving, solid_frames, wall_numbers
-from cortado.scene.parameters.registry import PARAMETERS
-from cortado.scene.sampling import reserve_offset
+from cortado.scene.parameters import PARAMETERS
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
-from cortado.scene.walls import mirrors_of
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting

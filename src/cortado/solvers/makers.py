@@ -10,7 +10,7 @@ from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.motions import moving
-from cortado.scene.parameters.known import REGISTRY, Known
+from cortado.scene.parameter_values import REGISTRY, Known
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.solvers.solver import Solver

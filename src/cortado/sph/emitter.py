@@ -23,7 +23,7 @@ from cortado.device.precision import Precision
 from cortado.particles.arrays import to_device
 from cortado.particles.fields import POSITIONS, VELOCITIES, Entry, StateField
 from cortado.particles.state import Layout, Parameters, State
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents
 

@@ -18,7 +18,7 @@ from cortado.device.precision import Precision
 from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
 from cortado.particles.state import Layout, Parameters
-from cortado.scene.parameters.parameter import Parameter
+from cortado.scene.parameters import Parameter
 from cortado.sph.function_meaning import REAL, VECTOR, InPrecision, check_calls, check_helper, check_truths, meanings
 from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, definition
 from cortado.sph.integration import integration_module

@@ -26,7 +26,7 @@ from cortado.scene.motions import (
     rotation_name,
     velocity_name,
 )
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameters import Axis
 from cortado.sph.free_kernels import free_kernels
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 

@@ -9,9 +9,8 @@ import numpy as np
 from cortado.code_words import code_words
 from cortado.errors import InputError, shown
 from cortado.scene.motions import motion_parameters
-from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.parameter import Parameter, Source
-from cortado.scene.parameters.values import checked_value
+from cortado.scene.parameter_values import Known, checked_value
+from cortado.scene.parameters import Parameter, Source
 from cortado.scene.solids import SolidTable
 from cortado.sph.parts import Force, Setting
 
@@ -50,7 +49,7 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
     """Those of a maker of ``what``; raises `InputError`."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
-        wanted = "a list of cortado.scene.parameters.registry.Parameter, which may be empty"
+        wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
     return parameters
 

@@ -22,7 +22,7 @@ from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.solid_shares import share_kinds
 from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 from cortado.sph.rotations import rotations

@@ -36,8 +36,8 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.parameters.known import argument
-from cortado.scene.parameters.parameter import Axis
+from cortado.scene.parameter_values import argument
+from cortado.scene.parameters import Axis
 from cortado.scene.scene import Scene
 from cortado.sph.integration import OrderKernels, order_kernels
 

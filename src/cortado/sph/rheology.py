@@ -7,7 +7,7 @@ import numpy as np
 from cortado.device.precision import Precision
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.own_force import OverTime, OwnFunction, topic

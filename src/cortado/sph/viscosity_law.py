@@ -1,5 +1,5 @@
 """Laws of viscosity, by which the viscosity of a fluid follows from its shear rate: a user's function, one of those
-that scenes name (`cortado.scene.rheology`), or the constant of a Newtonian fluid. Before a run begins each law is
+that scenes name (`cortado.scene.model`), or the constant of a Newtonian fluid. Before a run begins each law is
 tried, as Warp compiles it, at shear rates that fluids have."""
 
 import inspect

@@ -8,7 +8,7 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
-from cortado.scene.parameters.parameter import Parameter
+from cortado.scene.parameters import Parameter
 from cortado.sph.formula import Packed, compiled
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents

@@ -21,7 +21,7 @@ from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene
-from cortado.scene.sentences import sentences as in_sentences
+from cortado.scene.tables import sentences as in_sentences
 from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation
 from cortado.version import __version__

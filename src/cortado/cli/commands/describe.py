@@ -29,8 +29,7 @@ from cortado.rollout.choosing import scheduled_bounds
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.runs.recording import FrameChoice
-from cortado.scene.in_words import vector
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import Scene, load_scene, vector
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation

@@ -10,7 +10,7 @@ from cortado.optimisation.fitting.figures import profile_figure, residual_figure
 from cortado.optimisation.fitting.fitted import NOISE_ALONE, Fit, Profile, unit_of
 from cortado.optimisation.inverse.fit_task import FitTask
 from cortado.pictures.report import Section
-from cortado.scene.in_words import scene_in_words
+from cortado.scene.scene import scene_in_words
 from cortado.words import counted
 
 

@@ -14,7 +14,7 @@ from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.result import Result
 from cortado.pictures.particle_view import scene_view
 from cortado.pictures.report import Section
-from cortado.scene.in_words import scene_in_words
+from cortado.scene.scene import scene_in_words
 
 MOST_NUMBERS = 1000
 """Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""

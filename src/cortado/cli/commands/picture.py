@@ -19,7 +19,7 @@ from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import pace_of
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 

@@ -9,7 +9,7 @@ from cortado.device.memory import frame_parts
 from cortado.rollout.durations import ROOM, steps_of_run
 from cortado.runs.pace import Pace
 from cortado.runs.recording import FrameChoice
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.simulation import Simulation
 from cortado.words import counted
 

@@ -25,8 +25,7 @@ from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensors.readings import Readings
 from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.in_words import scene_in_words
-from cortado.scene.scene import Scene
+from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation
 
 

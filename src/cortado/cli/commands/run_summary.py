@@ -13,7 +13,7 @@ from cortado.particles.state import State
 from cortado.pictures.shown_run import is_out
 from cortado.rollout.rollout import Rollout
 from cortado.runs.sensors.readings import Readings, summary
-from cortado.scene.fluid_masses import FluidMasses
+from cortado.scene.fluid_particles import FluidMasses
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 

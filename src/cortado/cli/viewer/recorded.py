@@ -12,7 +12,7 @@ from cortado.cli.viewer.window import Shown, Window
 from cortado.pictures.painter import colours_of
 from cortado.runs.solid_motion import posed, sized, solid_motions
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.values import OVER_TIME
+from cortado.scene.parameter_values import OVER_TIME
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 

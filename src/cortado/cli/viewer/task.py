@@ -21,9 +21,8 @@ from cortado.optimisation.transforms import TimeInterpolation
 from cortado.particles.state import State
 from cortado.pictures.notebook import table
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.registry import names
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.parameters import Role, names
 
 FRAMES = 60
 """Of a run, at most about."""

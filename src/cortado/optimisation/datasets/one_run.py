@@ -10,7 +10,7 @@ from cortado.losses import FinalPositions
 from cortado.optimisation.datasets.sample import Sample
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.scene.parameters.registry import BY_NAME
+from cortado.scene.parameters import BY_NAME
 from cortado.simulation import Simulation
 
 WALL, FLUID, MORE_FLUID = 1, 0, 4

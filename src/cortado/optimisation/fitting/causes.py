@@ -11,7 +11,7 @@ from cortado.errors import ComputationError, CortadoWarning, DivergedError, Inpu
 from cortado.optimisation.fitting.certainty import Certainty, hessian, inverse, noise_of
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
 from cortado.optimisation.fitting.observation import CLOCK
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 SERIES = 4
 """Numbers of a frame whose trends are looked at, each for itself."""

@@ -19,7 +19,7 @@ from cortado.optimisation.fitting.fitted import Fit, Tried
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
 from cortado.optimisation.fitting.other_starts import elsewhere, misfit, other_starts, other_valleys
 from cortado.optimisation.fitting.search import least, search
-from cortado.scene.parameters.parameter import Range
+from cortado.scene.parameters import Range
 
 POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
 OTHERS = 3

@@ -13,7 +13,7 @@ from cortado.on_top import on_top
 from cortado.optimisation.fitting.coordinates import Coordinates
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting
 from cortado.optimisation.fitting.search import TINY, search
-from cortado.scene.parameters.values import UNITS
+from cortado.scene.parameter_values import UNITS
 from cortado.words import counted
 
 ALIKE = 0.9

@@ -9,7 +9,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number, read_only
 from cortado.errors import InputError, shown
 from cortado.losses import Snapshot
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 CLOCK = "start"
 """The parameter of an observation that says when its frames are."""

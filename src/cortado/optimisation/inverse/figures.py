@@ -15,9 +15,9 @@ from cortado.pictures.painter import colours_of
 from cortado.pictures.plots import images, loss_curve, panels, particles
 from cortado.pictures.report import Figures
 from cortado.pictures.shown_solids import solid_outline
-from cortado.scene.parameters.parameter import Axis
-from cortado.scene.parameters.tilt import Tilt
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
+from cortado.scene.parameter_values import Tilt
+from cortado.scene.parameters import Axis
 
 MOST_CURVES = 12
 """Parameters with more components get no picture of their own."""

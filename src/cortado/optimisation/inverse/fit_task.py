@@ -12,11 +12,9 @@ from cortado.optimisation.inverse.fit_tables import FitTable, FitTables
 from cortado.optimisation.inverse.measured_data import observation
 from cortado.optimisation.inverse.tables import ProblemTable
 from cortado.scene.fields import MISSING
-from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.registry import offered
+from cortado.scene.parameters import Role, offered
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.sentences import sentences
-from cortado.scene.tables import Table
+from cortado.scene.tables import Table, sentences
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.makers import known_in

@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pydantic import BeforeValidator, ValidationInfo, ValidatorFunctionWrapHandl
 
 from cortado.errors import Words
 from cortado.scene.fields import OneOf, as_number, field_error
-from cortado.scene.parameters.values import NAMES, UNITS
-from cortado.scene.sentences import wanted
+from cortado.scene.parameter_values import NAMES, UNITS
+from cortado.scene.tables import wanted
 
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")

@@ -16,8 +16,8 @@ from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.containers import CylinderContainer
-from cortado.scene.parameters.parameter import Range
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.parameters import Range
 from cortado.simulation import Simulation
 
 DRAWN = {"heart": heart, "rosetta": rosetta}

@@ -23,7 +23,7 @@ from cortado.pictures.report import Figures
 from cortado.pictures.shown_run import is_out, those
 from cortado.pictures.tracing.space import State
 from cortado.runs.pace import Pace, pace_of
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 
 EVALUATIONS = (1, 5, 20, 100)

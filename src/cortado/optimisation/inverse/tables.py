@@ -29,8 +29,7 @@ from cortado.optimisation.inverse.named_values import VALUES, ParameterName, Sta
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
 from cortado.scene.fields import MISSING, OneOf, Several, Text, count, field_error, quantity
-from cortado.scene.sentences import wanted
-from cortado.scene.tables import Table
+from cortado.scene.tables import Table, wanted
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "adam": Adam,

@@ -12,13 +12,11 @@ from cortado.errors import InputError, SceneError, Words
 from cortado.optimisation.inverse.tables import OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.scene.fields import MISSING
-from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
-from cortado.scene.parameters.registry import offered
-from cortado.scene.parameters.values import SUM_TOLERANCE, Arrays, is_too_small
-from cortado.scene.sampling import fluid_particles
+from cortado.scene.fluid_particles import fluid_particles
+from cortado.scene.parameter_values import SUM_TOLERANCE, Arrays, Known, is_too_small
+from cortado.scene.parameters import Axis, Parameter, Range, Role, offered
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.sentences import sentences
+from cortado.scene.tables import sentences
 from cortado.scene.toml import read_toml
 from cortado.solvers.makers import known_in
 

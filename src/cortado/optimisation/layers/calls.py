@@ -19,7 +19,7 @@ from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.host_states import Given
 from cortado.runs.sensors.sensor import Sensor
-from cortado.scene.parameters.values import Values
+from cortado.scene.parameter_values import Values
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 

@@ -19,8 +19,8 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
-from cortado.scene.parameters.values import Arrays
-from cortado.scene.quantities import QUANTITIES, check_quantity
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.quantity_names import QUANTITIES, check_quantity
 from cortado.simulation import Simulation
 
 READING = "reading"

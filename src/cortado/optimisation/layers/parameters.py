@@ -9,7 +9,7 @@ from cortado.errors import InputError
 from cortado.optimisation.layers.layer import PARAMETER, Array, Named, Shapes, named, on_host, part
 from cortado.rollout.device_rows import DeviceRows
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 

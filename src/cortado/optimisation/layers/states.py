@@ -14,7 +14,7 @@ from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.host_states import Given
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.restarts import check_clock, origin_of
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
 

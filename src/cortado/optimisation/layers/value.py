@@ -23,7 +23,7 @@ from cortado.optimisation.layers.layer import (
 from cortado.optimisation.layers.parameters import LayerParameters
 from cortado.optimisation.layers.states import LAST_STEP, check_state, named_states
 from cortado.problem import Problem
-from cortado.scene.parameters.values import Arrays
+from cortado.scene.parameter_values import Arrays
 
 LOSS = "loss"
 """The name of what it returns."""

@@ -21,7 +21,7 @@ from cortado.pictures.tracing.liquid_surface import nearest_colours, spheres
 from cortado.runs.frame_file import SAME, Marks, fraction_names
 from cortado.runs.solid_motion import SolidMotions, posed, sized
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.scene.picture import Picture
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 

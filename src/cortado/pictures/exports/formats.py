@@ -19,7 +19,7 @@ from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pos
 from cortado.runs.frame_file import FRACTION
 from cortado.runs.solid_motion import SolidMotion
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.quantities import QUANTITIES
+from cortado.scene.quantity_names import QUANTITIES
 from cortado.scene.scene import Scene, as_scene
 from cortado.simulation import Simulation
 from cortado.version import __version__

@@ -23,7 +23,7 @@ from cortado.pictures.tracing.steady import steadied, still_of
 from cortado.pictures.tracing.surroundings import EDGE, GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.tracing.trace import Eye, find_contrast, illuminate_kernel, trace_kernel
 from cortado.pictures.tracing.wetting import particles_of, turn, wetting
-from cortado.scene.camera_paths import View
+from cortado.scene.appearance import View
 from cortado.scene.scene import Scene
 
 

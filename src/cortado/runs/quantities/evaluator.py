@@ -16,8 +16,8 @@ from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.formulas import OnDevice, Particles, Pressures, Sums, formulas
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.containers import Container
-from cortado.scene.parameters.values import Arrays
-from cortado.scene.quantities import LOAD, check_quantity, is_load
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.quantity_names import LOAD, check_quantity, is_load
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from cortado.device.launching import Named
 from cortado.particles.arrays import Fields, padded
 from cortado.particles.solid_shares import ALL_WALLS
-from cortado.scene.quantities import load_name
+from cortado.scene.quantity_names import load_name
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import Adjoints, StepContext, Tangents

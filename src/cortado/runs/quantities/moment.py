@@ -13,8 +13,8 @@ from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
-from cortado.scene.parameters.values import Arrays
-from cortado.scene.quantities import QUANTITIES, check_quantity
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.quantity_names import QUANTITIES, check_quantity
 from cortado.scene.solids import SolidTable
 
 

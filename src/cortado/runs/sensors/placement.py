@@ -12,7 +12,7 @@ from cortado.runs.sensors.probes import FlowRate, PressureProbe, SolidLoad, Wall
 from cortado.runs.sensors.sensor import Cut, Sensor, reach_of
 from cortado.runs.sensors.wave_gauge import WaveGauge
 from cortado.scene.scene import Scene
-from cortado.scene.sentences import point_in_words
+from cortado.scene.tables import point_in_words
 
 SENSORS: dict[str, Callable[..., Sensor]] = {
     "pressure_probe": PressureProbe,

@@ -20,7 +20,7 @@ from cortado.runs.sensors.sensor import (
     positive,
     reach_of,
 )
-from cortado.scene.quantities import load_name
+from cortado.scene.quantity_names import load_name
 
 
 @fixed

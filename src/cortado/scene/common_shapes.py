@@ -1,7 +1,8 @@
-"""Shapes that solids and bodies of fluid may both have: polygons, and meshes from files."""
+"""Shapes that solids and bodies of fluid may both have."""
 
 from functools import lru_cache
-from typing import Annotated, Literal, Self
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -9,15 +10,95 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_checks import FoundMesh
 from cortado.discretise.mesh_files import mesh_in_file, thickness_of
-from cortado.discretise.primitives import Polygon
+from cortado.discretise.primitives import Box, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Solid
-from cortado.scene.fields import FieldPath, Length, Text, field_error, quantity
-from cortado.scene.fluids import beside_scene
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.tables import Table
 
+INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
 """In spacings: sheets of meshes that are thicker are thick."""
+
+
+def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
+    """Every component of upper must be greater than that of lower."""
+    if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
+        raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
+
+
+def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
+    """A cylinder needs three dimensions."""
+    if dimension == 2:
+        raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")
+
+
+def beside_scene(file: str, info: ValidationInfo) -> str:
+    """The absolute name of a file that a scene names, which is beside the scene's own."""
+    folder = Path((info.context or {}).get("folder", "."))
+    try:
+        return str((folder / file).absolute())
+    except (OSError, ValueError):
+        raise field_error((), file, "the name of a file") from None
+
+
+class BoxShape(Table):
+    """A box, or a rectangle in 2-D."""
+
+    shape: Literal["box"] = "box"
+    lower: Vector[Length]
+    """(d,) Corner with the least coordinates, before it is turned [m]."""
+    upper: Vector[Length]
+    """(d,) Corner with the greatest coordinates [m]."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        check_order(self.lower, self.upper)
+        return self
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        """The box about its middle, not turned, and where that is (d,) [m]."""
+        return Box(0.5 * np.subtract(self.upper, self.lower)), 0.5 * np.add(self.lower, self.upper)
+
+
+class SphereShape(Table):
+    """A sphere, or a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    centre: Vector[Length]
+    """(d,) Middle [m]."""
+    radius: Annotated[float, quantity("m", gt=0.0)]
+    """From the middle to the surface [m]."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        """The sphere about its middle, and where that is (d,) [m]."""
+        return Round(np.zeros(len(self.centre)), self.radius), np.array(self.centre)
+
+
+class CylinderShape(Table):
+    """A cylinder, in 3-D."""
+
+    instead: ClassVar[str]
+    """Shapes that there are in 2-D, in words."""
+    shape: Literal["cylinder"] = "cylinder"
+    base: Vector[Length]
+    """(3,) Middle of the bottom [m]."""
+    radius: Annotated[float, quantity("m", gt=0.0)]
+    """From the axis to the side [m]."""
+    height: Annotated[float, quantity("m", gt=0.0)]
+    """From the base, along the axis [m]."""
+    axis: Literal["x", "y", "z"] = "y"
+    """The axis of space along which it stands, before it is turned."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        refuse_plane(dimension, path, self.instead)
+        return super().in_dimension(dimension, path)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        """The cylinder about its middle, not turned, and where that is (3,) [m]."""
+        along = INDEX_OF_AXIS[self.axis]
+        middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[along]
+        return Revolved(Box(np.array([self.radius, 0.5 * self.height])), along), middle
 
 
 class PolygonShape(Table):

@@ -1,0 +1,418 @@
+"""What a scene looks like in pictures: materials, lights, cameras, and the tables [picture] and [render].
+
+Nothing that is computed depends on it. Colours are linear, from 0 to 1.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, SerializationInfo, ValidationInfo, field_serializer, field_validator, model_validator
+
+from cortado.calls import public
+from cortado.discretise.shapes import Points
+from cortado.errors import Words
+from cortado.scene.fields import (
+    MISSING,
+    Colour,
+    FieldPath,
+    Flag,
+    Length,
+    OneOf,
+    Text,
+    components,
+    count,
+    field_error,
+    quantity,
+)
+from cortado.scene.quantity_names import NAMES
+from cortado.scene.tables import Table
+
+Numbers = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Liquid:
+    """Fluid in pictures: on a way L within it light is taken away by Beer and Lambert's law."""
+
+    colour: Numbers
+    """Of light that it scatters, and of white light that has gone 1 / absorption through it."""
+    scattering: float
+    """[1/m]: the part exp(-scattering L) of the light goes straight on."""
+    absorption: float
+    """[1/m]: of that, the part colour^(absorption L) is left."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """A surface of a solid, or of the walls of a container."""
+
+    colour: Numbers
+    transparency: float = 0.0
+    """The part of the light that goes through."""
+    reflectivity: float = 0.0
+    """The part of the light that it reflects as a mirror in its colour does."""
+
+
+LIQUIDS = {
+    "water": Liquid(colour=(0.10, 0.35, 0.65), scattering=0.02, absorption=0.15),
+    "milk": Liquid(colour=(0.93, 0.90, 0.83), scattering=1500.0, absorption=100.0),
+    "coffee": Liquid(colour=(0.12, 0.035, 0.008), scattering=30.0, absorption=50.0),
+    "honey": Liquid(colour=(0.80, 0.36, 0.03), scattering=3.0, absorption=25.0),
+    "oil": Liquid(colour=(0.80, 0.62, 0.08), scattering=1.0, absorption=15.0),
+}
+"""What phases may be made of, by name."""
+FINISHES = {
+    "glass": Finish(colour=(0.72, 0.86, 0.82), transparency=0.92),
+    "steel": Finish(colour=(0.62, 0.61, 0.59), reflectivity=0.75),
+}
+"""What solids and containers may be made of, by name."""
+
+
+class Coloured(Table):
+    """A table with a colour: its own, if one is given, or that of its material, or else a plain one."""
+
+    materials: ClassVar[Mapping[str, Any]]
+    plain: ClassVar[Numbers]
+
+    @model_validator(mode="after")
+    def _take_colour(self) -> Self:
+        own: Any = self
+        if own.colour is None:
+            self.__dict__["colour"] = self.plain if own.material is None else self.materials[own.material].colour
+            self.model_fields_set.discard("colour")
+        return self
+
+    @field_serializer("colour", check_fields=False)
+    def _given_colour(self, colour: Colour, info: SerializationInfo) -> Colour | None:
+        """None where it was not given, unless the context asks for all `colours`: another material has another."""
+        return colour if "colour" in self.model_fields_set or info.context == "colours" else None
+
+
+@dataclass(frozen=True)
+class Light:
+    """A lamp, the sun, before a sky, and a weak strip of light on the other side; colours are linear."""
+
+    azimuth: float
+    """Of the sun, to the right of the camera where it begins, which looks from there [degrees]."""
+    elevation: float
+    """Of the sun, above the floor [degrees]."""
+    lamp: Numbers
+    """What is seen of the sun in reflections."""
+    strip: Numbers
+    """What is seen of the strip."""
+    sunlight: Numbers
+    """The light of the sun that falls on what faces it, of which white reflects 1."""
+    shadow: float
+    """The part of the light on the floor that is the sun's."""
+    background: Numbers
+    """The horizon, if a picture does not say which."""
+    zenith: Numbers
+    """The colour above, in parts of the horizon's."""
+
+
+LIGHTS = {
+    "studio": Light(
+        azimuth=-62.0,
+        elevation=50.0,
+        lamp=(7.0, 6.8, 6.4),
+        strip=(1.6, 1.7, 1.8),
+        sunlight=(0.62, 0.60, 0.57),
+        shadow=0.48,
+        background=(0.74, 0.77, 0.80),
+        zenith=(0.62, 0.72, 0.84),
+    ),
+    "noon": Light(
+        azimuth=-50.0,
+        elevation=68.0,
+        lamp=(9.0, 8.7, 8.0),
+        strip=(0.0, 0.0, 0.0),
+        sunlight=(0.78, 0.75, 0.68),
+        shadow=0.58,
+        background=(0.62, 0.73, 0.86),
+        zenith=(0.36, 0.56, 0.86),
+    ),
+    "evening": Light(
+        azimuth=-78.0,
+        elevation=20.0,
+        lamp=(9.0, 5.2, 2.4),
+        strip=(0.5, 0.6, 0.9),
+        sunlight=(0.90, 0.55, 0.28),
+        shadow=0.50,
+        background=(0.76, 0.58, 0.46),
+        zenith=(0.42, 0.60, 1.05),
+    ),
+    "overcast": Light(
+        azimuth=-62.0,
+        elevation=60.0,
+        lamp=(0.0, 0.0, 0.0),
+        strip=(0.4, 0.4, 0.4),
+        sunlight=(0.12, 0.12, 0.12),
+        shadow=0.12,
+        background=(0.62, 0.65, 0.68),
+        zenith=(1.15, 1.15, 1.15),
+    ),
+}
+"""By their names."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a camera is and where it looks, in the scene's axes."""
+
+    eye: Points
+    """(3,) [m]"""
+    look_at: Points
+    """(3,) [m]"""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a picture of a film is taken."""
+
+    share: float
+    """The part of the film that is over, from 0 to 1."""
+    time: float
+    """[s] in the run"""
+    up: Points
+    """(3,) unit vector against gravity"""
+    solids: Mapping[str, NDArray]
+    """(3,) where the middles of solids are now, by their names [m]"""
+
+
+class CameraPath(Table):
+    """How a camera moves."""
+
+    goes_around: ClassVar[bool] = False
+    """Whether it looks from all sides, and home has to be far enough off for that."""
+    kind: str
+    """Name of the path."""
+
+    def view(self, home: View, moment: Moment) -> View:
+        """Where the camera is at a moment; ``home``: where it is if it does not move."""
+        raise NotImplementedError
+
+    def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
+        """Raise the error of this table, at a path, if no solid of these names is the one that it names."""
+
+
+@public
+class Orbit(CameraPath):
+    """Around what it looks at, at its height and its distance."""
+
+    goes_around: ClassVar[bool] = True
+    kind: Literal["orbit"] = "orbit"
+    """Name of the path."""
+    turns: Annotated[float, quantity(ge=-100.0, le=100.0)] = 1.0
+    """How often it goes around during the film: counterclockwise seen from above, clockwise if negative."""
+
+    def view(self, home: View, moment: Moment) -> View:
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec(2.0 * np.pi * self.turns * moment.share * moment.up)
+        return View(home.look_at + turn.apply(home.eye - home.look_at), home.look_at)
+
+
+@public
+class Dolly(CameraPath):
+    """Straight towards what it looks at, or away from it, beginning and ending gently."""
+
+    kind: Literal["dolly"] = "dolly"
+    """Name of the path."""
+    distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
+    """How far off it is at the end, in its distance at the start."""
+
+    def view(self, home: View, moment: Moment) -> View:
+        factor = self.distance ** _gently(moment.share)
+        return View(home.look_at + factor * (home.eye - home.look_at), home.look_at)
+
+
+@public
+class Keyframes(CameraPath):
+    """Through places at given times of the run, on a smooth curve."""
+
+    kind: Literal["keyframes"] = "keyframes"
+    """Name of the path."""
+    times: tuple[Annotated[float, quantity("s", ge=0.0)], ...]
+    """(k,) Times of the run, each greater than the one before [s]; before the first and after the last it rests."""
+    cameras: tuple[tuple[Length, ...], ...]
+    """(k, 3) Where the camera is at these times [m]."""
+    look_at: tuple[tuple[Length, ...], ...] | None = None
+    """(k, 3) Where it looks at these times [m]; where it looks at home, if left out."""
+
+    @model_validator(mode="after")
+    def _check_rows(self) -> Self:
+        if len(self.times) < 2 or any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise field_error(("times",), self.times, "at least two times, each greater than the one before")
+        for name in ("cameras", "look_at"):
+            rows = getattr(self, name)
+            if rows is not None and (len(rows) != len(self.times) or any(len(row) != 3 for row in rows)):
+                wanted = f"{len(self.times)} places of 3 components, one for each of the times"
+                raise field_error((name,), rows, wanted)
+        return self
+
+    def view(self, home: View, moment: Moment) -> View:
+        look_at = home.look_at if self.look_at is None else self._at(moment.time, self.look_at)
+        return View(self._at(moment.time, self.cameras), look_at)
+
+    def _at(self, time: float, rows: Sequence[tuple[float, ...]]) -> Points:
+        from scipy.interpolate import PchipInterpolator
+
+        return np.asarray(PchipInterpolator(self.times, rows)(np.clip(time, self.times[0], self.times[-1])))
+
+
+@public
+class Follow(CameraPath):
+    """Beside a solid, in its middle the picture's, as far off as the camera is at home."""
+
+    kind: Literal["follow"] = "follow"
+    """Name of the path."""
+    solid: Text
+    """Name of the solid."""
+    distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0
+    """How far off it is, in its distance at home."""
+
+    def view(self, home: View, moment: Moment) -> View:
+        middle = np.asarray(moment.solids[self.solid])
+        return View(middle + self.distance * (home.eye - home.look_at), middle)
+
+    def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
+        if self.solid not in names:
+            wanted = f"the name of a solid: {', '.join(names)}" if names else "left out, as the scene has no solids"
+            raise field_error((*path, "solid"), self.solid, wanted)
+
+
+def _gently(share: float) -> float:
+    return share * share * (3.0 - 2.0 * share)
+
+
+AnyCameraPath = Annotated[Orbit | Dolly | Keyframes | Follow, Field(discriminator="kind")]
+
+
+COLOURS = ("phase", *NAMES, "age")
+"""What particles may be coloured by."""
+SEARCHED_FRAMES = 121
+"""Of films of a search whose scene does not say how many."""
+Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
+
+
+class Picture(Table):
+    """The stage for shaded pictures and films, which `cortado run`, `optimise` and `picture` write; what is left out
+    fits the scene."""
+
+    width: Annotated[int, count(64, 7680)] = 1280
+    """Columns of pixels."""
+    height: Annotated[int, count(64, 4320)] = 720
+    """Rows of pixels."""
+    surface: Literal["liquid", "spheres"] = "liquid"
+    """"liquid": the surface of the fluid; "spheres": a sphere for each particle, in 3-D."""
+    camera: Place | None = None
+    """(3,) where the camera is [m], in 3-D; left out, it sees all of the container."""
+    camera_path: AnyCameraPath | None = None
+    """How the camera moves over a run, in films and in single pictures, in 3-D; if left out it stays where it is."""
+    look_at: Place | None = None
+    """(3,) the middle of the picture [m], in 3-D; that of the container if left out."""
+    field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
+    """The angle that the width of the picture spans [degrees], in 3-D."""
+    transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
+    """The part of the light, from 0 to 1, that goes through fluid a tenth as thick as the container is long; if left
+    out 0.9 with one phase, and 0 with several or with another colour than theirs."""
+    floor: Flag = True
+    """Whether there is a floor, in 3-D."""
+    light: Annotated[str, OneOf(LIGHTS)] = "studio"
+    """Sun and sky, in 3-D: "studio", "noon", "evening" or "overcast"."""
+    background: Colour | None = None
+    """(3,) red, green and blue, linear, each from 0 to 1; that of the light if left out"""
+    colour: Annotated[str, OneOf(COLOURS)] = "phase"
+    """What colours particles: "phase", their own colours; a quantity, "density", "pressure", "speed", "vorticity" or
+    "wall_force", or "age", the time since they left an emitter or since the start; of both with a scale beside it."""
+    shaded: Flag = True
+    """Whether light and shadow fall on the fluid; without them its colours are those of the scale."""
+    film_frames: Annotated[int, count(0, 1_000_000)] | None = None
+    """Frames of a film, evenly chosen from those that were recorded; 25 in each of its seconds if left out, and no film
+    if 0. A search records as many for its films, 121 if left out."""
+    film_speed: Annotated[float, quantity(gt=0.0)] | None = None
+    """Seconds of the run in a second of its film: 1 is real time, 0.25 a quarter of it. If left out real time, or
+    slower or faster where the film would be shorter than 4 s or longer than 10 s."""
+
+    @property
+    def sun_and_sky(self) -> Light:
+        """The light by its numbers, with the background that is shown."""
+        light = LIGHTS[self.light]
+        return light if self.background is None else replace(light, background=self.background)
+
+    @property
+    def searched_frames(self) -> int:
+        """How many states a search records for its films, at most."""
+        return SEARCHED_FRAMES if self.film_frames is None else self.film_frames
+
+    @field_validator("look_at")
+    @classmethod
+    def _check_place(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and value == info.data.get("camera"):
+            raise field_error((), value, "another place than camera")
+        return value
+
+    def in_scene(self, dimension: int, solids: Sequence[str], path: FieldPath = ()) -> "Picture":
+        """This table, at a path, for 2 or 3 dimensions and solids of these names."""
+        for name in ("camera", "look_at", "camera_path"):
+            value = getattr(self, name)
+            if value is not None and dimension == 2:
+                found = Words("a table") if name == "camera_path" else value
+                raise field_error((*path, name), found, "left out, as the scene has 2 dimensions")
+        if self.camera_path is not None:
+            self.camera_path.check_solids(solids, (*path, "camera_path"))
+        return self
+
+
+Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("columns", "rows")]
+
+
+class Render(Table):
+    """The view, and for a view of the volume its camera."""
+
+    view: Literal["top", "volume", "plane"] = "top"
+    """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
+    resolution: Pixels = (128, 128)
+    """(2,) columns and rows of pixels"""
+    background: Colour = (1.0, 1.0, 1.0)
+    """(3,) red, green and blue, each from 0 to 1"""
+    extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
+    """How quickly light fades in fluid [1/m]; chosen by the renderer if left out."""
+    position: Place | None = Field(default=None, validate_default=True)
+    """(3,) where the camera is [m]; for a view of the volume, which needs it"""
+    look_at: Place | None = Field(default=None, validate_default=True)
+    """(3,) the middle of the picture [m]; for a view of the volume, which needs it"""
+    field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
+        default=None, validate_default=True
+    )
+    """The angle that the width of the picture spans [degrees]; for a view of the volume, 40 if left out."""
+
+    @field_validator("position", "look_at", "field_of_view")
+    @classmethod
+    def _check_camera(cls, value: Any, info: ValidationInfo) -> Any:
+        view = info.data.get("view")
+        if value is not None and view in ("top", "plane"):
+            raise field_error((), value, f'left out, as the view is "{view}": only the view "volume" has a camera')
+        if value is None and view == "volume":
+            if info.field_name == "field_of_view":
+                return 40.0
+            raise field_error((), MISSING, 'a list of 3 components: x, y and z, as the view is "volume"')
+        return value
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> Self:
+        if self.position is not None and self.position == self.look_at:
+            raise field_error(("look_at",), self.look_at, "another place than position")
+        return self
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        """This table, at a path, for 2 or 3 dimensions."""
+        if dimension == 2 and "view" not in self.model_fields_set:
+            return self.model_copy(update={"view": "plane"})
+        if (self.view == "plane") != (dimension == 2):
+            wanted = '"plane", as the scene has 2 dimensions' if dimension == 2 else '"top" or "volume" in 3-D'
+            raise field_error((*path, "view"), self.view, wanted)
+        return self

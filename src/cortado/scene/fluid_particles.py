@@ -1,0 +1,306 @@
+"""From a scene to its fluid particles, in float64.
+
+Bodies whose surface cuts through cells of a lattice begin with as many particles as their volume holds, which are then
+moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.pairs import apart, pairs_within
+from cortado.discretise.room import Region, Room
+from cortado.discretise.shapes import EXCESS, Points, grid
+from cortado.errors import InputError
+from cortado.scene.emitter import EmitterSample
+from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
+from cortado.scene.model import room_of
+from cortado.scene.scene import Scene
+
+FINER = 4
+"""Cells at the surface are cut into so many along each axis to measure a volume."""
+LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
+"""Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
+lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
+FAR = 4.0
+"""In spacings: how deep in a body depths are told apart."""
+DIGITS = 6
+"""Decimals of distances [spacings] by which particles are ordered: what is equal but for round-off stays in order."""
+
+
+def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
+    """Whether particles of a body may have another density than the lattice: where its own surface cuts cells, or where
+    it is no further than ``reach`` [m] from a solid."""
+    if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
+        return isinstance(fluid, RegionFluid)
+    return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
+
+
+@dataclass(frozen=True)
+class CutBody:
+    """The part of a body of fluid that a container and solids leave room for."""
+
+    fluid: RegionFluid
+    room: Room
+    spacing: float
+    """[m]"""
+
+    def distance(self, points: Points, reach: float) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]. What is not less than a reach
+        [m] in size may be any other number of its sign that is not."""
+        return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
+
+    def shares(self, points: Points) -> Points:
+        """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
+        return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
+
+    def volume(self, depth: float = 0.0) -> float:
+        """[m^d] of what is more than a depth [m] below the surface."""
+        dimension, fine = self.room.dimension, self.spacing / FINER
+        cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
+        distances = self.distance(cells, reach) + depth
+        cut = cells[np.abs(distances) < 0.5 * self.spacing * np.sqrt(dimension)]
+        whole = np.count_nonzero(distances < 0.0) - np.count_nonzero(self.distance(cut, reach) + depth < 0.0)
+        parts = grid([np.asarray(fine * (np.arange(FINER) + 0.5) - 0.5 * self.spacing)] * dimension)
+        reach = depth + fine
+        shares = sum(np.clip(0.5 - (self.distance(cut + part, reach) + depth) / fine, 0.0, 1.0).sum() for part in parts)
+        return float(whole * self.spacing**dimension + shares * fine**dimension)
+
+    @cached_property
+    def asked(self) -> float:
+        """[m^d] that it is to hold: the volume of the fluid's shape, times the part of it that walls leave."""
+        everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
+        return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
+
+    @cached_property
+    def _held(self) -> float:
+        """Its volume, as cells measure it [m^d]."""
+        return self.volume()
+
+    @cached_property
+    def count(self) -> int:
+        """The number of its particles."""
+        volume = self._held
+        lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
+        return round((volume - lacking) / self.spacing**self.room.dimension)
+
+    def particles(self) -> Points:
+        """(n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells as deep as there are
+        points, `count` of them."""
+        if not self._cuts_cells():
+            return self.fluid.particles_in(self.room, self.spacing)
+        points = self.fluid.lattice(self.spacing, self.spacing)
+        depths = np.round(self.distance(points, FAR * self.spacing) / self.spacing, DIGITS)
+        return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
+
+    def _cuts_cells(self) -> bool:
+        """Whether a surface goes through cells: that of the body, or that of a solid."""
+        if self.fluid.cuts_cells(self.spacing):
+            return True
+        from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
+        return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.fluid.block(self.spacing).spacings.min()).any())
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What lies around bodies that were cut: particles that stay where they are, air, and walls."""
+
+    bodies: tuple[CutBody, ...]
+    staying: Points
+    """(m, d) particles of other fluid [m]"""
+    lower: Points
+    """(d,) where the period begins [m]"""
+    lengths: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
+
+    def air(self, reach: float) -> tuple[Points, Points]:
+        """Points (m, d) [m] of lattices around the bodies up to ``reach`` [m] from their surfaces, and of the cell
+        around each the part (m,) where there is neither fluid nor wall."""
+        found = [self._air_around(body, reach) for body in self.bodies]
+        points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return points[shares > 0.0], shares[shares > 0.0]
+
+    def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
+        """That which is nearer to one body than to others, and no further from it than half a period."""
+        points = body.fluid.lattice(body.spacing, reach + body.spacing)
+        middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
+        within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
+        furthest = reach + body.spacing
+        points = points[within & (np.abs(body.distance(points, furthest)) < furthest)]
+        nearest = np.argmin([self._distance(other, points, furthest) for other in self.bodies], axis=0)
+        points = points[nearest == self.bodies.index(body)]
+        fluid = self._shares(points, body.spacing)
+        walls = np.clip(0.5 + body.room.distance(points, body.spacing) / body.spacing, 0.0, 1.0)
+        return points, np.clip(1.0 - fluid - walls, 0.0, 1.0)
+
+    def _distance(self, body: CutBody, points: Points, reach: float) -> Points:
+        return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
+
+    def _shares(self, points: Points, spacing: float) -> Points:
+        """(n,) the part of the cell around each of the points that is fluid."""
+        found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
+        reach = spacing * np.sqrt(points.shape[1])
+        point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
+        separations = np.abs(apart(points[point] - self.staying[particle], self.lengths))
+        common = np.clip(1.0 - separations / spacing, 0.0, None).prod(axis=1)
+        return np.asarray(found + np.bincount(point, common, minlength=len(points)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FluidSample:
+    """Fluid particles, in the order in which the scene lists their fluids; those of the emitter come last."""
+
+    positions: Points
+    """(n, d) [m]"""
+    velocities: Points
+    """(n, d) [m/s]"""
+    phase: NDArray[np.int64]
+    """(n,) index into the scene's phases"""
+    sizes: tuple[int, ...]
+    """How many particles each body of fluid has, without those of the emitter."""
+    asked: tuple[float, ...]
+    """What each of these is to hold, without what walls take of it [m^d]; of points what they hold."""
+    bodies: tuple[CutBody, ...]
+    """Those whose particles are to be packed, in the order of the particles."""
+    is_packed: NDArray[np.bool_]
+    """(n,) whether a particle is of one of these."""
+    is_placed: NDArray[np.bool_]
+    """(n,) whether somebody has said where a particle is: a point of a file, or one in a nozzle."""
+    emitter: EmitterSample | None
+    """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
+
+    def jittered(self, most: float) -> Points:
+        """(n, d) [m] positions, with each coordinate of what nobody has placed changed by up to ``most`` [m]."""
+        moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
+        return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
+
+    def some(self, kept: NDArray[np.int64]) -> "FluidSample":
+        """The same without particles but those of the given numbers (m,), in rising order; all of the emitter stay."""
+        names = "positions", "velocities", "phase", "is_packed", "is_placed"
+        arrays = {name: getattr(self, name)[kept] for name in names}
+        ends = np.searchsorted(kept, np.cumsum(self.sizes))
+        return replace(self, sizes=tuple(np.diff(ends, prepend=0).tolist()), **arrays)
+
+    @property
+    def emitted(self) -> slice:
+        """Which particles are the emitter's."""
+        count = len(self.positions)
+        return slice(count if self.emitter is None else count - len(self.emitter.upstream), count)
+
+
+def fluid_particles(scene: Scene) -> FluidSample:
+    """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
+    gone since the scene was read, or if walls leave no room for any particle of a fluid."""
+    spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
+    room, bodies = room_of(scene), _cut_bodies(scene)
+    positions = [
+        fluid.particles_in(room, spacing) if body is None else body.particles()
+        for fluid, body in zip(scene.fluid, bodies, strict=True)
+    ]
+    for index, (particles, body) in enumerate(zip(positions, bodies, strict=True)):
+        if not len(particles):
+            raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
+    velocities = [fluid.velocities(x) for fluid, x in zip(scene.fluid, positions, strict=True)]
+    phases = [names.index(fluid.phase) for fluid in scene.fluid]
+    asked = [
+        fluid.volume(spacing) if body is None else body.asked for fluid, body in zip(scene.fluid, bodies, strict=True)
+    ]
+    emitted = None
+    if scene.emitter is not None:
+        emitted = scene.emitter.sample(spacing)
+        emitted.positions[emitted.upstream > emitted.column] += reserve_offset(scene)
+        positions.append(emitted.positions)
+        velocities.append(emitted.velocities)
+        phases.append(names.index(scene.emitter.phase))
+        bodies.append(None)
+    sizes, nozzles = [len(x) for x in positions], len(positions) - len(scene.fluid)
+    return FluidSample(
+        positions=np.concatenate(positions),
+        velocities=np.concatenate(velocities),
+        phase=np.repeat(phases, sizes),
+        sizes=tuple(sizes[: len(scene.fluid)]),
+        asked=tuple(asked),
+        bodies=tuple(body for body in bodies if body is not None),
+        is_packed=np.repeat([body is not None for body in bodies], sizes),
+        is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),
+        emitter=emitted,
+    )
+
+
+def reserve_offset(scene: Scene) -> Points:
+    """(d,) [m] how far from their place in line particles wait that are in reserve: along every axis without a period
+    beyond all else, upstream of the opening."""
+    assert scene.emitter is not None
+    spacing, direction = scene.discretisation.spacing, np.array(scene.emitter.direction)
+    boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
+    ends = np.array([[scene.emitter.outlet] * 2, scene.container.extent() or [scene.emitter.outlet] * 2, *boxes])
+    size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
+    aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
+    return 2.0 * (size + scene.discretisation.support_radius) * aside
+
+
+def _cut_bodies(scene: Scene) -> list[CutBody | None]:
+    """Of each body of fluid the part that walls leave room for, where its particles may be packed; None of others."""
+    spacing, reach, room = scene.discretisation.spacing, scene.discretisation.support_radius, room_of(scene)
+    return [CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None for fluid in scene.fluid]
+
+
+def _why_none(body: CutBody | None, spacing: float) -> str:
+    """Why a body of fluid has no particles, and what to do, as the end of a sentence."""
+    if body is None:
+        return (
+            f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
+            "from them"
+        )
+    cells = body.volume() / spacing**body.room.dimension
+    return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
+
+
+def period(scene: Scene) -> tuple[Points, Points]:
+    """Where the period of a scene begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
+    return scene.container.periods(scene.dimension)
+
+
+@dataclass(frozen=True)
+class FluidMasses:
+    """By phase [kg]; in 2-D of a layer one metre thick."""
+
+    given: Mapping[str, float]
+    """That of its particles at the start, with those that wait in an emitter."""
+    asked: Mapping[str, float]
+    """That of the volume that its bodies of fluid have, without what walls take of it, and what an emitter holds."""
+
+    @classmethod
+    def of(cls, scene: Scene, fluid: FluidSample) -> Self:
+        """Of the first particles of a scene."""
+        names, cell = [phase.name for phase in scene.phase], scene.discretisation.spacing**scene.dimension
+        densities = np.array([phase.rest_density for phase in scene.phase])
+        held = cell * np.bincount(fluid.phase, minlength=len(names))
+        waiting = cell * np.bincount(fluid.phase[fluid.emitted], minlength=len(names))
+        bodies = [names.index(body.phase) for body in scene.fluid]
+        wanted = waiting + np.bincount(bodies, fluid.asked, minlength=len(names))
+        given, asked = ((densities * volumes).tolist() for volumes in (held, wanted))
+        return cls(dict(zip(names, given, strict=True)), dict(zip(names, asked, strict=True)))
+
+    @property
+    def off(self) -> dict[str, str]:
+        """In words, of phases that hold another mass than was asked for, by more than `EXCESS`."""
+        return {
+            name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
+            for name, given in self.given.items()
+            if abs(given - self.asked[name]) > EXCESS * self.asked[name]
+        }
+
+    @property
+    def warning(self) -> str | None:
+        """What to say of a scene before it runs; None where all phases hold what was asked for."""
+        if not self.off:
+            return None
+        return (
+            f"the fluid begins with {' and '.join(self.off.values())}: boxes whose sides are whole multiples of the "
+            "spacing have exactly what is asked for, and of other shapes a smaller spacing comes nearer."
+        )

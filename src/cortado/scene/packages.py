@@ -1,0 +1,334 @@
+"""Solvers and forces that installed packages register, by entry points, for scene files to name.
+
+Entry points are read where a scene names a kind that is not Cortado's own, and nowhere else. What goes wrong in a part
+of a package is a sentence that names the package, wherever the part is used.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import fields, replace
+from functools import cache, cached_property, wraps
+from importlib.metadata import EntryPoint, entry_points
+from inspect import Parameter as Argument
+from inspect import getattr_static, isfunction, signature
+from traceback import extract_tb
+from typing import Annotated, Any, ClassVar, Self, get_origin
+
+from pydantic import ConfigDict, GetJsonSchemaHandler, TypeAdapter, ValidationError, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from cortado.errors import ComputationError, CortadoError, InputError, SceneError, Words, shown
+from cortado.scene.fields import MISSING, FieldPath, Flag, Text, count, field_error, quantity, without_numpy
+from cortado.scene.parameters import PARAMETERS, Parameter
+from cortado.scene.tables import Table, wanted
+
+GUARDED = "_guarded_by_cortado"
+"""The attribute of classes that are guarded."""
+ABSENT = object()
+OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
+"""Modules whose objects are no part of a package."""
+
+
+def _in_words(problem: BaseException, package: str) -> str:
+    """What a package raised, and where, without the full stop."""
+    try:
+        text = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".: ")
+    except Exception:  # words of its own that cannot be made
+        text = type(problem).__name__
+    frames = extract_tb(problem.__traceback__)
+    own = [frame for frame in frames if "cortado" not in frame.filename.replace("\\", "/").split("/")] or frames
+    return f"{text} ({package}, {own[-1].filename}, line {own[-1].lineno})"
+
+
+@contextmanager
+def guarded(
+    what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
+) -> Iterator[None]:
+    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors,
+    for an interruption and for what is ``expected``. One that asks for the end of the process does not get it."""
+    kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
+    try:
+        yield
+    except kept:
+        raise
+    except BaseException as problem:
+        raise error(f"{what} {_in_words(problem, package)}.") from problem
+
+
+class PackageMaker:
+    """What a package makes of a table, as `Simulation` takes it; what it makes in turn is guarded too."""
+
+    def __init__(self, part: Any, kind: str, package: str):
+        """``kind``: the name that the package gives it; ``package``: what sentences call that."""
+        self._part, self._kind, self._package = part, kind, package
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        with guarded(f'"{self._kind}" fails where its {name} is read:', self._package):
+            found = getattr(self._part, name, ABSENT)
+        if found is ABSENT:
+            raise AttributeError(name)
+        return self._guarded(found, f'"{self._kind}" fails in {name}:') if callable(found) else found
+
+    @cached_property
+    def parameters(self) -> Any:
+        """Those of the part, whose functions are guarded."""
+        found = self.__getattr__("parameters")
+        return [self._judged(one) for one in found] if isinstance(found, (list, tuple)) else found
+
+    def _judged(self, parameter: Any) -> Any:
+        if not isinstance(parameter, Parameter):
+            return parameter
+        given = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
+        own = [name for name, value in given.items() if isfunction(value) and not _is_ours(value)]
+        what = f'"{self._kind}" fails in its parameter {parameter.name}:'
+        changes: dict[str, Any] = {name: self._guarded(given[name], what) for name in own}
+        return replace(parameter, **changes) if own else parameter
+
+    def _guarded(self, method: Callable[..., Any], what: str) -> Callable[..., Any]:
+        def call(*arguments: Any, **more: Any) -> Any:
+            with guarded(what, self._package):
+                return _at_work(method(*arguments, **more), self._kind, self._package)
+
+        return call
+
+    def __repr__(self) -> str:
+        return f'"{self._kind}" of {self._package}'
+
+
+def _at_work(made: Any, kind: str, package: str) -> Any:
+    """What a part of a package made, such as a solver: the methods and properties of its class are guarded from then
+    on, and what they return."""
+    cls: Any = type(made)
+    if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
+        with suppress(TypeError):  # of a class that is not Python's
+            made.__class__ = _guarded_class(cls, kind, package)
+    return made
+
+
+@cache
+def _guarded_class(cls: type, kind: str, package: str) -> type:
+    """One of the same name, without the methods that are Cortado's."""
+    if GUARDED in cls.__dict__:
+        return cls
+    own: dict[str, Any] = {"__slots__": (), "__module__": cls.__module__, GUARDED: True}
+    for name in dir(cls):
+        found, what = getattr_static(cls, name), f'"{kind}" fails in {name} of {cls.__name__}:'
+        if isinstance(found, property) and found.fget and not _is_ours(found.fget):
+            own[name] = property(_guarded_method(found.fget, what, kind, package), found.fset, found.fdel)
+        elif isfunction(found) and name == "__getattr__":
+            own[name] = _guarded_method(found, what, kind, package, (AttributeError,))
+        elif isfunction(found) and not name.startswith("__") and not _is_ours(found):
+            own[name] = _guarded_method(found, what, kind, package)
+    return type(cls)(cls.__name__, (cls,), own)
+
+
+def _guarded_method(
+    function: Callable[..., Any], what: str, kind: str, package: str, expected: tuple[type[BaseException], ...] = ()
+) -> Callable[..., Any]:
+    @wraps(function)
+    def call(*arguments: Any, **more: Any) -> Any:
+        with guarded(what, package, ComputationError, expected):
+            return _at_work(function(*arguments, **more), kind, package)
+
+    return call
+
+
+def _is_ours(function: Any) -> bool:
+    return (getattr(function, "__module__", None) or "").partition(".")[0] in OTHERS
+
+
+MOST = 1_000_000_000
+TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
+"""Of keys whose argument is annotated with a plain type, what is checked."""
+
+
+def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
+    """The entry point of a group, such as "cortado.forces", with a name that is none of Cortado's ``own``; raises a
+    `SceneError` about ``kind``."""
+    if kind in own:
+        raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
+    found = entry_points(group=group)
+    for entry in found:
+        if entry.name in own:
+            sentence = (
+                f'cannot be read: {_package_of(entry)} registers "{entry.name}" under {group}, which is a name of '
+            )
+            raise SceneError(None, "kind", kind, sentence=f"{sentence}Cortado's own, and must take another.")
+    same = list({(entry.value, _package_of(entry)): entry for entry in found if entry.name == kind}.values())
+    if not same:
+        names = ", ".join(sorted({f'"{entry.name}"' for entry in found})) or "which there is none"
+        offered = f'{advice}a name that an installed package registers under "{group}", of {names}'
+        raise SceneError(None, "kind", kind, offered.replace(', of "', ': "'))
+    if len(same) > 1:
+        packages = " and ".join(_package_of(entry) for entry in same)
+        raise SceneError(None, "kind", kind, f"a name that one package has: {packages} register it under {group}")
+    return same[0]
+
+
+def _package_of(entry: EntryPoint) -> str:
+    """As sentences call it."""
+    return f"the package {entry.dist.name}" if entry.dist is not None else f"the package of {entry.value}"
+
+
+def loaded(entry: EntryPoint) -> Callable[..., Any]:
+    """The class or function that an entry point names; raises a `SceneError` about ``kind``."""
+    where = f"is {shown(entry.name)}, for which {_package_of(entry)} registers {entry.value}"
+    with _told("kind", entry, f"{where}, but that cannot be imported:"):
+        found = entry.load()
+    if not callable(found):
+        sentence = f"{where}, but that is {shown(found)}, and must be a class or a function."
+        raise SceneError(None, "kind", entry.name, sentence=sentence)
+    return found
+
+
+@contextmanager
+def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
+    """Has whatever a package raises end as a `SceneError` about a field, other errors of Cortado's own included."""
+    try:
+        with guarded(what, _package_of(entry)):
+            yield
+    except SceneError:
+        raise
+    except CortadoError as problem:
+        found = str(problem)
+        sentence = found if found.startswith(what) else f"{what} {found}"
+        raise SceneError(None, field, entry.name, sentence=sentence) from problem
+
+
+def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
+    """The keys of a table as the arguments of a factory, each checked by its annotation; raises a `SceneError` about
+    the first that does not fit."""
+    arguments = _arguments(factory)
+    if arguments is None:
+        return dict(keys)
+    for name in reserved:
+        if name in arguments:
+            sentence = f"has an argument {name}, which is a key of every such table, and must be called otherwise."
+            raise SceneError(None, "kind", name, sentence=f"{getattr(factory, '__name__', 'the factory')} {sentence}")
+    known = [name for name, one in arguments.items() if one.kind is not Argument.VAR_KEYWORD]
+    for name in keys:
+        if name not in known and len(known) == len(arguments):
+            its = f"its keys are {', '.join([*reserved, *known])}"
+            raise SceneError(None, name, Words("unknown"), "", f"is not a key of {{table}}; {its}.")
+    for name in known:
+        if name not in keys and arguments[name].default is Argument.empty:
+            raise SceneError(None, name, MISSING, _adapter(arguments[name])[1])
+    return {name: _checked(name, value, arguments.get(name)) for name, value in keys.items()}
+
+
+def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
+    """Those that have names, and ``**others`` if it takes them; None where Python cannot tell."""
+    for evaluated in (True, False):
+        try:
+            found = signature(factory, eval_str=evaluated).parameters
+            break
+        except Exception:  # annotations may be any text
+            continue
+    else:
+        return None
+    unnamed = (Argument.POSITIONAL_ONLY, Argument.VAR_POSITIONAL)
+    return {name: one for name, one in found.items() if one.kind not in unnamed}
+
+
+def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
+    """What checks a value, and what it must be, in words; of other annotations than plain types and fields of scenes
+    whoever is given the value judges it."""
+    annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
+    if annotation is None or get_origin(annotation) is not Annotated:
+        return None, "given"
+    try:
+        adapter: TypeAdapter = TypeAdapter(annotation)
+        return adapter, wanted(adapter.json_schema(), argument.name)
+    except Exception:  # an annotation that is for others
+        return None, "given"
+
+
+def _checked(name: str, value: Any, argument: Argument | None) -> Any:
+    adapter, words = _adapter(argument) if argument is not None else (None, "")
+    if adapter is None:
+        return value
+    try:
+        return adapter.validate_python(value)
+    except ValidationError:
+        raise SceneError(None, name, value, words) from None
+
+
+def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
+    """What a factory makes of the keys of a table, which must have a method of that name; raises a `SceneError`."""
+    called = f'of the kind "{entry.name}"'
+    with _told("", entry, f"{called} cannot be made:"):
+        found = factory(**keys)
+        fits = not isinstance(found, type) and callable(getattr(found, method, None))
+    if not fits:
+        sentence = f"{called} is made by {entry.value}, but that returned {shown(found)}, and must return an object"
+        raise SceneError(None, "", entry.name, sentence=f"{sentence} with a method {method}(setting).")
+    return PackageMaker(found, entry.name, _package_of(entry))
+
+
+class PackageTable(Table):
+    """A table whose kind an installed package registers. Its other keys are the arguments of what is registered."""
+
+    model_config = ConfigDict(extra="allow")
+    group: ClassVar[str]
+    """Of entry points."""
+    method: ClassVar[str]
+    """That what is made has."""
+    own: ClassVar[Collection[str]] = ()
+    """Names that no package can have."""
+    advice: ClassVar[str] = ""
+    """What else may stand in the place of ``kind``, in words."""
+    kind: Text
+    """The name that the package gives it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_keys(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or not isinstance(data.get("kind"), str) or not data["kind"].strip():
+            return data
+        given = {str(name): without_numpy(value) for name, value in data.items()}
+        common = {name: value for name, value in given.items() if name in cls.model_fields}
+        others = {name: value for name, value in given.items() if name not in cls.model_fields}
+        try:
+            return {**common, **cls._judged(data["kind"], others)}
+        except SceneError as error:
+            sentence = None if error.wanted and error.sentence.startswith("is ") else error.sentence
+            path = () if not error.field else (error.field,)
+            raise field_error(path, error.found, error.wanted, sentence) from error
+
+    @classmethod
+    def _judged(cls, kind: str, keys: Mapping[str, Any]) -> dict[str, Any]:
+        """The keys as the part takes them; raises a `SceneError` about one of them."""
+        entry = registered(cls.group, kind, cls.own, cls.advice)
+        factory = loaded(entry)
+        checked = checked_keys(factory, keys, tuple(cls.model_fields))
+        made(entry, factory, checked, cls.method)
+        return checked
+
+    def make(self) -> Any:
+        """The part, as the package makes it of the keys; raises a `SceneError`."""
+        entry = registered(self.group, self.kind, self.own, self.advice)
+        return made(entry, loaded(entry), self.model_extra or {}, self.method)
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        return self
+
+
+class Inline:
+    """Has the JSON schema of a table stand where it is used, and not among the tables whose keys are all known."""
+
+    def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}
+
+
+class PackageForce(PackageTable):
+    """A force that an installed package registers; there may be several."""
+
+    group = "cortado.forces"
+    method = "force"
+    own = ("gravity", "viscosity", "pressure", *(p.name for p in PARAMETERS if p.is_optional))
+
+
+AnyForces = tuple[Annotated[PackageForce, Inline()], ...]

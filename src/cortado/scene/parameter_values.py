@@ -1,0 +1,278 @@
+"""Values of parameters as users write them, checked, with one sentence where one is wrong; and the functions of them
+that a run starts from. Without Warp, in float64.
+
+n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.arrays import as_numbers, require_table
+from cortado.errors import InputError, OutOfRangeError, shown
+from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Source, names
+
+
+def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
+    """m (n,) [kg / m3] for mass fractions (n, phases) and rest densities (phases,) [kg / m3]."""
+    return 1.0 / (fractions / rest_density).sum(axis=1)
+
+
+def reference_density_tangent(
+    fractions: np.ndarray, rest_density: np.ndarray, fractions_dot: np.ndarray, rest_density_dot: np.ndarray
+) -> np.ndarray:
+    """The derivative of m (n,) along a direction."""
+    change = (fractions_dot - fractions * rest_density_dot / rest_density) / rest_density
+    return -(reference_density(fractions, rest_density) ** 2) * change.sum(axis=1)
+
+
+def reference_density_adjoint(
+    fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The adjoints of fractions (n, phases) and of rest densities (phases,) for one of m (n,)."""
+    by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
+    return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
+
+
+SMALL = 1e-2
+"""Angles [rad] below which a series takes the place of a division by them; what it leaves out is below round-off."""
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """Gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k) of angles a (d - 1,) [degrees] from the rest e_0.
+
+    The unit vectors e_k are the axes other than the one that gravity at rest is most nearly along, in their order, made
+    perpendicular to it and to each other: where it is along -y, gravity leans towards x by a_1 and towards z by a_2.
+    The map is smooth, at rest as well (it is the exponential map of the sphere), and there and back for |a| < 180.
+    """
+
+    rest: tuple[float, ...]
+    """(d,) gravity without a tilt [m/s2], not 0."""
+
+    def gravity(self, angles: np.ndarray) -> np.ndarray:
+        """(d,) or (steps, d) [m/s2] of angles (d - 1,) or (steps, d - 1) [degrees]."""
+        a = np.radians(angles)
+        size = np.linalg.norm(a, axis=-1, keepdims=True)
+        return self._size * np.concatenate([np.cos(size), np.sinc(size / np.pi) * a], axis=-1) @ self._axes
+
+    def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
+        """The derivative of `gravity` along ``dot`` [m/s2], of the angles' shape."""
+        a, a_dot = np.radians(angles), np.radians(dot)
+        sine, sine_derivative = self._factors(a)
+        along = (a * a_dot).sum(axis=-1, keepdims=True)
+        return (
+            self._size
+            * np.concatenate([-sine * along, sine * a_dot + sine_derivative * along * a], axis=-1)
+            @ self._axes
+        )
+
+    def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        """The derivative with respect to the angles [1/degree], from that with respect to gravity."""
+        a, bars = np.radians(angles), self._size * bar @ self._axes.T
+        sine, sine_derivative = self._factors(a)
+        rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
+        along = sine_derivative * (a * lean_bar).sum(axis=-1, keepdims=True) - sine * rest_bar
+        return np.radians(sine * lean_bar + along * a)
+
+    @property
+    def towards(self) -> str:
+        """The names of the axes that gravity leans towards, such as "xz"."""
+        return "".join(np.delete(list("xyz"[: len(self.rest)]), np.abs(self.rest).argmax()))
+
+    @property
+    def _size(self) -> float:
+        return float(np.linalg.norm(self.rest))
+
+    @property
+    def _axes(self) -> np.ndarray:
+        """(d, d) rows e_0, e_1 ..."""
+        rows = [np.array(self.rest) / self._size]
+        for axis in np.delete(np.eye(len(self.rest)), np.abs(self.rest).argmax(), axis=0):
+            rest = axis - sum((axis @ row) * row for row in rows)
+            rows.append(rest / np.linalg.norm(rest))
+        return np.array(rows)
+
+    @staticmethod
+    def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(..., 1) s = sin|a| / |a|, and its derivative along |a|, over |a|."""
+        size = np.linalg.norm(a, axis=-1, keepdims=True)
+        sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
+        derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
+        return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)
+
+
+class Known(Mapping[str, Parameter]):
+    """Parameters by name, those of the registry first. It is equal to itself alone."""
+
+    __eq__, __hash__ = object.__eq__, object.__hash__
+
+    def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
+        """``own``: those of forces and of a solver, each with whose it is, in words; `TIME` may be among them several
+        times. Raises `InputError` where two parameters have one name, or the same arguments of kernels."""
+        self._by_name = dict(BY_NAME)
+        arguments = {argument(name): name for name in BY_NAME}
+        for parameter, whose in dict(own).items():
+            name = parameter.name
+            if argument(name) in arguments:
+                raise InputError(
+                    f"parameter {name} of {whose} has the name of another one, {arguments[argument(name)]}, but must "
+                    f"have its own: give {whose.replace('a ', 'the ')} another name."
+                )
+            arguments[argument(name)] = name
+            self._by_name[name] = parameter
+        self.own = tuple(p for p in self._by_name.values() if p.name not in BY_NAME)
+        """Those of forces and of a solver."""
+        self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
+        """Names of what steps depend on."""
+        self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
+        """Names of what the first state has, and other states have of their own."""
+        self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
+        """Names of those that may have a row for each step."""
+        self.vectors = tuple(name for name in self.run if self[name].components is not None)
+        """Names of what steps depend on and has the components of a vector."""
+        self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
+        """Names of other ways to write parameters, with those of these parameters."""
+        self.courses = {p.name: p.course for p in self.own if p.course is not None}
+        """How these change while a scene runs."""
+
+    def has_rows(self, name: str, value: Any) -> bool:
+        """Whether a value of a parameter has rows in time: one for each step, or for each of some knots."""
+        parameter = self[name]
+        return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self._by_name)
+
+
+class _Passing:
+    """Time itself, as a course of a parameter."""
+
+    def at(self, times: NDArray) -> NDArray:
+        return times
+
+    def rates(self, times: NDArray) -> NDArray:
+        return np.ones_like(times)
+
+
+TIME = Parameter(
+    "time",
+    "s",
+    "when a step begins",
+    Axis.STEP,
+    lambda source: 0.0,
+    role=Role.CLOCK,
+    moment=0.0,
+    course=_Passing(),
+)
+"""For forces that depend on time. Kernels find (members, steps) numbers; derivatives with respect to the time step
+follow, and runs that go on have their own."""
+
+
+def argument(name: str) -> str:
+    """What arguments of kernels call a parameter: ``drag_k`` is that of ``drag.k``."""
+    return name.replace(".", "_")
+
+
+REGISTRY = Known()
+"""Those of a simulation without forces of its own."""
+
+
+Values = Mapping[str, Any]
+Arrays = dict[str, np.ndarray]
+
+NAMES = names()
+"""Every parameter."""
+UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
+"""Every parameter with its unit."""
+OVER_TIME = names(axis=Axis.STEP)
+"""Parameters that may have a row for each step; a tilt takes the place of gravity."""
+SUM_TOLERANCE = 0.01
+"""How far the mass fractions of a particle may add up to something else than 1: differences need some room."""
+
+
+def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
+    """Every parameter of the ``known`` that a scene has, as it has it, in the shape that a user would write; without a
+    tilt, which is another way to write gravity."""
+    phases, positions = len(source.scene.phase), source.positions.shape
+    found = {}
+    for name, parameter in known.items():
+        if parameter.present(source.scene) and parameter.role not in (Role.VIEW, Role.CLOCK):
+            shape = parameter.shapes(0, phases, positions)[0]
+            found[name] = np.asarray(parameter.value(source), dtype=np.float64).reshape(shape)
+    return found
+
+
+def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
+    """Whether there is such a parameter, and a scene has it; raises `InputError`."""
+    if name not in known or known[name].role is Role.CLOCK:
+        owner = str(name).rpartition(".")[0]
+        if owner in (solid.name for solid in scene.solid if not solid.moves):
+            wanted = 'only those whose motion is "path" or "free" have parameters'
+            raise InputError(f"{what} {name!r} is unknown, as the solid {owner!r} is at rest: {wanted}.")
+        present = [p.name for p in known.values() if p.present(scene) and p.role is not Role.CLOCK]
+        raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(present)} in this scene.")
+    parameter = known[name]
+    if not parameter.present(scene):
+        raise InputError(f"{what} {name} is given, but must be left out, as the scene {parameter.absent}.")
+
+
+def require_points(points: object) -> None:
+    """Raises `InputError` unless these are parameters by name, of at least one point."""
+    if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
+        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+    for point in points:
+        require_table("a point", point, "{'gravity': value}")
+
+
+def is_too_small(array: np.ndarray, allowed: Range) -> bool:
+    """Whether a number is below a range that begins at 0."""
+    if allowed is Range.POSITIVE:
+        return bool((array <= 0.0).any())
+    return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())
+
+
+def checked_value(
+    name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
+) -> np.ndarray:
+    """A value as a float64 array of one of the shapes, finite and in range, or an `InputError` in a sentence: an
+    `OutOfRangeError` where only the value is wrong. A ``what`` of "direction" may be negative."""
+    array, parameter = as_numbers(f"{what} {name}", value), known[name]
+    unit = f" in {parameter.unit}" if parameter.unit else ""
+    if array.shape not in shapes:
+        raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")
+    if not np.isfinite(array).all():
+        raise OutOfRangeError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
+    if what != "direction":
+        _check_range(name, array, parameter.range, what)
+    return array
+
+
+def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> None:
+    if is_too_small(array, allowed):
+        raise OutOfRangeError(f"{what} {name} is {shown(float(array.min()))}, but must be {allowed.value}.")
+    if allowed is Range.FRACTIONS:
+        totals = array.sum(axis=-1)
+        worst = np.unravel_index(np.abs(totals - 1.0).argmax(), totals.shape)
+        if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
+            place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
+            raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")
+
+
+def stacked(tables: Sequence[Arrays]) -> Arrays:
+    """Arrays of the same names with a first axis for each of the tables."""
+    return {name: np.stack([one[name] for one in tables]) for name in tables[0]}
+
+
+def entry(arrays: Arrays, number: int) -> Arrays:
+    """One entry of the first axis of each array."""
+    return {name: array[number] for name, array in arrays.items()}

@@ -1,0 +1,223 @@
+"""Points from files: NumPy arrays and what VTK reads.
+
+VTK and HDF5 trust what a file says of itself: a damaged one may make them print pages, wait, take all memory or end
+the process. So they read in a process of its own, ``python -m cortado.scene.point_files FILE``, which has limits, and
+whose messages nobody sees. It writes the points (n, 3) or (n, 2) in NumPy's own format to its standard output, or, with
+exit code `REFUSED`, why there are none.
+"""
+
+import io
+import math
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from cortado.discretise.shapes import Points
+from cortado.errors import InputError, Words, shown
+from cortado.files.input_files import reason, regular_file
+
+MOST_POINTS = 10_000_000
+"""Of a file."""
+REFUSED = 3
+ROOM = 2**30
+"""Memory that any file may take [byte]; a large file may take more."""
+
+
+class Refused(Exception):
+    """Why a file cannot be used, a clause."""
+
+
+def _poly_data(path: str) -> Any:
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    return _read_by_vtk(vtkXMLPolyDataReader(), path)
+
+
+def _legacy(path: str) -> Any:
+    from vtkmodules.vtkIOLegacy import vtkDataSetReader
+
+    return _read_by_vtk(vtkDataSetReader(), path)
+
+
+def _read_by_vtk(reader: Any, path: str) -> Any:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    messages = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(messages)  # VTK has no exceptions
+    reader.SetFileName(path)
+    reader.Update()
+    output = reader.GetOutput()
+    points = output.GetPoints() if hasattr(output, "GetPoints") else None
+    # A message that quotes what is no text comes as bytes.
+    if "ERROR" in str(messages.GetOutput()) or points is None:
+        raise Refused("holds no points that VTK can read")
+    _check_count(points.GetNumberOfPoints())
+    return vtk_to_numpy(points.GetData())
+
+
+def _hdf5(path: str) -> Any:
+    """The points of the first step, of all its parts; those of a trajectory of Cortado's only if its checksums hold."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        if "cortado" in file:
+            return _trajectory(path)
+        root = file["VTKHDF"]
+        points, parts, begin = root["Points"], slice(None), 0
+        if "Steps" in root:
+            steps = root["Steps"]
+            if steps.attrs["NSteps"] < 1:
+                raise Refused("holds no step")
+            first = int(steps["PartOffsets"][0])
+            parts = slice(first, first + (int(steps["NumberOfParts"][0]) if "NumberOfParts" in steps else 1))
+            begin = int(steps["PointOffsets"][0])
+        count = int(root["NumberOfPoints"][parts].sum())
+        _check_count(count)
+        if begin < 0 or begin + count > len(points) or points.shape[1:] != (3,):
+            raise Refused(f"holds points of shape {points.shape}, but says that its first {count} begin at {begin}")
+        return points[begin : begin + count]
+
+
+def _trajectory(path: str) -> Any:
+    from cortado.errors import InputError
+    from cortado.files import vtkhdf
+
+    try:
+        positions = vtkhdf.read(path)["positions"]
+    except InputError:
+        raise Refused("is a damaged trajectory, or one of another version of Cortado") from None
+    if not len(positions):
+        raise Refused("holds no step")
+    _check_count(positions.shape[1])
+    return positions[0]
+
+
+READERS: dict[str, Callable[[str], Any]] = {".vtk": _legacy, ".vtp": _poly_data, ".vtkhdf": _hdf5}
+"""By the end of a file's name."""
+
+
+def _check_count(count: int) -> None:
+    if not 0 < count <= MOST_POINTS:
+        raise Refused(f"holds {count} points, but must hold from 1 to {MOST_POINTS}")
+
+
+def _limit_memory(size: int) -> None:
+    """For a file of a size [byte]: what VTK makes of it is several times as large, and an array of it on the way."""
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return
+    most = ROOM + 20 * size
+    for what, limit in ((resource.RLIMIT_DATA, most), (resource.RLIMIT_CORE, 0)):
+        hardest = resource.getrlimit(what)[1]
+        resource.setrlimit(what, (limit if hardest == resource.RLIM_INFINITY else min(limit, hardest), hardest))
+
+
+def main(path: str) -> int:
+    """Reads and writes; returns the exit code."""
+    output, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    for terminal in (1, 2):
+        os.dup2(nothing, terminal)
+    code, content = 0, io.BytesIO()
+    try:
+        _limit_memory(os.stat(path).st_size)
+        np.save(content, READERS[Path(path).suffix](path), allow_pickle=False)
+    except Refused as problem:
+        code, content = REFUSED, io.BytesIO(str(problem).encode())
+    except ModuleNotFoundError:
+        code, content = REFUSED, io.BytesIO(b"needs the package vtk to be read; install it with: pip install vtk")
+    with open(output, "wb") as file:
+        file.write(content.getbuffer())
+    return code
+
+
+SUFFIXES = (".npy", *READERS)
+MOST_BYTES = 2**30
+"""Of a file of points."""
+SECONDS, BYTES_PER_SECOND = 15.0, 5e6
+"""How long a file may take to be read at most: this long, and its size over this pace."""
+
+
+def read_points(path: str, dimension: int) -> Points:
+    """(n, d) [m], not to be written to. Raises `InputError`, a sentence that names the file."""
+    if Path(path).suffix not in SUFFIXES:
+        raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
+    try:
+        stat = regular_file(path, MOST_BYTES)
+    except OSError as problem:
+        raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
+    return _read(path, dimension, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4)
+def _read(path: str, dimension: int, changed: int, size: int) -> Points:
+    """Read once for each version of the file: the time of its last change and its size stand for the version."""
+    array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
+    if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
+        array = array[:, :2]  # VTK knows no plane
+    _check_form(path, array.shape, array.dtype, dimension)
+    points = np.array(array, dtype=np.float64)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path!r} holds positions that are not finite, but must hold metres.")
+    points.flags.writeable = False
+    return points
+
+
+def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimension: int) -> None:
+    if dtype.kind not in "fiu" or len(shape) != 2 or shape[1] != dimension or shape[0] < 1:
+        raise InputError(f"{path!r} holds {dtype} of shape {shape}, but must hold numbers of shape (n, {dimension}).")
+    if shape[0] > MOST_POINTS:
+        raise InputError(f"{path!r} holds {shape[0]} points, but must hold at most {MOST_POINTS}.")
+
+
+def _read_npy(path: str, size: int, dimension: int) -> Any:
+    """The array, whose header is held against the size of the file before anything else is read."""
+    headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    try:
+        with open(path, "rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the header is Python, which may warn of what it finds
+            shape, by_columns, dtype = headers[npy.read_magic(file)](file)
+            _check_form(path, shape, dtype, dimension)
+            wanted = file.tell() + math.prod(shape) * dtype.itemsize
+            if wanted != size:
+                found = f"says that it holds {dtype} of shape {shape}, which takes {wanted} bytes"
+                raise InputError(f"{path!r} {found}, but it has {size}.")
+            return np.fromfile(file, dtype, math.prod(shape)).reshape(shape, order="F" if by_columns else "C")
+    except InputError:
+        raise
+    except Exception as problem:  # of many types, where a header is damaged
+        raise InputError(f"{path!r} is no array that NumPy can read ({shown(Words(reason(problem)))}).") from None
+
+
+def _read_apart(path: str, size: int) -> Any:
+    """What another process reads: see `cortado.scene.point_files`."""
+    limit = SECONDS + size / BYTES_PER_SECOND
+    command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory
+    environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    nothing = subprocess.DEVNULL
+    try:
+        done = subprocess.run(
+            command, env=environment, timeout=limit, check=False, stdin=nothing, stdout=subprocess.PIPE, stderr=nothing
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path!r} was not read within {limit:.0f} s; it may be damaged.") from None
+    except OSError as problem:
+        raise InputError(f"{path!r} cannot be read, as no process can be started ({reason(problem)}).") from None
+    if done.returncode == 0:
+        return np.load(io.BytesIO(done.stdout), allow_pickle=False)
+    said = done.stdout.decode() if done.returncode == REFUSED else "holds no points that can be read; it may be damaged"
+    raise InputError(f"{path!r} {said}.")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

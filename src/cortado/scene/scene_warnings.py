@@ -1,0 +1,241 @@
+"""Warnings about scenes that may not do what is meant: keys that change nothing, and physics that is off."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.room import Room
+from cortado.discretise.surface_points import surface_feet
+from cortado.scene.appearance import Keyframes, Picture
+from cortado.scene.containers import BoxContainer
+from cortado.scene.fields import FieldPath, field_error
+from cortado.scene.fluids import PointsFluid
+from cortado.scene.model import Carreau, DiscretisationTable, SceneTables, Thinning, Yielding, resting_room
+from cortado.scene.motions import Steady, courses, told
+from cortado.scene.solids import SolidTable
+from cortado.scene.solvers import what_suits
+from cortado.scene.stability import fluid_lengths
+from cortado.scene.tables import Table, field_name, point_in_words
+
+OF_DIFFUSION = ("free_energy", "strength", "mobility_form", "interface_width")
+OF_ITERATIONS = (
+    *("minimum_iterations", "maximum_iterations", "density_tolerance", "maximum_density_tolerance"),
+    *("iterations", "tolerance", "repairs", "velocities_follow"),
+)
+OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
+
+
+def given(table: Table, *names: str) -> Iterator[str]:
+    """Those of some fields of a table that are there, with other values than their defaults."""
+    for name in names:
+        field = type(table).model_fields.get(name)
+        if field is not None and getattr(table, name) != field.default:
+            yield name
+
+
+def check_idle(scene: SceneTables) -> None:
+    """Raises a `field_error` for the first key that belongs to a choice that was not made."""
+    for path, table, names, reason in _idle(scene):
+        for name in given(table, *names):
+            raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
+
+
+def idle_sentences(scene: SceneTables) -> Iterator[str]:
+    """What to say of keys that a number of 0 turns off."""
+    for path, table, names, reason in _turned_off(scene):
+        for name in given(table, *names):
+            yield f"{field_name((*path, name))} changes nothing, as {reason}."
+
+
+Idle = tuple[FieldPath, Table, tuple[str, ...], str]
+"""A table by its path, those of its keys that change nothing, and why."""
+
+
+def _idle(scene: SceneTables) -> Iterator[Idle]:
+    forces, mixture = scene.forces, scene.mixture
+    if mixture.mobility == 0.0 and "mobility" not in mixture.model_fields_set:
+        yield ("mixture",), mixture, OF_DIFFUSION, "there is no mobility, without which nothing diffuses"
+    if forces.viscosity != "stress":
+        yield ("forces",), forces, ("viscous_solve",), f'viscosity is "{forces.viscosity}", and not "stress"'
+    if np.all(getattr(scene.container, "periodic", False)):
+        names = ("slip", "material", "colour")
+        yield ("container",), scene.container, names, "it has no walls where all axes are periodic"
+    if scene.dimension == 2:
+        tables: list[tuple[FieldPath, Table]] = [(("phase", index), phase) for index, phase in enumerate(scene.phase)]
+        for path, table in [*tables, (("container",), scene.container)]:
+            if "colour" in table.model_fields_set and getattr(table, "colour", None) is not None:
+                yield path, table, ("material",), "colour is given, which is all that a plane shows of it"
+    if scene.picture is not None:
+        yield from _idle_in_picture(scene.picture, scene.dimension)
+
+
+def _idle_in_picture(picture: Picture, dimension: int) -> Iterator[Idle]:
+    path = ("picture",)
+    if dimension == 2:
+        yield path, picture, OF_SPACE, "the scene has 2 dimensions"
+        if picture.background is not None:
+            yield path, picture, ("light",), "background is given, which is all that a plane shows of it"
+    if picture.surface == "spheres":
+        yield path, picture, ("transparency",), 'surface is "spheres", which are not clear'
+    if picture.film_frames == 0:
+        yield path, picture, ("film_speed",), "film_frames is 0, and there is no film"
+    if isinstance(picture.camera_path, Keyframes):
+        names = ("camera",) if picture.camera_path.look_at is None else ("camera", "look_at")
+        yield path, picture, names, "camera_path has keyframes"
+
+
+def _turned_off(scene: SceneTables) -> Iterator[Idle]:
+    forces, mixture = scene.forces, scene.mixture
+    thick = any(phase.viscosity > 0.0 or phase.rheology for phase in scene.phase)
+    if mixture.mobility == 0.0:
+        yield ("mixture",), mixture, OF_DIFFUSION, "mobility is 0 and nothing diffuses"
+    if forces.viscosity == "none" or not thick:
+        tables: list[tuple[FieldPath, Any]] = [(("container",), scene.container)]
+        tables += [(("solid", index), solid) for index, solid in enumerate(scene.solid)]
+        for path, table in tables:
+            yield path, table, ("slip",), "no viscous force acts"
+    if not forces.pressure:
+        yield ("solver",), scene.solver, OF_ITERATIONS, "forces.pressure is false"
+    cut = scene.discretisation
+    suited = ("discretisation", {"jitter": cut.jitter}) in what_suits(scene.solver, scene.container)
+    if all(isinstance(fluid, PointsFluid) for fluid in scene.fluid) and not suited:
+        yield ("discretisation",), cut, ("jitter",), "points of files and an emitter's particles stay where they are"
+    emitter, spacing = scene.emitter, scene.discretisation.spacing
+    if (
+        emitter is not None
+        and emitter.length is not None
+        and emitter.layers(spacing) * spacing < emitter.length - spacing
+    ):
+        yield ("emitter",), emitter, ("length",), "duration is over before so much is out"
+    for index, solid in enumerate(scene.solid):
+        names = tuple(name for name in ("centre", "base") if any(getattr(solid, name, ())))
+        if not np.allclose(solid.middle(), solid.shape_about()[1]):
+            yield ("solid", index), solid, names, "position says where its middle is"
+    for index, phase in enumerate(scene.phase):
+        path, law = ("phase", index, "rheology"), phase.rheology
+        if isinstance(law, Yielding) and law.yield_stress == 0.0:
+            yield path, law, ("regularisation",), "yield_stress is 0"
+        if isinstance(law, Thinning) and law.flow_index == 1.0:
+            yield path, law, ("least_shear_rate",), "flow_index is 1"
+        if isinstance(law, Carreau) and (law.flow_index == 1.0 or law.relaxation_time == 0.0):
+            why = "flow_index is 1" if law.flow_index == 1.0 else "relaxation_time is 0"
+            yield path, law, ("infinite_viscosity", "relaxation_time"), f"{why} and the viscosity is that at rest"
+
+
+def creep_sentence(scene: SceneTables) -> str | None:
+    """None for a scene without a yield stress, or without fluid at the start.
+
+    A film of depth H whose stress at the wall is a part r <= 1 of the yield stress has at its surface the speed
+    (H / m) (1 + (1 - r) ln(1 - r) / r), where the shear rate at each height is -ln(1 - stress / yield stress) / m: at
+    most H / m, with the ``regularisation`` m.
+    """
+    phase, law = scene.phase[0], scene.phase[0].rheology
+    if not isinstance(law, Yielding) or law.yield_stress == 0.0 or not scene.fluid:
+        return None
+    lengths, pull = fluid_lengths(scene), np.abs(scene.forces.gravity)
+    depth = lengths[pull.argmax()] if pull.any() else lengths.max()
+    growth = law.numbers(phase.viscosity)["regularisation"]
+    return (
+        f"where {phase.name} does not yield, below {law.yield_stress:g} Pa, it creeps, at up to "
+        f"{depth / growth:.2g} m/s: its depth, {depth:g} m, over rheology.regularisation, "
+        f"{growth:g} s; a longer one makes it slower."
+    )
+
+
+FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
+"""As measured in waves of shear (`docs/discretisation.md`)."""
+
+
+def wall_sentence(scene: SceneTables) -> str | None:
+    """What to say of a scene whose walls hold the fluid back; None if there is nothing."""
+    return _sentence(scene, 'slip is "no" at walls') if scene.sticks else None
+
+
+def parameter_sentence(scene: SceneTables) -> str | None:
+    """What to say where the viscosity is a parameter of a problem; None if there is nothing."""
+    return _sentence(scene, "the viscosity is a parameter")
+
+
+def _sentence(scene: SceneTables, where: str) -> str | None:
+    if scene.forces.viscosity != "pairwise":
+        return None
+    return f'{where} and forces.viscosity is "pairwise", {FAULT}: viscosity = "stress" has it within 1 %.'
+
+
+THROUGH = 1.5
+"""In spacings: how far a solid reaches through a wall at least for fluid to rest in the corner between them. Water 15
+deep moves with 0.13 m/s beside one that ends on the floor, with 0.10 if it goes on for 0.5 spacings, and with 0.05 for
+1 to 5."""
+FACING = 0.9
+"""The part along an axis of the normal of a face that counts as one across it."""
+
+
+def standing_sentences(scene: SceneTables) -> Iterator[str]:
+    """One of each flat wall of the container that a solid moves along and ends on."""
+    box = scene.container
+    if not isinstance(box, BoxContainer):
+        return
+    spacing, ends = scene.discretisation.spacing, box.extent()
+    for table in told(scene.solid):
+        axes = [axis for axis in range(scene.dimension) if not box.periodic[axis] and _stays(table, axis, spacing)]
+        if table.side == "inside" or not axes:
+            continue
+        feet, away = surface_feet(table.solid(), spacing)
+        for axis, upper in product(axes, (False, True)):
+            sign = 1.0 if upper else -1.0
+            through = sign * (feet[:, axis] - ends[upper][axis])
+            on_it = (sign * away[:, axis] > FACING) & (through > -0.5 * spacing) & (through < 0.75 * spacing)
+            if np.count_nonzero(on_it) > 2:
+                yield (
+                    f"the solid {table.name!r} moves along the wall of the container at {'xyz'[axis]} = "
+                    f"{ends[upper][axis]:g} m and ends on it, which stirs fluid in the corner between them: let it "
+                    f"reach through the wall by {THROUGH * spacing:.3g} m or more."
+                )
+
+
+def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
+    """Whether a path does not turn a solid, and keeps its middle as far from a wall across an axis."""
+    shifts, turns = courses(table)
+    if turns.greatest() > 0.0:
+        return False
+    if isinstance(shifts, Steady):
+        return bool(shifts.rate[axis] == 0.0)
+    return bool(np.ptp(shifts.values[:, axis]) < 0.5 * spacing)
+
+
+ONE_LAYER, TWO_LAYERS = 1.1, 1.5
+"""In spacings: how thick walls are at least that hold fluid, where they have one layer of particles, and two as fluid
+sees further than two spacings. With either solver, and steps however short, water 25 to 120 spacings deep, at rest, on
+a shelf or in a cup, went through those of 0.75, in space 1.0, and of 1.0 to 1.25, within 10 to 90 steps."""
+DEPTHS = np.arange(1, 9) / 8.0
+"""Of that thickness: beneath the surface there is to be no room for fluid so deep."""
+MARGIN = 1e-3
+"""Of it, too: what is so little thinner is thick enough."""
+SHARE = 0.01
+"""Of the surface: where no more is too thin, nothing is said."""
+
+
+def holding_thickness(cut: DiscretisationTable) -> float:
+    """How thick walls are at least that hold fluid [m]."""
+    return (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
+
+
+def thin_sentences(scene: SceneTables) -> Iterator[str]:
+    """One of each solid that has fluid on both sides where it is too thin to hold any."""
+    least, spacing = holding_thickness(scene.discretisation), scene.discretisation.spacing
+    for table in scene.solid if scene.forces.pressure else ():
+        solid, resting = table.solid(), resting_room(scene)
+        room = Room(resting.region, (solid,), resting.periods) if table.moves else resting
+        feet, away = surface_feet(solid, spacing)
+        feet, away = (part[room.contains(feet + MARGIN * least * away, 0.0)] for part in (feet, away))
+        depths = (1.0 - MARGIN) * least * DEPTHS
+        thin = np.any([room.contains(feet - depth * away, -MARGIN * depth) for depth in depths], axis=0)
+        if np.count_nonzero(thin) > SHARE * len(thin):
+            place = point_in_words(feet[thin][0].round(4))
+            yield (
+                f"the solid {table.name!r} is thinner than {least:.3g} m, {least / spacing:g} times the spacing, at "
+                f"{np.mean(thin):.0%} of its surface, for example at {place}: fluid that presses on it may go "
+                "through. Make it thicker, or the spacing smaller."
+            )
