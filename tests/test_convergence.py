@@ -7,7 +7,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
-from cortado.optimisation.sweep.richardson import Extrapolation
+from cortado.optimisation.sweep import Extrapolation
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])

@@ -14,10 +14,8 @@ import cortado
 from cortado import DivergedError, InputError, SceneError, Simulation
 from cortado.cli.commands import dataset as command
 from cortado.discretise.pairs import wrapped
-from cortado.optimisation.datasets import one_run as runs_of
-from cortado.optimisation.datasets.one_run import one_run
-from cortado.optimisation.datasets.sample import Sample
-from cortado.optimisation.datasets.table import DatasetTable
+from cortado.optimisation import datasets
+from cortado.optimisation.datasets import DatasetTable, Sample, one_run
 from full_disk import largest_file
 
 SCENE = """
@@ -151,7 +149,7 @@ def test_what_crosses_a_period_moves_the_shorter_way():
     np.testing.assert_allclose(places[:, 0, 0], [1.4, 1.6, 0.0], atol=1e-15)
     np.testing.assert_array_equal(places[:, 0, 1], positions[:, 0, 1])
     for one in (positions, places):
-        found = runs_of._statistics(one, periods)
+        found = datasets._statistics(one, periods)
         np.testing.assert_allclose(found["vel"][1], [0.6, 0.3], atol=1e-12)
         np.testing.assert_allclose(found["acc"][1], [0.2, 0.1], atol=1e-12)
 
@@ -209,7 +207,7 @@ def quick(monkeypatch):
         rows = np.full((4, 300, 2), float(sample.number))
         moments = [9, [1.0, 2.0], [3.0, 4.0]]
         ends = {"lower": [0.0, 0.0], "upper": [1.0, 1.0], "particles": 300}
-        return runs_of.OneRun(
+        return datasets.OneRun(
             {"position": rows, "particle_type": np.zeros(300)}, {"vel": moments, "acc": moments, **ends}
         )
 

@@ -8,7 +8,7 @@ import pytest
 
 from bad_tasks import TINY_SCENE
 from cortado import Simulation, load_scene
-from cortado.optimisation.datasets.table import DatasetTables
+from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.pictures.image_files import write_picture

@@ -6,7 +6,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from cortado import CortadoWarning, SceneError
-from cortado.optimisation.datasets.table import DatasetTable
+from cortado.optimisation.datasets import DatasetTable
 from cortado.scene.model import Bingham
 from cortado.scene.scene import Scene
 from scenes import jet, plane, scene, two_layers

@@ -23,8 +23,7 @@ from cortado.cli import main
 from cortado.cli.arguments import ALL_FRAMES
 from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
-from cortado.optimisation.sweep.combinations import combinations
-from cortado.optimisation.sweep.table import write_table
+from cortado.optimisation.sweep import combinations, write_table
 from cortado.runs.sensors.readings import Readings, from_csv, summary
 from cortado.runs.trajectory import Trajectory
 from dask_processes import PATIENCE, scheduler

@@ -13,7 +13,7 @@ from cortado.cli.commands.compare import SAME_TIME
 from cortado.cli.commands.named_runs import named_runs
 from cortado.cli.commands.own_quantity import OwnQuantity
 from cortado.errors import InputError, warn
-from cortado.optimisation.sweep.richardson import Extrapolation
+from cortado.optimisation.sweep import Extrapolation
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder

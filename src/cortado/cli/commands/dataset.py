@@ -13,10 +13,18 @@ from cortado.errors import ComputationError, CortadoWarning, DivergedError, Inpu
 from cortado.files.interruption import keeping
 from cortado.files.output_files import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import track, untracked
-from cortado.optimisation.datasets.layout import METADATA, Parts, assemble, metadata, remove_parts, write_metadata
-from cortado.optimisation.datasets.one_run import one_run
-from cortado.optimisation.datasets.sample import Sample
-from cortado.optimisation.datasets.table import DatasetTable, DatasetTables
+from cortado.optimisation.datasets import (
+    METADATA,
+    DatasetTable,
+    DatasetTables,
+    Parts,
+    Sample,
+    assemble,
+    metadata,
+    one_run,
+    remove_parts,
+    write_metadata,
+)
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_files import read_json
 from cortado.scene.fields import MISSING

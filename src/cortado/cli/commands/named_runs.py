@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cortado.errors import InputError
-from cortado.optimisation.sweep.table import folders_in
+from cortado.optimisation.sweep import folders_in
 from cortado.runs.run_folder import RunFolder
 
 

@@ -16,8 +16,7 @@ from cortado.files.interruption import Interrupted, keeping
 from cortado.files.output_files import LOCK, locked
 from cortado.files.terminal import track, untracked
 from cortado.optimisation.inverse.task import load_task
-from cortado.optimisation.sweep.combinations import Combination, combinations
-from cortado.optimisation.sweep.table import NAME, failed, write_table
+from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene

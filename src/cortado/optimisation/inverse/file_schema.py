@@ -4,7 +4,7 @@ stand beside."""
 import json
 from typing import Any
 
-from cortado.optimisation.datasets.table import DatasetTables
+from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.scene.scene import Scene

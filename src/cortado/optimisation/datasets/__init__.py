@@ -1,1 +1,0 @@
-"""Data sets of runs with varied scenes, for learned simulators."""
