@@ -151,7 +151,7 @@ def test_where_there_can_be_no_law_it_is_a_sentence():
 
 @pytest.mark.parametrize("kind", ["bingham", "herschel_bulkley"])
 def test_a_film_that_does_not_yield_creeps_as_slowly_as_is_said(kind):
-    """98 Pa at the wall of 150 Pa, however thin it is once it flows: the closed form of `cortado.scene.scene_warnings`."""
+    """98 Pa at the wall of 150 Pa, thin as it is once it flows: the closed form of `cortado.scene.scene_warnings`."""
     depth, deep, slope = 0.1, 8, 0.1
     spacing, size, sides = depth / deep, math.hypot(1.0, slope), {"periodic": [True, False], "slip": "no"}
     index = {"flow_index": 0.6} if kind == "herschel_bulkley" else {}
