@@ -7,7 +7,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 import cortado
-from cortado.device import bands
+from cortado.device import launching
 from cortado.device.launching import BandLauncher
 from cortado.errors import ComputationError
 from cortado.pictures.exports.held_volume import contained_liquid, enclosed, with_volume
@@ -228,7 +228,7 @@ def test_values_are_smoothed_to_and_fro_however_launches_are_made(rounds, monkey
     for _ in range(rounds):
         wanted = 0.5 * wanted + 0.25 * (np.roll(wanted, 1, axis=0) + np.roll(wanted, -1, axis=0))
     for least in (0, 1000):
-        monkeypatch.setattr(bands, "LEAST_SHARED_OFTEN", least)
+        monkeypatch.setattr(launching, "LEAST_SHARED_OFTEN", least)
         values = wp.array(given, dtype=wp.vec3)
         np.testing.assert_allclose(smoothed(values, neighbours, halves, rounds, launch).numpy(), wanted, atol=1e-6)
         np.testing.assert_array_equal(values.numpy(), given)
