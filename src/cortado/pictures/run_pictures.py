@@ -156,11 +156,7 @@ def trajectory_picture(
 
 
 def trajectory_film(
-    trajectory: Trajectory,
-    path: str | Path,
-    scene: Scene | str | Path | None,
-    device: str,
-    settings: Mapping[str, Any],
+    trajectory: Trajectory, path: str | Path, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> Film:
     """See `Trajectory.film`."""
     return film_of(trajectory, _scene_of(trajectory, scene), path, device_of(device), settings)

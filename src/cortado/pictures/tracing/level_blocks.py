@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import BandLauncher
+from cortado.pictures.tracing.array_types import Floats2d, Ints
 from cortado.pictures.tracing.near_particles import MODULE, NearParticles, bump_at, marked, sum_near
 
 WIDTH = wp.constant(4)
@@ -32,9 +33,9 @@ class Blocks:
     """Blocks along each axis."""
     corners: wp.array3d(dtype=wp.float32)
     """(blocks + 1 along each axis) the level at the lower corner of each block"""
-    places: wp.array(dtype=wp.int32)
+    places: Ints
     """(blocks,) how many up to each are in ``levels``, itself among them if it is"""
-    levels: wp.array2d(dtype=wp.float32)
+    levels: Floats2d
     """(blocks that the surface may pass, CUBES) the level at the nodes of each"""
 
 
@@ -127,7 +128,7 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: wp.array(dtype=wp.int32)):
+def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
     """Which blocks the surface may pass; ``left``: of a bump in the middle of a block, at its corners."""
     n = first + wp.tid()
     at = block_at(b, n)
@@ -141,7 +142,7 @@ def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: wp.array(d
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks, blocks: wp.array(dtype=wp.int32)):
+def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks, blocks: Ints):
     n = first + wp.tid()
     node = node_of(block_at(b, blocks[n / CUBES]), n % CUBES)
     p = place_of(b, float(node[0]), float(node[1]), float(node[2]))

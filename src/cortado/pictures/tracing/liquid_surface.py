@@ -12,6 +12,7 @@ from cortado.device.launching import BandLauncher
 from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
+from cortado.pictures.tracing.array_types import Floats, Vec2s, Vec3s
 from cortado.pictures.tracing.level_blocks import level_blocks
 from cortado.pictures.tracing.near_particles import MODULE, NearParticles, Particles, near_particles, sum_near
 from cortado.pictures.tracing.surface_net import net_of, normals_of, smoothed, triangles_of
@@ -158,13 +159,7 @@ crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_weights(
-    first: wp.int32,
-    s: NearParticles,
-    reach: wp.float32,
-    points: wp.array(dtype=wp.vec3),
-    weights: wp.array(dtype=wp.float32),
-):
+def find_weights(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, weights: Floats):
     """How much each corner is smoothed: little where few particles are (Löschner et al. 2023)."""
     v = first + wp.tid()
     near = crowd_near(s, points[v], reach)
@@ -173,14 +168,7 @@ def find_weights(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_looks(
-    first: wp.int32,
-    s: NearParticles,
-    reach: wp.float32,
-    points: wp.array(dtype=wp.vec3),
-    colours: wp.array(dtype=wp.vec3),
-    media: wp.array(dtype=wp.vec2),
-):
+def find_looks(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, colours: Vec3s, media: Vec2s):
     v = first + wp.tid()
     near = tint_near(s, points[v], reach)
     if near[5] <= 1.0e-6:
@@ -201,7 +189,7 @@ place_near = sum_near(place, wp.vec4)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: wp.array(dtype=wp.float32)):
+def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
     """Less volume where space is not filled, such as in drops and sheets: their level is around what they fill."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)

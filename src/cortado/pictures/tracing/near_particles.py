@@ -15,6 +15,7 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
+from cortado.pictures.tracing.array_types import Floats, Ints, Vec3s
 from cortado.words import counted
 
 MODULE = kernel_module("liquid")
@@ -81,12 +82,7 @@ class Particles:
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_ends(
-    first: wp.int32,
-    places: wp.array(dtype=wp.vec3),
-    lower: wp.array(dtype=wp.vec3),
-    upper: wp.array(dtype=wp.vec3),
-):
+def find_ends(first: wp.int32, places: Vec3s, lower: Vec3s, upper: Vec3s):
     """Those of every so many."""
     part = first + wp.tid()
     low = places[part]
@@ -101,12 +97,7 @@ def find_ends(
 
 
 @wp.kernel(module=kernel_module("marked"), enable_backward=False)
-def list_marked(
-    first: wp.int32,
-    marks: wp.array(dtype=wp.int32),
-    counts: wp.array(dtype=wp.int32),
-    numbers: wp.array(dtype=wp.int32),
-):
+def list_marked(first: wp.int32, marks: Ints, counts: Ints, numbers: Ints):
     i = first + wp.tid()
     if marks[i] > 0:
         numbers[counts[i] - 1] = i
@@ -136,13 +127,13 @@ class NearParticles:
     """[m] which is the width of a cell, too."""
     shape: wp.vec3i
     """Cells along each axis."""
-    starts: wp.array(dtype=wp.int32)
+    starts: Ints
     """(cells + 1,) the first particle of each"""
-    places: wp.array(dtype=wp.vec3)
+    places: Vec3s
     """(n,) [m]"""
     looks: wp.array(dtype=Look)
     """(n,)"""
-    volumes: wp.array(dtype=wp.float32)
+    volumes: Floats
     """(n,) of each, such that their bumps add up to about 1 within fluid; a particle alone has 1"""
 
 
@@ -202,10 +193,10 @@ count_near = sum_near(one, wp.float32)
 @wp.kernel(module=MODULE, enable_backward=False)
 def sort_particles(
     first: wp.int32,
-    order: wp.array(dtype=wp.int32),
-    given: wp.array(dtype=wp.vec3),
+    order: Ints,
+    given: Vec3s,
     given_looks: wp.array(dtype=Look),
-    places: wp.array(dtype=wp.vec3),
+    places: Vec3s,
     looks: wp.array(dtype=Look),
 ):
     i = first + wp.tid()
@@ -214,7 +205,7 @@ def sort_particles(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: wp.array(dtype=wp.float32)):
+def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
     i = first + wp.tid()
     volumes[i] = 1.0 / count_near(s, s.places[i], reach)
 

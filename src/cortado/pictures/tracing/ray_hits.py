@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.pictures.tracing.array_types import Vec3s2d
 from cortado.pictures.tracing.surroundings import (
     CLEAR,
     FAR,
@@ -285,7 +286,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
         return passed
 
     @wp.func
-    def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+    def background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
         """What a ray sees that meets no fluid."""
         most = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:

@@ -12,6 +12,7 @@ from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
+from cortado.pictures.tracing.array_types import Floats, Vec3s, Vec3s2d, Vec4s2d
 from cortado.pictures.tracing.near_particles import Look, Particles
 
 MODULE = kernel_module("shadow")
@@ -31,15 +32,15 @@ SKY = 0.32
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def cast(
-    places: wp.array(dtype=wp.vec3),
+    places: Vec3s,
     looks: wp.array(dtype=Look),
-    volumes: wp.array(dtype=wp.float32),
+    volumes: Floats,
     corner: wp.vec3,
     cell: wp.float32,
     slope: wp.vec2,
     fading: wp.float32,
     begin: wp.vec2i,
-    thickness: wp.array2d(dtype=wp.vec4),
+    thickness: Vec4s2d,
 ):
     """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
     and its thickness; the less the higher it is, by ``fading`` [1/m]. ``begin``: the first node that is there."""
@@ -61,13 +62,7 @@ def cast(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def blur(
-    first: wp.int32,
-    across: wp.int32,
-    weights: wp.array(dtype=wp.float32),
-    sharp: wp.array2d(dtype=wp.vec4),
-    found: wp.array2d(dtype=wp.vec4),
-):
+def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, found: Vec4s2d):
     """Along one axis, or ``across``, along the other."""
     n = first + wp.tid()
     i = n / sharp.shape[1]
@@ -93,14 +88,14 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 def darken(
     first: wp.int32,
-    key: wp.array2d(dtype=wp.vec4),
-    around: wp.array2d(dtype=wp.vec4),
+    key: Vec4s2d,
+    around: Vec4s2d,
     strength: wp.vec2,
     layer: wp.float32,
     opacity: wp.float32,
     tinted: wp.float32,
     begin: wp.vec2i,
-    light: wp.array2d(dtype=wp.vec3),
+    light: Vec3s2d,
 ):
     """What the lamp's light and the sky's leave, of so much ``strength`` each, of the nodes from ``begin`` on."""
     n = first + wp.tid()

@@ -13,6 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import BandLauncher
+from cortado.pictures.tracing.array_types import Floats, Floats2d, Ints, Ints2d, Vec3s2d
 from cortado.pictures.tracing.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 from cortado.pictures.tracing.near_particles import MODULE, NearParticles, count_near
 
@@ -33,15 +34,15 @@ class Still:
     """The fluid in one frame of a film, as the others need it."""
 
     b: Blocks
-    blocks: wp.array(dtype=wp.int32)
+    blocks: Ints
     """Numbers of those that the surface may pass."""
     first: wp.vec3i
     """The first block, counted from the origin."""
-    means: wp.array(dtype=wp.float32)
+    means: Floats
     """(blocks that the surface may pass,) of the level"""
-    bodies: wp.array(dtype=wp.float32)
+    bodies: Floats
     """(blocks that the surface may pass,) 1 where much fluid is around, and 0 in drops"""
-    light: wp.array2d(dtype=wp.vec3)
+    light: Vec3s2d
     """(nodes, nodes) that the fluid leaves on the floor"""
 
 
@@ -60,14 +61,7 @@ def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_means(
-    first: wp.int32,
-    own: Still,
-    s: NearParticles,
-    reach: wp.float32,
-    means: wp.array(dtype=wp.float32),
-    bodies: wp.array(dtype=wp.float32),
-):
+def find_means(first: wp.int32, own: Still, s: NearParticles, reach: wp.float32, means: Floats, bodies: Floats):
     n = first + wp.tid()
     total = wp.float32(0.0)
     for k in range(CUBES):
@@ -84,9 +78,9 @@ def find_ways(
     own: Still,
     others: wp.array(dtype=Still),
     width: wp.float32,
-    touching: wp.array2d(dtype=wp.int32),
-    indices: wp.array2d(dtype=wp.int32),
-    ways: wp.array2d(dtype=wp.float32),
+    touching: Ints2d,
+    indices: Ints2d,
+    ways: Floats2d,
 ):
     """How far the fluid in each block, of a width in spacings, is from where it is in the others, in spacings; which
     block of theirs it is; and which blocks touch it."""
@@ -110,13 +104,13 @@ def find_ways(
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_shares(
     first: wp.int32,
-    touching: wp.array2d(dtype=wp.int32),
-    ways: wp.array2d(dtype=wp.float32),
-    bodies: wp.array(dtype=wp.float32),
+    touching: Ints2d,
+    ways: Floats2d,
+    bodies: Floats,
     before: wp.int32,
     window: wp.int32,
     limits: wp.vec2,
-    shares: wp.array2d(dtype=wp.float32),
+    shares: Floats2d,
 ):
     """Of the others in each block, by the root mean square of the ways in it and in those that touch it."""
     n = first + wp.tid()
@@ -145,9 +139,9 @@ def average_level(
     others: wp.array(dtype=Still),
     before: wp.int32,
     limits: wp.vec2,
-    indices: wp.array2d(dtype=wp.int32),
-    shares: wp.array2d(dtype=wp.float32),
-    levels: wp.array2d(dtype=wp.float32),
+    indices: Ints2d,
+    shares: Floats2d,
+    levels: Floats2d,
 ):
     n = (first + wp.tid()) / CUBES
     k = (first + wp.tid()) % CUBES
@@ -174,7 +168,7 @@ def average_light(
     before: wp.int32,
     window: wp.int32,
     limits: wp.vec2,
-    found: wp.array2d(dtype=wp.vec3),
+    found: Vec3s2d,
 ):
     i = (first + wp.tid()) / found.shape[1]
     k = (first + wp.tid()) % found.shape[1]

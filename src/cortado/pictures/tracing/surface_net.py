@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import BandLauncher
+from cortado.pictures.tracing.array_types import Floats, Ints, Vec3s
 from cortado.pictures.tracing.level_blocks import CUBES, LEVEL, Blocks, block_at, entry_of, level_at, node_of, place_of
 from cortado.pictures.tracing.near_particles import MODULE, last_of
 
@@ -24,11 +25,11 @@ class Cubes:
     """Those of the blocks that the surface may pass, and which corners of the net are in them."""
 
     b: Blocks
-    blocks: wp.array(dtype=wp.int32)
+    blocks: Ints
     """(blocks that the surface may pass,)"""
-    corners: wp.array(dtype=wp.int32)
+    corners: Ints
     """(cubes + 1,) how many corners come before that of each cube"""
-    sides: wp.array(dtype=wp.int32)
+    sides: Ints
     """(cubes + 1,) how many quadrilaterals come before those across the sides from the lowest node of each cube"""
 
 
@@ -43,14 +44,7 @@ def signs_of(b: Blocks, node: wp.vec3i):
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def count_corners(
-    first: wp.int32,
-    b: Blocks,
-    blocks: wp.array(dtype=wp.int32),
-    signs: wp.array(dtype=wp.int32),
-    corners: wp.array(dtype=wp.int32),
-    sides: wp.array(dtype=wp.int32),
-):
+def count_corners(first: wp.int32, b: Blocks, blocks: Ints, signs: Ints, corners: Ints, sides: Ints):
     n = first + wp.tid()
     found = signs_of(b, node_of(block_at(b, blocks[n / CUBES]), n % CUBES))
     signs[n] = found
@@ -82,12 +76,7 @@ def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def place_corners(
-    first: wp.int32,
-    cubes: Cubes,
-    signs: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    own_signs: wp.array(dtype=wp.int32),
-    neighbours: wp.array(dtype=Neighbours),
+    first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, own_signs: Ints, neighbours: wp.array(dtype=Neighbours)
 ):
     """In the middle of where the surface passes the sides of each cube."""
     n = first + wp.tid()
@@ -128,13 +117,7 @@ def place_corners(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def list_triangles(
-    first: wp.int32,
-    cubes: Cubes,
-    signs: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    triangles: wp.array(dtype=wp.int32),
-):
+def list_triangles(first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, triangles: Ints):
     """Two for each quadrilateral, cut along its shorter diagonal."""
     n = first + wp.tid()
     side = cubes.sides[n]
@@ -164,7 +147,7 @@ def list_triangles(
 
 
 @wp.func
-def sum_beside(beside: Neighbours, values: wp.array(dtype=wp.vec3)):
+def sum_beside(beside: Neighbours, values: Vec3s):
     """The sum of values of the neighbours of a corner, and how many it has."""
     total = wp.vec3(0.0)
     count = wp.float32(0.0)
@@ -176,13 +159,7 @@ def sum_beside(beside: Neighbours, values: wp.array(dtype=wp.vec3)):
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def smooth(
-    first: wp.int32,
-    neighbours: wp.array(dtype=Neighbours),
-    weights: wp.array(dtype=wp.float32),
-    values: wp.array(dtype=wp.vec3),
-    found: wp.array(dtype=wp.vec3),
-):
+def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Floats, values: Vec3s, found: Vec3s):
     """Towards the mean of neighbours."""
     v = first + wp.tid()
     total, count = sum_beside(neighbours[v], values)
@@ -190,13 +167,7 @@ def smooth(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def find_normals(
-    first: wp.int32,
-    signs: wp.array(dtype=wp.int32),
-    neighbours: wp.array(dtype=Neighbours),
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-):
+def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
     """The mean of those of the quadrilaterals around each corner, by their areas."""
     v = first + wp.tid()
     beside = neighbours[v]
@@ -220,12 +191,7 @@ def find_normals(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def smooth_normals(
-    first: wp.int32,
-    neighbours: wp.array(dtype=Neighbours),
-    values: wp.array(dtype=wp.vec3),
-    found: wp.array(dtype=wp.vec3),
-):
+def smooth_normals(first: wp.int32, neighbours: wp.array(dtype=Neighbours), values: Vec3s, found: Vec3s):
     v = first + wp.tid()
     total, _count = sum_beside(neighbours[v], values)
     if wp.length_sq(total) == 0.0:

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
+from cortado.pictures.tracing.array_types import Floats, Ints, Vec2s, Vec3s, Vec3s2d
 
 
 @wp.struct
@@ -15,30 +16,30 @@ class LitSurface:
     """Triangles with what is known at their corners."""
 
     mesh: wp.uint64
-    corners: wp.array(dtype=wp.int32)
+    corners: Ints
     """(3 triangles,) indices of points"""
-    normals: wp.array(dtype=wp.vec3)
+    normals: Vec3s
     """(points,) outwards"""
-    colours: wp.array(dtype=wp.vec3)
+    colours: Vec3s
     """(points,)"""
-    light: wp.array(dtype=wp.vec3)
+    light: Vec3s
     """(points,) light that falls on the surface, of which white reflects 1"""
-    media: wp.array(dtype=wp.vec2)
+    media: Vec2s
     """(points,) of a fluid: scattering and absorption [1/m]"""
     is_flat: wp.int32
     """Whether its colours are shown as they are, without light and shadow."""
     reach: wp.float32
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
-    left: wp.array(dtype=wp.vec2)
+    left: Vec2s
     """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
-    reflectivity: wp.array(dtype=wp.float32)
+    reflectivity: Floats
     """(triangles,) of opaque solids: the part of the light that they reflect as a mirror in their colour does"""
     from_edges: wp.array(dtype=wp.mat33)
     """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
 
 
 @wp.func
-def at_corners(surface: LitSurface, values: wp.array(dtype=wp.vec3), face: wp.int32, u: wp.float32, v: wp.float32):
+def at_corners(surface: LitSurface, values: Vec3s, face: wp.int32, u: wp.float32, v: wp.float32):
     """Interpolated on a triangle."""
     return (
         u * values[surface.corners[3 * face]]
@@ -228,7 +229,7 @@ def open_light(s: Environment, normal: wp.vec3):
 
 
 @wp.func
-def shadow_at(s: Environment, shadow: wp.array2d(dtype=wp.vec3), x: wp.float32, z: wp.float32):
+def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
     """The part of the light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
@@ -251,7 +252,7 @@ def line(x: wp.float32, grid: wp.float32, width: wp.float32):
 
 
 @wp.func
-def floor(s: Environment, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footprint: wp.float32):
+def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
     """The floor at p, which becomes the horizon further out; ``footprint``: the width of a pixel there [m]."""
     colour = s.floor_colour
     if s.grid > 0.0:
@@ -265,7 +266,7 @@ def floor(s: Environment, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footpri
 
 
 @wp.func
-def open_background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
     """What a ray sees that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
@@ -372,13 +373,7 @@ class Passed:
 
 @wp.func
 def pane(
-    s: Environment,
-    d: wp.vec3,
-    normal: wp.vec3,
-    rim: wp.float32,
-    is_pane: wp.float32,
-    colour: wp.vec3,
-    behind: Passed,
+    s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
     """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge, which
     has a colour, is seen, 0 to 1."""

@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
+from cortado.pictures.tracing.array_types import Ints, Vec2s, Vec3s, Vec3s2d
 from cortado.pictures.tracing.ray_hits import glass_functions, meet_solid, reach_solid, shaded_solid, surface_functions
 from cortado.pictures.tracing.surroundings import (
     FAR,
@@ -58,13 +59,13 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
         first: wp.int32,
         s: Environment,
         surface: LitSurface,
-        points: wp.array(dtype=wp.vec3),
-        normals: wp.array(dtype=wp.vec3),
-        directions: wp.array(dtype=wp.vec3),
-        sun_directions: wp.array(dtype=wp.vec3),
+        points: Vec3s,
+        normals: Vec3s,
+        directions: Vec3s,
+        sun_directions: Vec3s,
         reach: wp.float32,
         clearness: wp.float32,
-        light: wp.array(dtype=wp.vec3),
+        light: Vec3s,
     ):
         """The light that falls on each of the points of a surface with normals: from all around, as far as neither
         other fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that goes
@@ -156,7 +157,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.func
     def within(
         s: Environment,
-        shadow: wp.array2d(dtype=wp.vec3),
+        shadow: Vec3s2d,
         surface: LitSurface,
         start: wp.vec3,
         direction: wp.vec3,
@@ -228,14 +229,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
 
     @wp.func
-    def seen(
-        s: Environment,
-        shadow: wp.array2d(dtype=wp.vec3),
-        surface: LitSurface,
-        o: wp.vec3,
-        d: wp.vec3,
-        spread: wp.float32,
-    ):
+    def seen(s: Environment, shadow: Vec3s2d, surface: LitSurface, o: wp.vec3, d: wp.vec3, spread: wp.float32):
         """The light that comes to the eye against a ray."""
         met = meet(s, surface, o, d)
         floor_at = FAR
@@ -284,10 +278,10 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         eye: Eye,
         s: Environment,
         surface: LitSurface,
-        shadow: wp.array2d(dtype=wp.vec3),
-        pixels: wp.array(dtype=wp.int32),
-        offsets: wp.array(dtype=wp.vec2),
-        image: wp.array(dtype=wp.vec3),
+        shadow: Vec3s2d,
+        pixels: Ints,
+        offsets: Vec2s,
+        image: Vec3s,
     ):
         """The light of some pixels, the mean of that through points of each; ``offsets``: where in the pixel, from -0.5
         to 0.5."""
@@ -305,13 +299,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
-def find_contrast(
-    first: wp.int32,
-    columns: wp.int32,
-    image: wp.array(dtype=wp.vec3),
-    contrast: wp.float32,
-    found: wp.array(dtype=wp.int32),
-):
+def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
     """1 where a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it, and
     0 elsewhere."""
     i = first + wp.tid()

@@ -15,6 +15,7 @@ from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.stage import Stage
+from cortado.pictures.tracing.array_types import Ints, Vec3s
 from cortado.pictures.tracing.near_particles import MODULE, Look, Particles, last_of, mixed
 from cortado.pictures.tracing.surroundings import GLASS_BOX, Environment
 
@@ -77,7 +78,7 @@ round cup ends up to one and a half spacings from its wall."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def turn(first: wp.int32, frame: wp.mat33, places: wp.array(dtype=wp.vec3)):
+def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
     i = first + wp.tid()
     places[i] = frame * places[i]
 
@@ -131,13 +132,7 @@ def has_image(which: wp.int32, images: wp.int32):
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def count_images(
-    first: wp.int32,
-    s: Environment,
-    spacing: wp.float32,
-    places: wp.array(dtype=wp.vec3),
-    counts: wp.array(dtype=wp.int32),
-):
+def count_images(first: wp.int32, s: Environment, spacing: wp.float32, places: Vec3s, counts: Ints):
     """Of each particle, itself among them."""
     i = first + wp.tid()
     q = s.glass_frame * places[i]
@@ -153,10 +148,10 @@ def list_images(
     first: wp.int32,
     s: Environment,
     spacing: wp.float32,
-    places: wp.array(dtype=wp.vec3),
+    places: Vec3s,
     looks: wp.array(dtype=Look),
-    counts: wp.array(dtype=wp.int32),
-    image_places: wp.array(dtype=wp.vec3),
+    counts: Ints,
+    image_places: Vec3s,
     image_looks: wp.array(dtype=Look),
 ):
     """``counts``: of those up to each particle."""
