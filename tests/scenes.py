@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from cortado import Scene
+from cortado.scene.stability import stability_limits
 
 
 def splash(**solver: Any) -> Scene:
@@ -108,3 +109,8 @@ def thrown(simulation, seed=3):
     spacing = simulation.scene.discretisation.spacing
     inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
     return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
+
+
+def stability_limit(scene: Scene) -> float:
+    """The smallest of the limits of a scene's time step [s], infinite if nothing moves."""
+    return min(stability_limits(scene).values())

@@ -21,8 +21,8 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
 from cortado.runs.recording import EverySteps, FramesPerSecond
-from cortado.scene.stability import stability_limit, stability_limits
-from scenes import jet, plane, two_layers
+from cortado.scene.stability import stability_limits
+from scenes import jet, plane, stability_limit, two_layers
 
 
 @pytest.fixture(autouse=True)

@@ -21,9 +21,10 @@ from cortado.problem import Problem
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.model import DiscretisationTable, MixtureTable
 from cortado.scene.scene import Scene, load_scene, scene_from_dict
-from cortado.scene.stability import stability_limit, stability_limits
+from cortado.scene.stability import stability_limits
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
+from scenes import stability_limit
 
 
 @pytest.fixture

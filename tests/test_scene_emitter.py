@@ -13,7 +13,7 @@ from cortado.errors import CortadoWarning, SceneError
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.scene import Scene
-from cortado.scene.stability import stability_limit
+from scenes import stability_limit
 
 SPACING = 0.05
 NOZZLE = {"phase": "water", "outlet": [0.1, 0.6, 0.2], "radius": 0.12, "length": 0.3, "flow_rate": 2e-3}

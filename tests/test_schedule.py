@@ -11,13 +11,12 @@ from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
 from cortado.certificate import certify
 from cortado.cli.commands.run_summary import Energy, RunSummary
+from cortado.scene.motions import Course
 from cortado.scene.parameter_values import Tilt
 from cortado.scene.scene import scene_in_words
-from cortado.scene.schedule import Course
-from cortado.scene.stability import stability_limit
 from experiments.experiment_files import load_experiment
 from finite_differences import central_difference
-from scenes import jet, plane, scene
+from scenes import jet, plane, scene, stability_limit
 
 STEPS, DT = 12, 0.004
 SWAY = {"times": [0.003, 0.02, 0.03], "values": [[0.0, -9.81], [6.0, -5.0], [-3.0, -12.0]]}

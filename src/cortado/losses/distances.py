@@ -20,8 +20,7 @@ from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Adjoint, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.particles.arrays import to_device
 from cortado.particles.state import State
-from cortado.scene.motions import AXES, position_name, solids_in
-from cortado.scene.poses import Pose, matrix
+from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 
 @cache

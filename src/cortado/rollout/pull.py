@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.scene.motions import Course
 from cortado.scene.parameter_values import Tilt
 from cortado.scene.parameters import Changing
 from cortado.scene.scene import Scene
-from cortado.scene.schedule import Course
 from cortado.scene.stability import gravity_limits
 
 PARTS = 8

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.rollout.step_bounds import greatest_step
 from cortado.rollout.step_sizes import GROWTH
-from cortado.scene.motions import Knots, displacement_name, reach, told, turn_name
+from cortado.scene.motions import Course, Knots, displacement_name, reach, told, turn_name
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Changing
 from cortado.scene.scene import Scene
-from cortado.scene.schedule import Course
 from cortado.scene.stability import SOLID_STEP
 
 LEAST = 1e-4

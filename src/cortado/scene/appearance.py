@@ -225,7 +225,7 @@ class Dolly(CameraPath):
     """How far off it is at the end, in its distance at the start."""
 
     def view(self, home: View, moment: Moment) -> View:
-        factor = self.distance ** _gently(moment.share)
+        factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
         return View(home.look_at + factor * (home.eye - home.look_at), home.look_at)
 
 
@@ -282,10 +282,6 @@ class Follow(CameraPath):
         if self.solid not in names:
             wanted = f"the name of a solid: {', '.join(names)}" if names else "left out, as the scene has no solids"
             raise field_error((*path, "solid"), self.solid, wanted)
-
-
-def _gently(share: float) -> float:
-    return share * share * (3.0 - 2.0 * share)
 
 
 AnyCameraPath = Annotated[Orbit | Dolly | Keyframes | Follow, Field(discriminator="kind")]

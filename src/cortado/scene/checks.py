@@ -33,15 +33,13 @@ axis."""
 
 
 def check_free(scene: SceneTables) -> None:
-    """Bodies are moved by the projection alone, and begin outside of walls and of each other."""
+    """Only the projection moves free bodies, and they begin outside of walls and of each other."""
     bodies = free(scene.solid)
     if not bodies:
         return
     if scene.solver.kind != "projection":
-        wanted = (
-            f'"projection", as the solid {bodies[0].name!r} is free, and pressures that are not shared with it move it'
-        )
-        raise field_error(("solver", "kind"), scene.solver.kind, wanted)
+        why = f"as the solid {bodies[0].name!r} is free, and pressures that are not shared with it move it"
+        raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
     if not scene.forces.pressure:
         raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
     spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
@@ -77,6 +75,7 @@ def _points_within(solid: Solid, step: float) -> Points:
 
 NEAREST = 0.5
 """In spacings: particles that start nearer to each other overlap."""
+OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
 """Of the number density within a fluid: a particle that starts where another body has so much is inside of it, however
 the two lattices lie. In a corner of the other body, half a spacing away, there is at most 7/8 of it."""
@@ -95,7 +94,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
     from scipy.spatial import cKDTree
 
     distances = cKDTree(points).query(points, k=[2])[0].ravel()
-    if distances.min() < _least_distance(spacing):
+    if distances.min() < OVERLAPPING * spacing:
         raise field_error(path, *_overlap("itself", points[np.argmin(distances)], spacing))
 
 
@@ -107,7 +106,7 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
     for second, shift in product(range(len(bodies)), shifts):
         last = second + 1 if shift.any() else second
         gaps = np.maximum(lower[:last] - upper[second] - shift, lower[second] + shift - upper[:last])
-        for first in np.nonzero((gaps < _least_distance(spacing)).all(axis=1))[0]:
+        for first in np.nonzero((gaps < OVERLAPPING * spacing).all(axis=1))[0]:
             place = _meeting(bodies[first], bodies[second], shift, spacing)
             if place is not None:
                 raise field_error(paths[second], *_overlap(field_name(paths[first]), place, spacing))
@@ -122,7 +121,7 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
     if not len(one) or not len(other):
         return None
     distances = cKDTree(one).query(other)[0]
-    if distances.min() < _least_distance(spacing):
+    if distances.min() < OVERLAPPING * spacing:
         return other[np.argmin(distances)]
     for points, body in ((other, one), (one, other)):
         tree = cKDTree(body)
@@ -151,10 +150,6 @@ def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
     return Words(f"overlapping {other} at {point_in_words(place)}"), wanted
 
 
-def _least_distance(spacing: float) -> float:
-    return NEAREST * spacing * (1.0 - 1e-6)
-
-
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
 """In spacings from the origin; further away, neighbours would not have distinct positions in float64."""
@@ -170,13 +165,20 @@ def check_scene(scene: SceneTables) -> None:
     _check_files(scene)
     _check_counts(scene)
     for index, fluid in enumerate(scene.fluid):
-        _check_size(index, fluid, spacing)
-    if scene.emitter is not None:
-        _check_length(scene.emitter, spacing)
+        if fluid.count(spacing) == 0.0:
+            wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
+            raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
+    emitter = scene.emitter
+    if emitter is not None and emitter.length is not None and emitter.layers(spacing) == 0.0:
+        wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
+        raise field_error(("emitter", "length"), emitter.length, wanted)
     for path, body in _bodies(scene):
-        _check_distance(path, body, spacing)
+        _check_near(path, body.extent(spacing), spacing)
     check_length(scene.container, spacing, scene.discretisation.support_radius)
-    _check_place(scene)
+    if (ends := scene.container.extent()) is not None:
+        _check_near(("container",), ends, spacing)
+    for index, solid in enumerate(scene.solid):
+        _check_near(("solid", index), solid.body().extent(), spacing)
     for index, solid in enumerate(scene.solid):
         check_solid(("solid", index), solid, spacing)
     check_free(scene)
@@ -193,7 +195,7 @@ def check_scene(scene: SceneTables) -> None:
 
 
 def check_bounded(scene: SceneTables) -> None:
-    """A time step that is chosen is bounded also where the fluid rests."""
+    """Adaptive time steps need an upper bound where the fluid rests."""
     if not np.isfinite(min(chosen_limits(scene).values())):
         wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
         raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
@@ -273,32 +275,12 @@ def _check_counts(scene: SceneTables) -> None:
         raise field_error(("discretisation", "spacing"), spacing, wanted)
 
 
-def _check_place(scene: SceneTables) -> None:
-    spacing, ends = scene.discretisation.spacing, scene.container.extent()
-    if ends is not None and np.abs(ends).max() > FURTHEST * spacing:
-        raise field_error(("container",), Words(f"{np.abs(ends).max():g} m from the origin"), _nearer(spacing))
-    for index, solid in enumerate(scene.solid):
-        furthest = np.abs(solid.body().extent()).max()
-        if furthest > FURTHEST * spacing:
-            raise field_error(("solid", index), Words(f"{furthest:g} m from the origin"), _nearer(spacing))
-
-
-def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
-    if fluid.count(spacing) == 0.0:
-        wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
-        raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
-
-
-def _check_length(emitter: EmitterTable, spacing: float) -> None:
-    if emitter.length is not None and emitter.layers(spacing) == 0.0:
-        wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
-        raise field_error(("emitter", "length"), emitter.length, wanted)
-
-
-def _check_distance(path: FieldPath, body: FluidBody, spacing: float) -> None:
-    furthest = np.abs(body.extent(spacing)).max()
+def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
+    """A box between corners, each (d,) [m], is not too far from the origin."""
+    furthest = np.abs(ends).max()
     if furthest > FURTHEST * spacing:
-        raise field_error(path, Words(f"{furthest:g} m from the origin"), _nearer(spacing))
+        wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
+        raise field_error(path, Words(f"{furthest:g} m from the origin"), wanted)
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
@@ -385,7 +367,3 @@ def _check_schedule(scene: SceneTables) -> None:
         if not region.contains(np.array(place) + opening, 1e-6 * spacing).all():
             wanted = "where all of the opening is inside the container"
             raise field_error(("schedule", "nozzle_path", "values", index), place, wanted)
-
-
-def _nearer(spacing: float) -> str:
-    return f"within {FURTHEST:g} spacings of {spacing:g} m"

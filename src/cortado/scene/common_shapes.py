@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_checks import FoundMesh
@@ -33,13 +33,17 @@ def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
         raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")
 
 
-def beside_scene(file: str, info: ValidationInfo) -> str:
+def _beside_scene(file: str, info: ValidationInfo) -> str:
     """The absolute name of a file that a scene names, which is beside the scene's own."""
     folder = Path((info.context or {}).get("folder", "."))
     try:
         return str((folder / file).absolute())
     except (OSError, ValueError):
         raise field_error((), file, "the name of a file") from None
+
+
+File = Annotated[Text, AfterValidator(_beside_scene)]
+"""The name of a file beside the scene's own."""
 
 
 class BoxShape(Table):
@@ -135,15 +139,10 @@ class MeshShape(Table):
     """What a mesh of triangles holds, in 3-D."""
 
     shape: Literal["mesh"] = "mesh"
-    file: Text
+    file: File
     """Its name: STL, OBJ, PLY, glTF or GLB; beside the scene file, and absolute once read."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
     """What its lengths are multiplied with, such as 0.001 where they are millimetres."""
-
-    @field_validator("file")
-    @classmethod
-    def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
-        return beside_scene(file, info)
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:

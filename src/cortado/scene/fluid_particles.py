@@ -50,8 +50,8 @@ class CutBody:
     """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]. What is not less than a reach
-        [m] in size may be any other number of its sign that is not."""
+        """(n,) distances [m] of points (n, d) [m] from the body, negative inside, with a reach as of
+        `Room.from_solids`."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
@@ -174,12 +174,12 @@ class FluidSample:
     """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
 
     def jittered(self, most: float) -> Points:
-        """(n, d) [m] positions, with each coordinate of what nobody has placed changed by up to ``most`` [m]."""
+        """(n, d) [m] positions, with each coordinate changed by up to ``most`` [m], except those that are placed."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """The same without particles but those of the given numbers (m,), in rising order; all of the emitter stay."""
+        """The sample of the particles with numbers (m,) in rising order, with all of the emitter among them."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -196,7 +196,8 @@ def fluid_particles(scene: Scene) -> FluidSample:
     """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
     gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
-    room, bodies = room_of(scene), _cut_bodies(scene)
+    room, reach = room_of(scene), scene.discretisation.support_radius
+    bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
     positions = [
         fluid.particles_in(room, spacing) if body is None else body.particles()
         for fluid, body in zip(scene.fluid, bodies, strict=True)
@@ -232,7 +233,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def reserve_offset(scene: Scene) -> Points:
-    """(d,) [m] how far from their place in line particles wait that are in reserve: along every axis without a period
+    """(d,) [m] the shift from their place in line at which particles in reserve wait: along every axis without a period
     beyond all else, upstream of the opening."""
     assert scene.emitter is not None
     spacing, direction = scene.discretisation.spacing, np.array(scene.emitter.direction)
@@ -241,12 +242,6 @@ def reserve_offset(scene: Scene) -> Points:
     size = float(np.ptp(ends.reshape(-1, scene.dimension), axis=0).max())
     aside = np.where(direction > 0.0, -1.0, 1.0) * (period(scene)[1] == 0.0)
     return 2.0 * (size + scene.discretisation.support_radius) * aside
-
-
-def _cut_bodies(scene: Scene) -> list[CutBody | None]:
-    """Of each body of fluid the part that walls leave room for, where its particles may be packed; None of others."""
-    spacing, reach, room = scene.discretisation.spacing, scene.discretisation.support_radius, room_of(scene)
-    return [CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None for fluid in scene.fluid]
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:
@@ -267,16 +262,16 @@ def period(scene: Scene) -> tuple[Points, Points]:
 
 @dataclass(frozen=True)
 class FluidMasses:
-    """By phase [kg]; in 2-D of a layer one metre thick."""
+    """Masses of fluid by phase [kg]; in 2-D of a layer one metre thick."""
 
     given: Mapping[str, float]
-    """That of its particles at the start, with those that wait in an emitter."""
+    """The mass of particles at the start, with those that wait in an emitter."""
     asked: Mapping[str, float]
-    """That of the volume that its bodies of fluid have, without what walls take of it, and what an emitter holds."""
+    """The mass of the volume of bodies of fluid, less what walls take of it, and of what an emitter holds."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
-        """Of the first particles of a scene."""
+        """The masses of the first particles of a scene."""
         names, cell = [phase.name for phase in scene.phase], scene.discretisation.spacing**scene.dimension
         densities = np.array([phase.rest_density for phase in scene.phase])
         held = cell * np.bincount(fluid.phase, minlength=len(names))
@@ -288,7 +283,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """In words, of phases that hold another mass than was asked for, by more than `EXCESS`."""
+        """Sentence parts, by phase, for phases whose mass differs from what was asked for by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()
@@ -297,7 +292,7 @@ class FluidMasses:
 
     @property
     def warning(self) -> str | None:
-        """What to say of a scene before it runs; None where all phases hold what was asked for."""
+        """A warning before a scene runs; None where all phases hold what was asked for."""
         if not self.off:
             return None
         return (

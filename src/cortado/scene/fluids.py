@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field
 
 from cortado.discretise.primitives import block_around, points_inside
 from cortado.discretise.room import Region, Room
@@ -15,10 +15,10 @@ from cortado.scene.common_shapes import (
     INDEX_OF_AXIS,
     BoxShape,
     CylinderShape,
+    File,
     MeshShape,
     PolygonShape,
     SphereShape,
-    beside_scene,
 )
 from cortado.scene.fields import (
     FieldPath,
@@ -103,8 +103,8 @@ class Fluid(FluidBody):
         """[m^d] of its shape, to round-off, whatever cuts it; of points what they hold."""
 
 
-class LatticeFluid(Fluid):
-    """A body of fluid whose particles are on a lattice of the spacing."""
+class RegionFluid(Fluid):
+    """A body that fills a region, with particles that are, or begin, on a lattice of the spacing."""
 
     @abstractmethod
     def block(self, spacing: float) -> Block:
@@ -123,10 +123,6 @@ class LatticeFluid(Fluid):
         """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
-
-
-class RegionFluid(LatticeFluid):
-    """A body that fills a region."""
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
@@ -243,14 +239,9 @@ class PointsFluid(Fluid):
     """Particles at the positions that a file holds."""
 
     shape: Literal["points"] = "points"
-    file: Text
+    file: File
     """Its name: an array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside
     the scene file, and absolute once read."""
-
-    @field_validator("file")
-    @classmethod
-    def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
-        return beside_scene(file, info)
 
     def points(self) -> Points:
         """(n, d) [m]; raises `InputError`."""

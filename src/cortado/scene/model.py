@@ -29,9 +29,9 @@ from cortado.scene.fields import (
     quantity,
 )
 from cortado.scene.fluids import AnyFluid, turned
+from cortado.scene.motions import Schedule
 from cortado.scene.packages import AnyForces
 from cortado.scene.parameters import PARAMETERS
-from cortado.scene.schedule import Schedule
 from cortado.scene.solid_shapes import AnySolid
 from cortado.scene.solids import solids_of
 from cortado.scene.solvers import AnySolver, what_suits

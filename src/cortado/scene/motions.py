@@ -1,33 +1,31 @@
-"""How solids that move are displaced and turned from where they begin, over time, and how large they are."""
+"""What changes while a scene runs: parameters over time, as values at some times, and solids that move, are turned and
+change their size. States have the fields of solids by the names that are made here."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import pairwise
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, create_model, model_validator
 
-from cortado.scene.parameters import Axis, Parameter, Range, Role, Source
-from cortado.scene.schedule import along_lines
+from cortado.errors import Words
+from cortado.scene.fields import FieldPath, Several, field_error, quantity
+from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, Source
 from cortado.scene.solids import SolidTable
-
-AXES = ("turn_x", "turn_y", "turn_z")
-"""How fields of states end that keep how a free body is turned: how far the ends of its unit axes have moved [-]."""
-RADIAN = 1.0
-"""What an optimiser would take for a large turn [rad]."""
-STRETCH = 0.2
-"""What it would take for a large change of a scale, in parts of it."""
+from cortado.scene.tables import Table
 
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """Something that grows by the same in every second."""
+    """A quantity that is 0 at time 0 and grows by the same in every second."""
 
     rate: NDArray[np.float64]
-    """() or (components,)"""
+    """() or (components,), a second"""
 
     def at(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) at times (n,) [s]"""
+        """(n,) or (n, components) at times (n,) [s]."""
         return np.multiply.outer(times, self.rate)
 
     def greatest(self) -> float:
@@ -41,7 +39,7 @@ class Steady:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Straight lines between values at some times, constant after the last."""
+    """Straight lines between values at some times, constant before the first and after the last."""
 
     times: NDArray[np.float64]
     """(k,) [s]"""
@@ -49,8 +47,9 @@ class Knots:
     """(k,) or (k, components)"""
 
     def at(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) at times (n,) [s]"""
-        found = along_lines(times, self.times, self.values.reshape(len(self.times), -1))
+        """(n,) or (n, components) at times (n,) [s]."""
+        columns = self.values.reshape(len(self.times), -1).T
+        found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
         return found.reshape(len(times), *self.values.shape[1:])
 
     def greatest(self) -> float:
@@ -63,79 +62,165 @@ class Knots:
 
     @property
     def _slopes(self) -> NDArray[np.float64]:
-        """(k,) or (k, components) after each of the times."""
+        """(k,) or (k, components) after each of the times; the last, 0, also before the first."""
         lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
-        return np.concatenate([np.diff(self.values, axis=0) / lengths, 0.0 * self.values[:1]])
+        return np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
+
+
+class Course(Table):
+    """One parameter over time: linear between the times, constant before the first and after the last."""
+
+    times: Several[Annotated[float, quantity("s", ge=0.0)]]
+    """(k,) counted from the first state of the run, each greater than the one before [s]"""
+    values: Any
+    """(k, components) in the parameter's unit"""
+
+    @model_validator(mode="after")
+    def _check_times(self) -> Self:
+        for index, (before, after) in enumerate(pairwise(self.times), 1):
+            if after <= before:
+                raise field_error(("times", index), after, f"greater than the time before, {before:g} s")
+        if len(self.values) != len(self.times):
+            wanted = f"a list of {len(self.times)}, one for each of the times"
+            raise field_error(("values",), Words(f"a list of {len(self.values)}"), wanted)
+        return self
+
+    @property
+    def _knots(self) -> Knots:
+        return Knots(np.array(self.times), np.array(self.values, dtype=np.float64))
+
+    def at(self, times: NDArray) -> NDArray:
+        """(n, components) at times (n,) [s]."""
+        return self._knots.at(times)
+
+    def rates(self, times: NDArray) -> NDArray:
+        """(n, components) the derivatives with respect to time at times (n,) [s], as those of `Knots`."""
+        return self._knots.rates(times)
+
+
+def _course_table(parameter: Parameter) -> type[Course]:
+    """The table of one parameter, whose values have its unit."""
+    unit = parameter.unit.replace("²", "2").replace("°", "degrees")
+    row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
+    values: Any = (Several[row], Field(description="(k, components) one row for each of the times"))
+    words = f"The parameter `{parameter.name}` over time: {parameter.meaning}."
+    return create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, __doc__=words, values=values)
+
+
+_OVER_TIME = [p for p in PARAMETERS if p.axis is Axis.STEP]
+_COURSES: dict[str, Any] = {
+    p.name: (_course_table(p) | None, Field(default=None, description=p.meaning)) for p in _OVER_TIME
+}
+
+
+class _Schedule(Table):
+    """What changes while the scene runs; of what is left out, nothing does."""
+
+    @property
+    def courses(self) -> dict[str, Course]:
+        """Those that are given, by the names of their parameters."""
+        found = {name: getattr(self, name) for name in _COURSES}
+        return {name: course for name, course in found.items() if course is not None}
+
+    @property
+    def leads_gravity(self) -> bool:
+        """Whether gravity changes, as such or by a tilt."""
+        return not self.courses.keys().isdisjoint(("gravity", "tilt"))
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        """This table, with rows of as many components as their parameters have in 2 or 3 dimensions."""
+        for name, course in self.courses.items():
+            components = next(p.components for p in _OVER_TIME if p.name == name)
+            size = 1 if components is None else components(dimension, 1)
+            for index, row in enumerate(course.values):
+                if len(row) != size:
+                    wanted = f"a list of {size}, as the scene has {dimension} dimensions"
+                    raise field_error((*path, name, "values", index), row, wanted)
+        return self
+
+
+Schedule: Any = create_model("Schedule", __base__=_Schedule, __module__=__name__, __doc__=_Schedule.__doc__, **_COURSES)
+"""A course for each parameter over time that changes, made from the registry of parameters."""
+
+AXES = ("turn_x", "turn_y", "turn_z")
+"""How fields of states end that keep how a free body is turned: how far the ends of its unit axes have moved [-]."""
+RADIAN = 1.0
+"""What an optimiser would take for a large turn [rad]."""
+STRETCH = 0.2
+"""What it would take for a large change of a scale, in parts of it."""
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Those that move, in their order."""
+    """The solids that move, in their order."""
     return [solid for solid in solids if solid.moves]
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """What their wall particles are numbered with, by their names: those that move from 0 on, and those at rest from
-    -2 on downwards, as -1 is the container."""
+    """Numbers of solids that their wall particles have, by name: those that move from 0 on, and those at rest from -2
+    on downwards, as -1 is the container."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
 
 
 def told(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Those that move as they are told."""
+    """The solids whose motion is prescribed."""
     return [solid for solid in moving(solids) if solid.motion != "free"]
 
 
 def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """Those that fluid moves."""
+    """The solids that fluid moves."""
     return [solid for solid in solids if solid.motion == "free"]
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of the solids of a scene that move: where their middles are at the start, (k, d) [m], and how they are turned,
-    (k, d, d)."""
+    """The middles (k, d) [m] and the rotation matrices (k, d, d), at the start, of the solids of a scene that move."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """How fast the fastest point of a solid moves at most [m/s], with values of parameters that replace the scene's."""
+    """The greatest speed of any point of a solid [m/s], with values of parameters that replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
-        shift = values.get(velocity_name(solid.name))
-        turn = values.get(angular_velocity_name(solid.name))
-        shifts = shifts if shift is None else Steady(shift)
-        turns = turns if turn is None else Steady(turn)
+        if (shift := values.get(velocity_name(solid.name))) is not None:
+            shifts = Steady(shift)
+        if (turn := values.get(angular_velocity_name(solid.name))) is not None:
+            turns = Steady(turn)
         found.append(shifts.greatest() + reach(solid, values) * turns.greatest())
     return max(found)
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """How far from its middle its furthest point is at most [m], with values of parameters that replace the scene's."""
+    """The distance from a solid's middle to its furthest point, at most [m], with values of parameters that replace the
+    scene's."""
     shape, _ = solid.shape_about()
     return float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
 
 
-def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Of solids that move: where they begin, and where they are at the end of each step, as from there, or, if their
-    motion is steady, how fast they go, and how large they are; of free bodies how they begin, and their density."""
-    found = [make(solid) for solid in told(solids) for make in (_position, _rotation, _scale, _displacement, _turn)]
-    steady = [
-        replace(make(solid), role=Role.VIEW, in_place_of=name(solid.name))
-        for solid in told(solids)
-        if solid.times is None
-        for make, name in ((_velocity, displacement_name), (_angular_velocity, turn_name))
-    ]
-    makers = (_position, _rotation, _velocity, _angular_velocity)
-    begun = [replace(make(solid), role=Role.STATE) for solid in free(solids) for make in makers]
-    return [*found, *steady, *begun, *map(_density, free(solids))]
+def _name(end: str) -> Callable[[str], str]:
+    """The function that gives the name of a parameter of a solid, or of a field of a state, by the solid's name."""
+    return lambda solid: f"{solid}.{end}"
 
 
-def position_name(solid: str) -> str:
-    """Of the parameter that says where its middle begins, and of the field of a state that says where it is."""
-    return f"{solid}.position"
+position_name = _name("position")
+"""The parameter where the middle begins [m]; the field where it is."""
+rotation_name = _name("rotation")
+"""The parameter, and the field: how it is turned at first [rad]."""
+scale_name = _name("scale")
+"""The parameter, and the field: how many times as large as in the scene it is."""
+displacement_name = _name("displacement")
+"""The parameter: how far the middle is from where it began [m]."""
+turn_name = _name("turn")
+"""The parameter, and the field: how far it is turned from how it began [rad]."""
+velocity_name = _name("velocity")
+"""The parameter: how fast the middle is, of a free body at the start [m/s]; the field of a free body."""
+angular_velocity_name = _name("angular_velocity")
+"""The parameter: how fast it turns, a free body at the start [rad/s]; the field of a free body."""
+density_name = _name("density")
+"""The parameter of a free body [kg/m3]."""
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
@@ -144,167 +229,76 @@ def solids_in(fields: Iterable[str]) -> list[str]:
     return [field.removesuffix(end) for field in fields if field.endswith(end)]
 
 
-def rotation_name(solid: str) -> str:
-    """Of the parameter that says how it begins, and of the field that keeps it."""
-    return f"{solid}.rotation"
+def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
+    """Parameters of solids that move: where those that are told begin, and where they are at the end of each step, as
+    from there, or, if their motion is steady, how fast they go, and how large they are; how free bodies begin, and
+    their density."""
+    known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
+    names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
+    found = [known[name(solid.name)] for solid in told(solids) for name in names]
+    for solid in told(solids):
+        for name, of in ((velocity_name, displacement_name), (angular_velocity_name, turn_name)):
+            if solid.times is None:
+                found.append(replace(known[name(solid.name)], role=Role.VIEW, in_place_of=of(solid.name)))
+    begun = (position_name, rotation_name, velocity_name, angular_velocity_name)
+    found += [replace(known[name(solid.name)], role=Role.STATE) for solid in free(solids) for name in begun]
+    return [*found, *(known[density_name(solid.name)] for solid in free(solids))]
 
 
-def scale_name(solid: str) -> str:
-    """Of the parameter that says how many times as large it is, and of the field that keeps it."""
-    return f"{solid}.scale"
+def _parameters(solid: SolidTable) -> list[Parameter]:
+    """All parameters that a solid that moves may have."""
+    name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
+    unturned = np.zeros(_shape_of(2 * len(middle) - 3))
+    when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
+    place, turn, rate = {"change": _spacings}, {"change": _constant(RADIAN)}, {"change": _constant(1.0)}
+    steps: dict[str, Any] = {"axis": Axis.STEP, "moment": 1.0, "grows": True}
+
+    def made(of: Callable[[str], str], unit: str, meaning: str, value: Any, **more: Any) -> Parameter:
+        begun, axis = np.asarray(value, dtype=np.float64), more.pop("axis", Axis.SCALAR)
+        components = (lambda dimension, phases: dimension) if begun.ndim else None
+        return Parameter(of(name), unit, meaning, axis, lambda source: begun, components=components, **more)
+
+    rotation = unturned if solid.rotation is None else np.reshape(solid.rotation, unturned.shape)
+    spin = unturned if solid.angular_velocity is None else np.reshape(solid.angular_velocity, unturned.shape)
+    displaced = f"how far the middle of the solid {name} is from where it began, after each step"
+    turned = f"how far the solid {name} is turned from how it began, after each step"
+    heavy = f"the mass of the body {name} over its volume"
+    stretched = f"how many times as large as in the scene the solid {name} is, about its middle"
+    return [
+        made(position_name, "m", f"where the middle of the solid {name} is at the start", middle, **place),
+        made(rotation_name, "rad", f"how the solid {name} is turned about its middle at the start", rotation, **turn),
+        made(scale_name, "", stretched, 1.0, role=Role.STATE, range=Range.POSITIVE, change=_stretch),
+        made(displacement_name, "m", displaced, still, **steps, **place, course=shifts),
+        made(turn_name, "rad", turned, unturned, **steps, **turn, course=turns),
+        made(
+            velocity_name, "m/s", f"how fast the middle of the solid {name} is{when}", solid.velocity or still, **rate
+        ),
+        made(angular_velocity_name, "rad/s", f"how fast the solid {name} turns about its middle{when}", spin, **rate),
+        made(density_name, "kg/m³", heavy, solid.density or 0.0, range=Range.POSITIVE),
+    ]
 
 
-def displacement_name(solid: str) -> str:
-    """Of the parameter."""
-    return f"{solid}.displacement"
-
-
-def turn_name(solid: str) -> str:
-    """Of the parameter, and of the field of a state."""
-    return f"{solid}.turn"
-
-
-def velocity_name(solid: str) -> str:
-    """Of the parameter that says how fast the middle of a solid is, of a free body at the start, and of the field of a
-    state."""
-    return f"{solid}.velocity"
-
-
-def angular_velocity_name(solid: str) -> str:
-    """Of the parameter that says how fast a solid turns, a free body at the start, and of the field of a state."""
-    return f"{solid}.angular_velocity"
-
-
-def density_name(solid: str) -> str:
-    """Of the parameter of a free body."""
-    return f"{solid}.density"
-
-
-def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """How a solid that is told where to go is displaced [m], and turned [rad], over time from where it begins."""
-    d = len(solid.middle())
-    return _course(solid, "positions", "velocity", d), _course(solid, "rotations", "angular_velocity", 2 * d - 3)
-
-
-def _position(solid: SolidTable) -> Parameter:
-    middle = solid.middle()
-    return Parameter(
-        position_name(solid.name),
-        "m",
-        f"where the middle of the solid {solid.name} is at the start",
-        Axis.SCALAR,
-        lambda source: middle,
-        components=lambda dimension, phases: dimension,
-        change=_change_of_place,
-    )
-
-
-def _rotation(solid: SolidTable) -> Parameter:
-    angles = 2 * len(solid.middle()) - 3
-    begun = np.array(solid.rotation or (0.0,) * angles, dtype=np.float64)
-    return Parameter(
-        rotation_name(solid.name),
-        "rad",
-        f"how the solid {solid.name} is turned about its middle at the start",
-        Axis.SCALAR,
-        lambda source: begun.reshape(_shape_of(angles)),
-        components=None if angles == 1 else lambda dimension, phases: dimension,
-        change=lambda source, value: np.full(np.shape(value), RADIAN),
-    )
-
-
-def _scale(solid: SolidTable) -> Parameter:
-    return Parameter(
-        scale_name(solid.name),
-        "",
-        f"how many times as large as in the scene the solid {solid.name} is, about its middle",
-        Axis.SCALAR,
-        lambda source: np.float64(1.0),
-        role=Role.STATE,
-        range=Range.POSITIVE,
-        change=lambda source, value: STRETCH * np.abs(value),
-    )
-
-
-def _velocity(solid: SolidTable) -> Parameter:
-    begun = np.array(solid.velocity or np.zeros(len(solid.middle())), dtype=np.float64)
-    return Parameter(
-        velocity_name(solid.name),
-        "m/s",
-        f"how fast the middle of the solid {solid.name} is{_when(solid)}",
-        Axis.SCALAR,
-        lambda source: begun,
-        components=lambda dimension, phases: dimension,
-        change=lambda source, value: np.ones(np.shape(value)),
-    )
-
-
-def _angular_velocity(solid: SolidTable) -> Parameter:
-    angles = 2 * len(solid.middle()) - 3
-    begun = np.array(solid.angular_velocity or np.zeros(angles), dtype=np.float64)
-    return Parameter(
-        angular_velocity_name(solid.name),
-        "rad/s",
-        f"how fast the solid {solid.name} turns about its middle{_when(solid)}",
-        Axis.SCALAR,
-        lambda source: begun.reshape(_shape_of(angles)),
-        components=None if angles == 1 else lambda dimension, phases: dimension,
-        change=lambda source, value: np.ones(np.shape(value)),
-    )
-
-
-def _when(solid: SolidTable) -> str:
-    return " at the start" if solid.motion == "free" else ""
-
-
-def _density(solid: SolidTable) -> Parameter:
-    return Parameter(
-        density_name(solid.name),
-        "kg/m³",
-        f"the mass of the body {solid.name} over its volume",
-        Axis.SCALAR,
-        lambda source: np.float64(solid.density or 0.0),
-        range=Range.POSITIVE,
-    )
-
-
-def _displacement(solid: SolidTable) -> Parameter:
-    return Parameter(
-        displacement_name(solid.name),
-        "m",
-        f"how far the middle of the solid {solid.name} is from where it began, after each step",
-        Axis.STEP,
-        lambda source: np.zeros(source.scene.dimension),
-        components=lambda dimension, phases: dimension,
-        change=_change_of_place,
-        moment=1.0,
-        grows=True,
-        course=courses(solid)[0],
-    )
-
-
-def _turn(solid: SolidTable) -> Parameter:
-    angles = 2 * len(solid.middle()) - 3
-    return Parameter(
-        turn_name(solid.name),
-        "rad",
-        f"how far the solid {solid.name} is turned from how it began, after each step",
-        Axis.STEP,
-        lambda source: np.zeros(_shape_of(angles)),
-        components=None if angles == 1 else lambda dimension, phases: dimension,
-        change=lambda source, value: np.full(np.shape(value), RADIAN),
-        moment=1.0,
-        grows=True,
-        course=courses(solid)[1],
-    )
-
-
-def _change_of_place(source: Source, value: NDArray) -> NDArray[np.float64]:
+def _spacings(source: Source, value: NDArray) -> NDArray[np.float64]:
     return np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)
+
+
+def _stretch(source: Source, value: NDArray) -> NDArray[np.float64]:
+    return np.asarray(STRETCH * np.abs(value))
+
+
+def _constant(size: float) -> Callable[[Source, NDArray], NDArray[np.float64]]:
+    return lambda source, value: np.full(np.shape(value), size)
 
 
 def _shape_of(components: int) -> tuple[int, ...]:
     return () if components == 1 else (components,)
+
+
+def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
+    """The displacement [m] and the turn [rad] of a solid whose motion is prescribed, over time, from where it
+    begins."""
+    d = len(solid.middle())
+    return _course(solid, "positions", "velocity", d), _course(solid, "rotations", "angular_velocity", 2 * d - 3)
 
 
 def _course(solid: SolidTable, values: str, rate: str, components: int) -> Steady | Knots:
@@ -315,3 +309,79 @@ def _course(solid: SolidTable, values: str, rate: str, components: int) -> Stead
         return Knots(np.array(solid.times), table - table[0])
     steady: Any = getattr(solid, rate)
     return Steady(np.zeros(shape) if steady is None else np.array(steady, dtype=np.float64).reshape(shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Place and rotation of a solid that moves, in a state: R = Q R(w), in space also for one in the plane."""
+
+    name: str
+    """Of the solid."""
+    is_free: bool
+    """Whether it is a body that fluid moves: states keep Q of these by its columns, and of others by its vector."""
+    position: NDArray[Any]
+    """(d,) [m]"""
+    scale: float
+    """How many times as large as in the scene it is."""
+    begun: NDArray[Any]
+    """w, (3,), by which it was turned at first [rad]"""
+    turn: NDArray[Any]
+    """(3,) by which it was turned since [rad]; 0 of a body that is free"""
+    turned: NDArray[Any]
+    """Q, (3, 3)"""
+
+    @classmethod
+    def of(cls, name: str, is_free: bool, at: Any) -> Self:
+        """The pose of a solid in a state, ``at``, whose fields have an axis of one entry."""
+        position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
+        if is_free:
+            turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
+        else:
+            turn, scale = _in_space(at[turn_name(name)][0]), float(at[scale_name(name)][0])
+            turned = matrix(turn)
+        return cls(name, is_free, position, scale, _in_space(begun), turn, turned)
+
+    @property
+    def rotation(self) -> NDArray[Any]:
+        """R, (3, 3)"""
+        return np.asarray(self.turned @ matrix(self.begun))
+
+    def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """From ``t`` (3,), the derivative with respect to a further turn of R, to those of fields, by their names."""
+        name, dimension = self.name, len(self.position)
+        bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
+        if not self.is_free:
+            return bars | {turn_name(name): _angles(_jacobian(self.turn).T @ t, dimension)}
+        columns = zip(AXES, self.turned.T, strict=True)
+        return bars | {f"{name}.{axis}": 0.5 * np.cross(t, column)[None, :dimension] for axis, column in columns}
+
+
+def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
+    """(3, 3) of a rotation vector (3,), or of an angle (1,) in the plane [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(_in_space(rotation)).as_matrix())
+
+
+def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
+    """(3,) of a vector, or the rotation vector of an angle."""
+    found = np.zeros(3)
+    if np.ndim(vector) == 0 or len(vector) == 1:
+        found[2] = np.reshape(vector, ())
+    else:
+        found[: len(vector)] = vector
+    return found
+
+
+def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
+    """(1, 1) or (1, 3) a rotation vector w (3,) as a field of a state."""
+    return np.asarray(w[2:] if dimension == 2 else w[None])
+
+
+def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
+    """J of `cortado.sph.rotations`."""
+    size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
+    if size < 1e-4:
+        return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)
+    a, b = (1.0 - np.cos(size)) / size**2, (size - np.sin(size)) / size**3
+    return np.asarray(np.eye(3) + a * cross + b * cross @ cross)

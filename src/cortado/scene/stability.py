@@ -112,11 +112,6 @@ funnels with walls 3 to 10 spacings thick steps of 0.5 spacings went wrong with 
 with walls 1.25 to 2 spacings thick those of 0.4 to 0.65 of their thickness."""
 
 
-def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
-    """The smallest of the `stability_limits` [s], infinite if nothing moves."""
-    return min(stability_limits(scene, values).values())
-
-
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
     """What bounds the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
     the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself

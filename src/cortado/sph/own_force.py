@@ -30,9 +30,9 @@ from cortado.fixed import fixed
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum
+from cortado.scene.motions import Course
 from cortado.scene.parameter_values import TIME
 from cortado.scene.parameters import Axis, Parameter, Source
-from cortado.scene.schedule import Course
 from cortado.sph.formula import Formula, Packed, applied, change_along, compiled, formula, theta_of, work_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents

@@ -37,8 +37,7 @@ from cortado.runs.sensors.sensor import (
     reach_of,
 )
 from cortado.scene.containers import Container
-from cortado.scene.motions import position_name, scale_name
-from cortado.scene.poses import Pose
+from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5
