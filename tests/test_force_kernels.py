@@ -299,8 +299,6 @@ ELSEWHERE = {
     "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
     "velocity_kernels": "the same",
     "velocity_gradient_kernels": "the same",
-    "shift_kernels": "the same",
-    "following_kernels": "the same",
     "beginning_kernels": "the same",
     "moving_kernels": "the same",
     "coarse_push_kernels": "the same",
