@@ -53,7 +53,8 @@ def pointwise_kernels(
 
     The function has a type at each parameter, and ``results`` are the arrays that it writes. ``replaced`` maps a result
     to the input in whose place its adjoint stands at first, and the adjoint kernel leaves that of the input there.
-    Parameters among ``numbers`` are numbers of a launch, without derivatives."""
+    Parameters among ``numbers`` are numbers of a launch, without derivatives. A tape cannot differentiate the forward
+    kernel."""
     forward, along, back = (Term.of(make(module)) for module in modules)
     of = _Pointwise(precision, forward, results, replaced or {}, numbers)
     known = (

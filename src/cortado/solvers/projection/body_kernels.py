@@ -49,8 +49,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
     normal = normal_part(discretisation)
     topic = "projection_bodies"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
     held = bundle(gamma_of=vector, arm=vector)

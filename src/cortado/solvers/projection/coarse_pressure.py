@@ -21,8 +21,6 @@ leaves open would take solves hundreds of iterations, in dams that have run out.
 particles in two ways: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles of the
 cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second derivatives
 at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
-
-How far a coarse correction of the pressure goes: alpha of `cortado.solvers.projection.coarse_pressure`.
 """
 
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, symm
 
 @dataclass(frozen=True)
 class CoarsePressureKernels:
-    """Of d, given e; those of alpha are in `cortado.solvers.projection.coarse_pressure`."""
+    """Of d, given e; `LengthKernels` has those of alpha."""
 
     correct: Any
     correct_tangent: Any

@@ -99,8 +99,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "beside", "coarse")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
     LANES = discretisation.lanes

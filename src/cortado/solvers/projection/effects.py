@@ -5,7 +5,7 @@ the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from
 ((nu + 9 q nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror and q, which is 0 beside others
 (`cortado.solvers.projection.images`):
 
-    sigma = S(0.1, 0.5) B    how much tension is let through, 1 where a scene is shut (see `beginning`),
+    sigma = S(0.1, 0.5) B    how much tension is let through, 1 where a scene is shut (see `pressure`),
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,

@@ -99,8 +99,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
     whole, per = moment_functions(precision, dimension).change, wp.constant(real(1.0 / dimension))
     topic = f"{TOPIC}_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     spread = fluid_sum(discretisation, module=module)(spread_term(discretisation))
     spread_tangent = made_tangent(discretisation, spread_term, tangent_module)
     spread_adjoint = made_adjoint(discretisation, spread_term, adjoint_module)

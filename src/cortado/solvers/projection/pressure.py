@@ -13,8 +13,8 @@ an iteration from y, an extrapolation of k (Nesterov 1983), is
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
 b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists. The first k and v are told
-below. Tension is let through by sigma, where particles are surrounded. Slopes of
-the clamp and of the maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
+below. Tension is let through by sigma, where particles are surrounded. Slopes of the clamp and of the maximum have
+corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
 
 A step begins with the pressure of the step before: k is f times as large as it was, and v is v* + f w, with
 the kick w = -D^T k / m that it gave.
@@ -122,8 +122,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     spread, spread_tangent, lift, lift_back = mirrors.spread, mirrors.spread_tangent, mirrors.lift, mirrors.lift_back
     gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
     topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     weights4 = weights_type(precision)
     own = {
         name: kind
@@ -332,8 +331,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     precision = discretisation.precision
     real, vector, weights4 = precision.real, precision.vector, weights_type(precision)
     topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     towards = wp.constant(real(TOWARDS))
 
     @wp.func

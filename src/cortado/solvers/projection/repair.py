@@ -63,8 +63,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         densities.weights_adjoint,
     )
     topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights", "image")}
     seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
     LANES = discretisation.lanes

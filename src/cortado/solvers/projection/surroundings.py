@@ -53,8 +53,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     mirror_walls, mirror_walls_tangent, mirror_walls_back = mirrors.walls, mirrors.walls_tangent, mirrors.walls_back
     mirror_of = mirrors.mirror_of
     topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     own, packed = moment_functions(precision, dimension), symmetric(precision)
     whole, change, six, pack = own.whole, own.change, packed.kind, packed.pack
     here = effect_functions(precision, dimension, module)

@@ -44,8 +44,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     packed = symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "image")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
     pulled = bundle(y=real, T=six, g=vector, gamma=vector, image=real)

@@ -15,8 +15,8 @@ The pressure of a particle pushes the walls of one solid along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s)
 
-with the sums of `cortado.solvers.projection.walls` over the wall particles of the solid, and e from those over all
-walls. Loads are read now and then, so that it is put together off the device, in float64.
+with the sums above over the wall particles of the solid, and e from those over all walls. Loads are read now and then,
+so that gamma_s is put together off the device, in float64.
 """
 
 from dataclasses import dataclass
