@@ -8,8 +8,8 @@ import warp as wp
 
 import cortado
 from cortado.errors import DivergedError, InputError
+from cortado.optimisation.layers.functions import Steps
 from cortado.optimisation.layers.layer import PARAMETER, STATE, named, on_host
-from cortado.optimisation.layers.steps import Steps
 
 STEPS = 4
 

@@ -8,7 +8,6 @@ import pytest
 
 import cortado
 from cortado import InputError, Simulation, gradients, sensors
-from cortado.optimisation.layers import residuals
 from cortado.optimisation.layers.layer import KEPT
 from layered import POINT, STIFF, matched, scheduled, shear, sheared
 from scenes import jet, plane, scene, two_layers
@@ -131,6 +130,8 @@ def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, la
 
 def test_residuals_that_are_gone_are_computed_again(jax, layer, simulation, point, monkeypatch):
     """And none is left behind by a backward pass."""
+    from cortado.optimisation.layers import with_jax
+
     first = layer.state(simulation)
 
     def loss(viscosity):
@@ -139,14 +140,12 @@ def test_residuals_that_are_gone_are_computed_again(jax, layer, simulation, poin
             state = layer.step(simulation, state, {"viscosity": STIFF * viscosity}, steps=5)
         return (state["velocities"] ** 2).sum()
 
-    waiting = len(residuals.RESIDUALS)
+    waiting = len(with_jax.RESIDUALS)
     wanted = jax.grad(loss)(point[3])
-    assert len(residuals.RESIDUALS) == waiting
-    monkeypatch.setattr(residuals, "MOST_KEPT", 0)
+    assert len(with_jax.RESIDUALS) == waiting
+    monkeypatch.setattr(with_jax, "MOST_KEPT", 0)
     computed = []
-    monkeypatch.setattr(
-        residuals, "evaluate", lambda *a, own=residuals.evaluate, **k: computed.append(1) or own(*a, **k)
-    )
+    monkeypatch.setattr(with_jax, "evaluate", lambda *a, own=with_jax.evaluate, **k: computed.append(1) or own(*a, **k))
     assert jax.grad(loss)(point[3]) == wanted and len(computed) == 3 + 2
 
 
@@ -625,7 +624,7 @@ def test_within_a_compiled_program_the_error_has_the_sentence(jax, layer, simula
 
 def test_an_error_that_is_not_ours_has_its_traceback(jax, layer, problem, capfd, monkeypatch):
     loss = jax.jit(lambda m: layer.value(problem)({"viscosity": m}))
-    monkeypatch.setattr("cortado.optimisation.layers.residuals.evaluate", lambda *given: 1 / 0)
+    monkeypatch.setattr("cortado.optimisation.layers.with_jax.evaluate", lambda *given: 1 / 0)
     with pytest.raises(Exception, match="ZeroDivisionError"):
         loss(jax.numpy.asarray(10.0)).block_until_ready()
     assert "Traceback" in capfd.readouterr().out

@@ -1,19 +1,17 @@
 """What is the same for every program that has Cortado as a layer: states, steps, rollouts and losses of its arrays."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from cortado.arrays import require_table, whole_number
+from cortado.arrays import as_precise_numbers, require_table, whole_number
 from cortado.errors import InputError, shown
 from cortado.gradients import GradientEstimator
-from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, named, part
-from cortado.optimisation.layers.measure import READING, Measure
-from cortado.optimisation.layers.picture import PICTURE, Picture
-from cortado.optimisation.layers.states import check_state
-from cortado.optimisation.layers.steps import Steps
-from cortado.optimisation.layers.value import LOSS, Value
+from cortado.optimisation.layers.functions import LOSS, PICTURE, READING, Measure, Picture, Steps, Value
+from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, check_state, kept_or_made, named, part
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState
@@ -29,25 +27,37 @@ KEPT = 4
 """Numbers of steps whose layers a simulation keeps for the next call."""
 
 
-class Bridge(Protocol):
+class Bridge(ABC):
     """What these functions need of another program."""
 
+    stack: Callable[[list[Any]], Any]
+    """Arrays of the other program as one with a first axis."""
+
+    @abstractmethod
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
         """What a layer returns, by name, differentiable."""
 
+    @abstractmethod
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """An array of the layer's precision, or numbers as one; raises `InputError`."""
+        """An array of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
 
+    @abstractmethod
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Arrays of a layer as arrays of the other program."""
+        """Arrays of a layer as arrays of the other program, with memory of their own."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """An array on the host, in float64; raises `InputError`."""
+        return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """The states that a step leads to again and again, with the next row of each array, and the first one."""
+        """The states that a step leads to again and again, with the next row of each array, and the first one, along a
+        first axis."""
+        states = [state]
+        for k in range(count):
+            states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
+        return {name: self.stack([one[name] for one in states]) for name in state}
 
 
 def steps_layer(simulation: Simulation, steps: int) -> Steps:
@@ -56,11 +66,7 @@ def steps_layer(simulation: Simulation, steps: int) -> Steps:
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
     steps = whole_number("steps", steps, 1)
     layers: dict[int, Steps] = simulation.__dict__.setdefault("_layers", {})
-    found = layers.pop(steps, None) or Steps(simulation, steps)
-    layers[steps] = found  # the last one
-    while len(layers) > KEPT:
-        layers.pop(next(iter(layers)))
-    return found
+    return kept_or_made(layers, steps, partial(Steps, simulation), KEPT)
 
 
 def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, parameters: Values | None) -> Any:

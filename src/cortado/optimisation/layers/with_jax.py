@@ -3,21 +3,33 @@
 A layer is one primitive. Its rule of forward mode applies it with the number of its residual as a further result, and
 then a second primitive, the tangent, which is linear in tangents; the transpose of this is a third, the adjoint. So
 `jax.jvp` and `jax.grad` come from the same rules, and both are linear functions that JAX may transpose again.
+
+As a program of JAX holds arrays alone, the residual itself waits in `RESIDUALS`, to be found by a ticket, which is one.
+Compiled programs call Python by Warp's foreign functions: on the memory of the program and, on a GPU, in its stream.
 """
 
+import inspect
+import sys
+from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
-from functools import partial
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache, partial
+from itertools import count
 from math import prod
-from typing import Any
+from threading import Lock
+from typing import Any, Literal
+from uuid import uuid4
+from weakref import finalize
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.arrays import as_precise_numbers
-from cortado.errors import InputError, LibraryMissingError, Words
-from cortado.optimisation.layers import residuals
-from cortado.optimisation.layers.compiled import ForeignFunction
-from cortado.optimisation.layers.layer import Array, Layer, Named, on_host
+from cortado.device.threads import WARP
+from cortado.errors import CortadoError, InputError, LibraryMissingError, Words
+from cortado.optimisation.layers.calls import Bridge
+from cortado.optimisation.layers.layer import Array, Layer, Named, on_host, rows, stacked
 
 try:
     import jax
@@ -28,28 +40,100 @@ except ModuleNotFoundError as error:
     raise LibraryMissingError("JAX", "jax") from error
 
 SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
+MOST_KEPT = 2**30
+"""Bytes of residuals that wait for a derivative; the oldest ones beyond are computed again when they are needed."""
+TICKET = 2
+"""How many whole numbers it has: that of the residual, and that of an entry, where a layer is mapped over several."""
+LONGER = 64
+"""So many foreign functions whose programs are gone are kept."""
+Kept = tuple[Layer, int | None, Any]
+"""A layer, over how many entries it is mapped, None if it is not, and its residual."""
 Names = tuple[str, ...]
 Sizes = tuple[int, ...]
 """Over how many entries a layer is mapped, along one axis after the other."""
 Arrays = Sequence[Any]
+Way = Literal["push", "pull"]
+"""The methods of a layer that are its derivatives, in forward and in reverse mode."""
+
+
+class Residuals:
+    """Residuals that wait for a derivative, by their numbers."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[int, Kept] = OrderedDict()
+        self._numbers, self._lock = count(1), Lock()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def put(self, kept: Kept) -> int:
+        """The number of one."""
+        with self._lock:
+            number = next(self._numbers) % 2**31
+            self._kept[number] = kept
+            while len(self._kept) > 1 and sum(layer.kept_bytes for layer, *_ in self._kept.values()) > MOST_KEPT:
+                self._kept.popitem(last=False)
+            return number
+
+    def get(self, number: int, last: bool) -> Kept | None:
+        """That of a number; None if it is gone, as it is once somebody was the ``last`` to take it."""
+        with self._lock:
+            return self._kept.pop(number, None) if last else self._kept.get(number)
+
+
+RESIDUALS = Residuals()
+
+
+def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
+    """What a layer returns, mapped over so many entries along a first axis; and, to ``keep``, the tickets (entries, 2)
+    of its residual, or (2,), else 0."""
+    own = layer if entries is None else layer.batched(entries)
+    found, residual = own.evaluate(given, keep)
+    number = RESIDUALS.put((own, entries, residual)) if keep else 0
+    tickets = np.stack([np.full(entries or 1, number), np.arange(entries or 1)], axis=1).astype(np.int32)
+    return found, tickets[0] if entries is None else tickets
+
+
+def derivative(
+    way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
+) -> Named:
+    """What a layer pushes the tangents ``others`` of arrays ``given`` to it to, or pulls the adjoints of what it
+    returned to, by the tickets of its residual.
+
+    Mapped over so many entries, of a layer that was mapped over these, over a part of them, as where it is
+    differentiated along several directions, or not at all."""
+    numbers, places = tickets.reshape(-1, TICKET).T
+    last = way == "pull"
+    kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
+    if kept is None:
+        own = evaluate(layer, entries, given, keep=True)[1].reshape(-1, TICKET)
+        kept, places = RESIDUALS.get(int(own[0, 0]), last), own[:, 1]
+    assert kept is not None
+    own_layer, mapped, residual = kept
+    derived: Callable[[Any, Named], Named] = getattr(own_layer, way)
+    if mapped == entries:
+        return derived(residual, others)
+    order = np.argsort(places, kind="stable").reshape(mapped or 1, -1).T  # (directions, entries of the layer)
+    turns: Sequence[Any] = [row if mapped is not None else int(row[0]) for row in order]
+    whole = stacked([derived(residual, rows(others, turn)) for turn in turns])
+    if mapped is not None:
+        whole = {name: array.reshape((-1, *array.shape[2:])) for name, array in whole.items()}
+    return rows(whole, np.argsort(order.reshape(-1)))
 
 
 def _evaluated(arrays: Arrays, *, layer: Layer, names: Names, sizes: Sizes, keep: bool) -> list[Array]:
-    found, tickets = residuals.evaluate(layer, _entries(sizes), dict(zip(names, arrays, strict=True)), keep)
+    found, tickets = evaluate(layer, _entries(sizes), dict(zip(names, arrays, strict=True)), keep)
     own = [found[name] for name in layer.outputs()]
     return [*own, tickets] if keep else own
 
 
-def _pushed(arrays: Arrays, *, layer: Layer, names: Names, along: Names, sizes: Sizes) -> list[Array]:
-    tickets, given, dots = _taken_apart(arrays, names, along)
-    found = residuals.push(layer, _entries(sizes), tickets, given, dots)
-    return [found[name] for name in layer.outputs()]
-
-
-def _pulled(arrays: Arrays, *, layer: Layer, names: Names, along: Names, sizes: Sizes) -> list[Array]:
-    tickets, given, bars = _taken_apart(arrays, names, tuple(layer.outputs()))
-    found = residuals.pull(layer, _entries(sizes), tickets, given, bars)
-    return [found[name] for name in along]
+def _derived(way: Way, arrays: Arrays, *, layer: Layer, names: Names, along: Names, sizes: Sizes) -> list[Array]:
+    tickets, *rest = arrays
+    given, outputs = dict(zip(names, rest[: len(names)], strict=True)), tuple(layer.outputs())
+    along, wanted = (along, outputs) if way == "push" else (outputs, along)
+    others = dict(zip(along, rest[len(names) :], strict=True))
+    found = derivative(way, layer, _entries(sizes), on_host(tickets), given, others)
+    return [found[name] for name in wanted]
 
 
 def _entries(sizes: Sizes) -> int | None:
@@ -57,16 +141,10 @@ def _entries(sizes: Sizes) -> int | None:
     return prod(sizes) if sizes else None
 
 
-def _taken_apart(arrays: Arrays, names: Names, others: Names) -> tuple[np.ndarray, Named, Named]:
-    tickets, *rest = arrays
-    given = dict(zip(names, rest[: len(names)], strict=True))
-    return on_host(tickets), given, dict(zip(others, rest[len(names) :], strict=True))
-
-
 def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **others: Any) -> list[Any]:
     """The shapes and types of what a layer returns."""
     found = [jax.core.ShapedArray((*sizes, *shape), layer.real) for shape in layer.outputs().values()]
-    return [*found, jax.core.ShapedArray((*sizes, residuals.TICKET), np.int32)] if keep else found
+    return [*found, jax.core.ShapedArray((*sizes, TICKET), np.int32)] if keep else found
 
 
 def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: Any) -> list[Any]:
@@ -81,27 +159,24 @@ def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[...
     made.multiple_results = True
     made.def_abstract_eval(results)
 
-    def flat(array: Any, sizes: Sizes) -> Any:
-        return array.reshape((prod(sizes), *array.shape[len(sizes) :])) if sizes else array
+    def flat(shape: Sizes, sizes: Sizes) -> Sizes:
+        return (prod(sizes), *shape[len(sizes) :]) if sizes else shape
+
+    def flattened(arrays: Arrays, sizes: Sizes) -> list[Any]:
+        return [array.reshape(flat(array.shape, sizes)) if sizes else array for array in arrays]
 
     def at_once(*arrays: Any, **options: Any) -> list[Any]:
-        given = [flat(_array(array), options["sizes"]) for array in arrays]
+        given = flattened([_array(array) for array in arrays], options["sizes"])
         wanted = results(*arrays, **options)
         return [_jax_array(*own) for own in zip(run(given, **options), wanted, strict=True)]
 
     def compiled(context: Any, *arrays: Any, **options: Any) -> Any:
-        foreign = ForeignFunction(partial(run, **options))
+        foreign, sizes = ForeignFunction(partial(run, **options)), options["sizes"]
         context.module_context.add_keepalive(foreign)
 
         def call(*traced: Any) -> list[Any]:
-            sizes = options["sizes"]
-            wanted = [jax.ShapeDtypeStruct(own.shape, own.dtype) for own in results(*traced, **options)]
-            flattened = [
-                jax.ShapeDtypeStruct((prod(sizes), *own.shape[len(sizes) :]) if sizes else own.shape, own.dtype)
-                for own in wanted
-            ]
-            found = foreign(*(flat(array, sizes) for array in traced), results=flattened)
-            return [array.reshape(own.shape) for array, own in zip(found, wanted, strict=True)]
+            wanted = results(*traced, **options)
+            return foreign(*flattened(traced, sizes), shapes=[flat(own.shape, sizes) for own in wanted], results=wanted)
 
         return mlir.lower_fun(call, multiple_results=True)(context, *arrays)
 
@@ -120,8 +195,8 @@ def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[...
 
 
 evaluate_p = _primitive("evaluate", _evaluated, _results)
-push_p = _primitive("push", _pushed, _results)
-pull_p = _primitive("pull", _pulled, _of_given)
+push_p = _primitive("push", partial(_derived, "push"), _results)
+pull_p = _primitive("pull", partial(_derived, "pull"), _of_given)
 
 
 def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: Any) -> tuple[Any, Any]:
@@ -135,17 +210,12 @@ def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: An
     return [*found, number], [*tangents, ad.Zero(jax.core.ShapedArray(number.shape, jax.dtypes.float0))]
 
 
-def _push_transposed(bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any) -> list[Any]:
-    arrays = given[: len(names)]
+def _transposed(
+    transpose: Any, bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any
+) -> list[Any]:
+    """The rule of reverse mode of a linear primitive, whose first arrays have no derivative: its transpose."""
     own = [ad.instantiate_zeros(bar) for bar in bars]
-    found = pull_p.bind(number, *arrays, *own, names=names, along=along, **options)
-    return [None] * (1 + len(names)) + list(found)
-
-
-def _pull_transposed(dots: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any) -> list[Any]:
-    arrays = given[: len(names)]
-    own = [ad.instantiate_zeros(dot) for dot in dots]
-    found = push_p.bind(number, *arrays, *own, names=names, along=along, **options)
+    found = transpose.bind(number, *given[: len(names)], *own, names=names, along=along, **options)
     return [None] * (1 + len(names)) + list(found)
 
 
@@ -162,14 +232,15 @@ def _linear_forward(primitive: Any, given: Arrays, dots: Arrays, *, names: Names
 
 
 ad.primitive_jvps[evaluate_p] = _evaluate_forward
-ad.primitive_jvps[push_p] = partial(_linear_forward, push_p)
-ad.primitive_jvps[pull_p] = partial(_linear_forward, pull_p)
-ad.primitive_transposes[push_p] = _push_transposed
-ad.primitive_transposes[pull_p] = _pull_transposed
+for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
+    ad.primitive_jvps[_one] = partial(_linear_forward, _one)
+    ad.primitive_transposes[_one] = partial(_transposed, _other)
 
 
-class JaxBridge:
+class JaxBridge(Bridge):
     """What calls of layers need of JAX."""
+
+    stack = staticmethod(jnp.stack)
 
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
         """What a layer returns, by name."""
@@ -197,20 +268,12 @@ class JaxBridge:
         """Arrays of a layer as JAX's."""
         return {name: self.array(name, np.array(on_host(array)), layer) for name, array in found.items()}
 
-    def numbers(self, what: str, value: Any) -> np.ndarray:
-        """An array on the host, in float64."""
-        return as_precise_numbers(what, value)
-
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """The states that a step leads to again and again, with the next row of each array, and the first one, along a
-        first axis."""
+        """One step after the other, but in a program that is compiled a loop."""
         if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
-            states = [state]
-            for k in range(count):
-                states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
-            return {name: jnp.stack([one[name] for one in states]) for name in state}
+            return super().repeated(step, state, rows, count)
 
         def body(before: Any, own: Any) -> tuple[Any, Any]:
             after = step(before, own)
@@ -233,3 +296,89 @@ def _jax_array(found: Array, wanted: Any) -> Any:
         return jnp.from_dlpack(found).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)
     return jnp.array(own.reshape(wanted.shape), dtype=wanted.dtype)
+
+
+class ForeignFunction:
+    """A function of arrays that a compiled program calls, for as long as the program holds this, and some time longer:
+    JAX lets go of a program that still runs."""
+
+    def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
+        self._number = next(_NUMBERS)
+        _FUNCTIONS[self._number] = function
+        finalize(self, _let_go, self._number)
+
+    @WARP
+    def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
+        """The call within a function that JAX traces; ``shapes`` are those of what the function returns, ``results``
+        have the shapes that JAX is to have it in, and the types."""
+        given = [array.reshape(array.shape or (1,)) for array in arrays]
+        dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
+        kinds = tuple((array.ndim, str(array.dtype)) for array in given)
+        made = tuple((len(shape), str(own.dtype)) for shape, own in zip(dims.values(), results, strict=True))
+        found = _callable(kinds, made)(*given, self._number, output_dims=dims)
+        return [own.reshape(result.shape) for own, result in zip(found, results, strict=True)]
+
+
+_NUMBERS = count(1)
+_FUNCTIONS: dict[int, Callable[[list[Array]], Sequence[Array]]] = {}
+_GONE: deque[int] = deque()
+
+
+def _let_go(number: int) -> None:
+    _GONE.append(number)
+    while len(_GONE) > LONGER:
+        _FUNCTIONS.pop(_GONE.popleft(), None)
+
+
+@cache
+def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], ...]) -> Any:
+    """What calls a function by its number, with so many arrays of these numbers of axes and types."""
+
+    def call(*arguments: Any) -> None:
+        arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
+        with WARP, _in_order(results[0].device):
+            try:
+                found = _FUNCTIONS[number]([_as_array(array) for array in arrays])
+            except CortadoError as error:
+                raise error.with_traceback(None) from None
+            for result, own in zip(results, found, strict=True):
+                if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
+                    wp.copy(result, own.reshape(result.shape))
+                else:
+                    result.assign(on_host(own).reshape(result.shape))
+
+    types = {f"in_{k}": _annotation(*kind) for k, kind in enumerate(given)}
+    types |= {"number": int} | {f"out_{k}": _annotation(*kind) for k, kind in enumerate(made)}
+    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in types]
+    )
+    call.__annotations__ = types
+    call.__qualname__ = f"call_{uuid4().hex}"  # a program that was kept on disk does not find it in another process
+    found = wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
+    vars(sys.modules[type(found).__module__])["print"] = _print
+    return found
+
+
+def _print(*words: Any, **options: Any) -> None:
+    """What Warp's foreign functions print, which is the traceback of each error, but for errors of ours: JAX raises
+    them with their sentence, and their traceback says nothing more. Warp has no setting for it."""
+    if not isinstance(sys.exc_info()[1], CortadoError):
+        print(*words, **options)
+
+
+def _in_order(device: Any) -> AbstractContextManager[Any]:
+    """On a GPU, in a stream of ours, after and before what is in that of the program, which cannot be captured."""
+    return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
+
+
+@cache
+def _stream(device: str) -> Any:
+    return wp.Stream(device)
+
+
+def _annotation(axes: int, dtype: str) -> Any:
+    return wp.array(dtype=getattr(wp, dtype), ndim=axes)
+
+
+def _as_array(array: wp.array) -> Array:
+    return array.numpy() if array.device.is_cpu else array

@@ -11,6 +11,7 @@ import warp as wp
 
 from cortado.arrays import as_precise_numbers
 from cortado.errors import InputError, LibraryMissingError, Words
+from cortado.optimisation.layers.calls import Bridge
 from cortado.optimisation.layers.layer import Array, Layer, Named
 
 try:
@@ -160,8 +161,10 @@ for _one in (Pull, Push):
     _one.vmap = staticmethod(_mapped(_one))
 
 
-class TorchBridge:
+class TorchBridge(Bridge):
     """What calls of layers need of PyTorch."""
+
+    stack = staticmethod(torch.stack)
 
     @torch.compiler.disable
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
@@ -196,16 +199,6 @@ class TorchBridge:
         """A tensor, or what else it may be, on the host."""
         whole = isinstance(value, torch.Tensor) and value.dtype not in (torch.float16, torch.bfloat16)
         return as_precise_numbers(what, value.detach().cpu().numpy() if whole else value)
-
-    def repeated(
-        self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
-    ) -> dict[str, Any]:
-        """The states that a step leads to again and again, with the next row of each array, and the first one, along a
-        first axis."""
-        states = [state]
-        for k in range(count):
-            states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
-        return {name: torch.stack([one[name] for one in states]) for name in state}
 
 
 def _dtype(layer: Layer) -> Any:

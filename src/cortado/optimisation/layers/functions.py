@@ -1,0 +1,362 @@
+"""The functions of a simulation that are layers: steps, the loss of a problem, what sensors read, and pictures."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from cortado.arrays import check_steps
+from cortado.device.threads import WARP, Turn, in_turn
+from cortado.errors import InputError, MissingDerivativeError, shown
+from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator
+from cortado.gradients.estimator import checked_estimator
+from cortado.losses.loss import Snapshot, SnapshotAdjoint
+from cortado.optimisation.layers.layer import (
+    LAST_STEP,
+    PARAMETER,
+    STATE,
+    Array,
+    Layer,
+    LayerParameters,
+    Named,
+    OneByOne,
+    Shapes,
+    check_state,
+    named,
+    named_states,
+    on_host,
+    part,
+)
+from cortado.problem import Problem
+from cortado.render import Renderer
+from cortado.rollout.checkpoints import MEMORY_BUDGET
+from cortado.rollout.device_states import DeviceState, DeviceStates
+from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
+from cortado.rollout.residual import Residual
+from cortado.rollout.rollout import Rollout
+from cortado.rollout.stepper import Stepper, StepResidual
+from cortado.runs.quantities.moment import Moment, row_of
+from cortado.runs.sensors.placement import warn_of_places
+from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
+from cortado.scene.parameter_values import Arrays
+from cortado.scene.quantity_names import QUANTITIES, check_quantity
+from cortado.simulation import Simulation
+
+LOSS, READING, PICTURE = "loss", "reading", "picture"
+"""The names of what layers return that return one array."""
+
+
+class OfSimulation(Layer):
+    """A layer of a simulation. Its arrays are those of a state, and parameters over a number of steps."""
+
+    def __init__(self, simulation: Simulation, steps: int, each: bool = False):
+        """``each`` as that of `LayerParameters`."""
+        super().__init__()
+        self._simulation, self._each = simulation, each
+        self.states = named_states(simulation)
+        """What makes states of named arrays."""
+        self._parameters = LayerParameters(simulation, steps, each)
+        self.real, self.device = simulation.precision.numpy, simulation.device
+        self.on_device = frozenset(STATE + name for name in self.states.fields)
+        self.unmapped = f"a simulation that is a batch of {simulation.batch}" if simulation.batch is not None else ""
+        self._state_size = sum(array.capacity for array in simulation.initial.arrays())
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses it."""
+        return self._simulation.turn
+
+    def check(self, given: Shapes) -> None:
+        check_state(part(given, STATE), self.states.shapes)
+        self._parameters.check(given, with_state=True)
+
+    def _last_step(self) -> dict[str, Array]:
+        """What steps were chosen by, where they were: it has no derivative."""
+        return {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
+
+
+class Steps(OfSimulation):
+    """So many steps of a simulation, from a state to a later one."""
+
+    def __init__(self, simulation: Simulation, steps: int, each: bool = False):
+        self._steps = check_steps(steps)
+        super().__init__(simulation, steps, each)
+        self.kept_bytes = min(steps * self._state_size, MEMORY_BUDGET)
+
+    @cached_property
+    def _stepper(self) -> Stepper:
+        return self._simulation.stepper(self._steps)
+
+    def outputs(self) -> dict[str, tuple[int, ...]]:
+        return named(STATE, self.states.shapes)
+
+    @in_turn
+    def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
+        values = self._parameters.on_device(given)
+        state = self.states.state(part(given, STATE), values)
+        residual: StepResidual | None = None
+        if keep:
+            end, residual = self._stepper.step(state, values)
+        else:
+            end = self._stepper.advance(state, values)
+        assert isinstance(end, DeviceState)
+        return named(STATE, self.states.arrays(end)), residual
+
+    @in_turn
+    def pull(self, residual: StepResidual, bars: Named) -> Named:
+        before, found = self._stepper.vjp(residual, self._derivatives(bars))
+        return {**self._named(before), **self._parameters.adjoints(found, residual.values)}
+
+    @in_turn
+    def push(self, residual: StepResidual, dots: Named) -> Named:
+        return self._named(self._stepper.jvp(residual, self._derivatives(dots), self._parameters.on_device(dots)))
+
+    def many(self, size: int) -> Layer:
+        return Steps(self._simulation.batch_of(size), self._steps, each=True)
+
+    def _derivatives(self, given: Named) -> dict[str, Any]:
+        """With respect to a state, as a stepper takes them."""
+        own = part(given, STATE)
+        fields = self.states.written({name: array for name, array in own.items() if name in self.states.fields})
+        found = {name: fields.numbers(name) for name in own if name in self.states.fields}
+        members = self.states.shapes[STATE_TIME]
+        return found | {name: np.reshape(on_host(own[name]), members) for name in (STATE_TIME,) if name in own}
+
+    def _named(self, found: dict[str, Any]) -> dict[str, Array]:
+        """The other way round."""
+        fields = {**self.states.narrowed(found), STATE_TIME: np.asarray(found[STATE_TIME])}
+        return named(STATE, {**fields, **self._last_step()})
+
+
+class Evaluation:
+    """One forward run of a problem, of which derivatives are computed when they are asked for."""
+
+    def __init__(self, problem: Problem, values: Arrays, estimator: GradientEstimator, with_state: bool):
+        self._problem, self.values, self._estimator, self._with_state = problem, values, estimator, with_state
+        self._run = problem.forward_pass(values) if isinstance(estimator, AdjointEstimator) else None
+        self._found: Arrays | None = None
+        if self._run is None:
+            found: Estimate = problem.estimate(values, estimator)
+            self._found = named(PARAMETER, found.gradient)
+        self.loss: Any = found.loss if self._run is None else self._run.loss
+
+    @property
+    def gradient(self) -> Arrays:
+        """The derivatives of the loss by the names of arrays of the layer, in float64, of a batch with a first axis."""
+        if self._found is None:
+            assert self._run is not None and isinstance(self._estimator, AdjointEstimator)
+            if self._with_state:
+                found, state = self._run.back_to_state(self._estimator)
+                last = {LAST_STEP: np.zeros(np.shape(self.loss))}  # by which the steps were chosen: see docs/steps.md
+                self._found = {**named(PARAMETER, found), **named(STATE, state | last)}
+            else:
+                self._found = named(PARAMETER, self._run.back(self._estimator))
+            self._run = None  # and the states that it keeps
+        return self._found
+
+    def along(self, dots: Named) -> Any:
+        """The derivative of the loss along tangents: by forward mode, unless an estimator was asked for."""
+        if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
+            return self._problem.tangent(self.values, part(dots, PARAMETER))
+        terms = [self.gradient[name] * dot for name, dot in dots.items()]
+        return sum(np.reshape(term, (*np.shape(self.loss), -1)).sum(axis=-1) for term in terms) + 0.0 * self.loss
+
+
+class Value(OfSimulation):
+    """The loss of a problem. Its arrays are parameters, and those of a state if the problem is to begin there."""
+
+    def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
+        """``gradient``: the estimator that reverse mode goes by, `gradients.Exact` by default."""
+        if not isinstance(problem, Problem):
+            raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
+        super().__init__(problem.simulation, problem.steps, each)
+        self._problem = problem
+        self._estimator = Exact() if gradient is None else checked_estimator(gradient)
+        self.on_device = frozenset()
+        self.unmapped = self.unmapped and f"a problem whose simulation is a batch of {self._simulation.batch}"
+        self.kept_bytes = min(problem.steps * self._state_size, problem.memory_budget)
+
+    def check(self, given: Shapes) -> None:
+        own = part(given, STATE)
+        if own:
+            check_state(own, self.states.shapes)
+        if own and not isinstance(self._estimator, AdjointEstimator):
+            kind = type(self._estimator).__name__
+            raise InputError(
+                f"gradient is a {kind}, but must go back through a run where a state is given: an AdjointEstimator."
+            )
+        self._parameters.check(given, with_state=bool(own) or self._problem.state is not None)
+
+    def outputs(self) -> dict[str, tuple[int, ...]]:
+        batch = self._simulation.batch
+        return {LOSS: () if batch is None else (batch,)}
+
+    @in_turn
+    def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
+        values, own, problem = self._parameters.values(given), part(given, STATE), self._problem
+        if own:
+            state = self.states.state(own, values)
+            problem = problem.beginning_at(problem.simulation.on_host(state))
+        if not keep:
+            return {LOSS: np.asarray(problem.value(values))}, None
+        found = Evaluation(problem, values, self._estimator, bool(own))
+        return {LOSS: np.asarray(found.loss)}, found
+
+    @in_turn
+    def pull(self, residual: Evaluation, bars: Named) -> Named:
+        bar = on_host(bars[LOSS]).astype(np.float64).reshape(np.shape(residual.loss)) if LOSS in bars else 0.0
+        scaled = {name: _times(found, bar) for name, found in residual.gradient.items()}
+        own = self._parameters.adjoints(part(scaled, PARAMETER), residual.values)
+        return {**{name: found for name, found in scaled.items() if name.startswith(STATE)}, **own}
+
+    @in_turn
+    def push(self, residual: Evaluation, dots: Named) -> Named:
+        own = {name: on_host(dot).astype(np.float64) for name, dot in dots.items() if name.startswith(STATE)}
+        found = np.asarray(residual.along({**own, **named(PARAMETER, self._parameters.values(dots))}))
+        return {LOSS: np.where(self._moved(dots), found, 0.0)}
+
+    def _moved(self, dots: Named) -> Any:
+        """Of each scene, (batch,) or (), whether a tangent is not 0; tangents that all scenes of a batch share are of
+        each."""
+        found = np.zeros(self.outputs()[LOSS], dtype=bool)
+        for name, dot in dots.items():
+            array = on_host(dot)
+            own = self._each or name.startswith(STATE)
+            found |= array.reshape(*found.shape, -1).any(axis=-1) if own else bool(array.any())
+        return found
+
+    def many(self, size: int) -> Layer:
+        estimator = self._estimator
+        if not isinstance(estimator, AdjointEstimator) or not estimator.batches:
+            return OneByOne(self, size)
+        return Value(self._problem.batch_of(size), estimator, each=True)
+
+
+def _times(found: np.ndarray, bar: Any) -> np.ndarray:
+    """A derivative, of a batch with a first axis for the scenes, times that with respect to the loss; 0 where this is
+    0, also of what has no numbers."""
+    factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
+    return np.where(factor == 0.0, 0.0, found) * factor
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What derivatives of a reading need."""
+
+    snapshot: Snapshot
+    step: Residual
+    values: Arrays
+
+
+class Measure(OfSimulation):
+    """What a sensor, or by its name a quantity of the particles, is. Its arrays are those of a state, and parameters of
+    the step after it."""
+
+    def __init__(self, simulation: Simulation, what: Sensor | str):
+        if simulation.batch is not None:
+            raise InputError(f"simulation is a batch of {simulation.batch}, but must be of one scene to be measured.")
+        super().__init__(simulation, 1)
+        self._name = check_quantity(what) if isinstance(what, str) else None
+        self._sensor = None if isinstance(what, str) else checked_sensor(what)
+        warn_of_places(simulation, {repr(what): what})
+        self._space, self._rollout = ParameterSpace(simulation, 1), Rollout(simulation.solver, 1)
+        self.kept_bytes = 2 * self._state_size
+
+    def outputs(self) -> dict[str, tuple[int, ...]]:
+        simulation = self._simulation
+        if self._sensor is not None:
+            return {READING: (len(self._sensor.columns(simulation.dimension)),)}
+        return {READING: QUANTITIES[str(self._name)].shape(simulation.particles, simulation.dimension)}
+
+    @in_turn
+    def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
+        simulation, values = self._simulation, self._space.checked(self._parameters.values(given))
+        state = self.states.state(part(given, STATE), values)
+        DeviceStates(simulation).begin(self._space, self._rollout, state, values, set(values))
+        moment = Moment.of(self._rollout, 0, state.arrays, simulation.evaluator)
+        snapshot = Snapshot(state.arrays, simulation.dimension, self._space.colours(values), moment)
+        found = snapshot[str(self._name)] if self._sensor is None else value_of(self._sensor, snapshot)
+        return {READING: found}, Look(snapshot, Residual(self._rollout), values) if keep else None
+
+    @in_turn
+    def pull(self, residual: Look, bars: Named) -> Named:
+        return self._back(residual, on_host(bars[READING]).astype(np.float64))
+
+    @in_turn
+    def push(self, residual: Look, dots: Named) -> Named:
+        if self._sensor is not None:
+            (columns,) = self.outputs()[READING]
+            rows = [self._back(residual, one) for one in np.eye(columns)]
+            return {READING: np.array([sum((row[n] * on_host(dot)).sum() for n, dot in dots.items()) for row in rows])}
+        residual.step.bring_back()
+        rollout, own = self._rollout, part(dots, STATE)
+        fields = self.states.written({name: dot for name, dot in own.items() if name in self.states.fields})
+        along = self._space.checked(self._parameters.values(dots), "direction")
+        parameters = rollout.solver.new_parameters(1)
+        times = np.reshape(on_host(own.get(STATE_TIME, np.zeros(1))), 1).astype(np.float64)
+        self._space.set_direction(rollout, residual.values, along, fields, parameters, times)
+        moment, row = residual.snapshot.moment, row_of(rollout, parameters.written, 0)
+        assert moment is not None
+        name = str(self._name)
+        return {READING: moment.tangents([name], fields.numpy(self._simulation.dimension), row)[name]}
+
+    def _back(self, look: Look, bar: np.ndarray) -> dict[str, Any]:
+        """From the adjoint of the reading to those of all arrays, float64."""
+        snapshot, rollout = look.snapshot, self._rollout
+        found = {str(self._name): bar} if self._sensor is None else self._sensor.adjoint(snapshot, bar)
+        state = snapshot.state.like()
+        state.set({name: array for name, array in found.items() if name in state.names})
+        others = {name: array for name, array in found.items() if name not in state.names}
+        whole = SnapshotAdjoint(state, np.zeros_like(snapshot.colours), others).through_quantities(snapshot)
+        look.step.bring_back()
+        parameters = rollout.solver.new_parameters(1)
+        for name, own in whole.step.parameters.items() if whole.step else ():
+            parameters[name].assign(own)
+        times = self._space.time_adjoints(rollout, look.values, parameters)
+        gradient = self._space.gradient(rollout, look.values, whole.state, parameters)
+        fields = {name: on_host(array).astype(np.float64) for name, array in self.states.read(whole.state).items()}
+        return {
+            **named(STATE, {**fields, STATE_TIME: times[0], **self._last_step()}),
+            **self._parameters.adjoints(gradient, look.values),
+        }
+
+
+class Picture(Layer):
+    """Pictures of a renderer. Its arrays are positions (n, d) [m] and, where wanted, mass fractions (n, phases) and
+    colours (phases, 3). They pass through the host."""
+
+    def __init__(self, renderer: Renderer):
+        super().__init__()
+        if not isinstance(renderer, Renderer):
+            raise InputError(f"renderer is {shown(renderer)}, but must be one such as simulation.renderer() gives.")
+        self._renderer = renderer
+        self.real, self.device = renderer.precision.numpy, renderer.device
+        self.kept_bytes = sum(int(np.prod(shape)) for shape in renderer.inputs.values()) * renderer.precision.bytes
+
+    def check(self, given: Shapes) -> None:
+        wanted = self._renderer.inputs
+        if "positions" not in given:
+            raise InputError(f"positions is left out, but must be an array {wanted['positions']}.")
+        for name, shape in given.items():
+            if shape != wanted[name]:
+                raise InputError(f"{name} has shape {shape}, but must have {wanted[name]}.")
+
+    def outputs(self) -> dict[str, tuple[int, ...]]:
+        return {PICTURE: self._renderer.shape}
+
+    @WARP
+    def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
+        own = {name: np.array(on_host(array)) for name, array in given.items()}
+        return {PICTURE: self._renderer.render(**own)}, own if keep else None
+
+    @WARP
+    def pull(self, residual: dict[str, np.ndarray], bars: Named) -> Named:
+        self._renderer.render(**residual)  # whose last picture may be another one
+        found = self._renderer.adjoint(on_host(bars[PICTURE]).astype(np.float64))
+        positions = found.positions.numpy()[:, : residual["positions"].shape[1]]
+        all_found = {"positions": positions, "fractions": found.fractions.numpy(), "colours": found.colours}
+        return {name: np.array(all_found[name]) for name in residual}
+
+    def push(self, residual: dict[str, np.ndarray], dots: Named) -> Named:
+        raise MissingDerivativeError("A picture has derivatives in reverse mode only: take a gradient.")
