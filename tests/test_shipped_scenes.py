@@ -9,7 +9,7 @@ import pytest
 from cortado.cli.commands.new import new_scene, templates
 from cortado.errors import CortadoWarning
 from cortado.optimisation.inverse.task import load_task
-from cortado.rollout.parameter_checks import unstable_sentence
+from cortado.rollout.run_checks import unstable_sentence
 from cortado.scene.parameter_values import Tilt
 from cortado.scene.scene import load_scene
 

@@ -439,7 +439,7 @@ def run_command(cortado_command, tmp_path):
 
 
 def test_a_run_whose_steps_become_too_short_says_so(monkeypatch):
-    monkeypatch.setattr("cortado.rollout.durations.expected_steps", lambda scene, time, values: 3)
+    monkeypatch.setattr("cortado.rollout.parameter_space.expected_steps", lambda scene, time, values: 3)
     with pytest.warns(cortado.CortadoWarning, match="the run ended at 0.1.* s, before the time that was asked for"):
         run = Simulation(drop(CHOSEN)).run(time=10.0)
     assert len(run.converged) == 12

@@ -14,9 +14,9 @@ from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
 from cortado.losses.loss import StepBar
 from cortado.particles.state import Parameters, State
+from cortado.rollout.device_states import OfLost, without_lost
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.rollout.residual import OfLost, Residual, without_lost
-from cortado.rollout.rollout import BackwardStep, Observer, Rollout
+from cortado.rollout.rollout import BackwardStep, Observer, Residual, Rollout
 from cortado.runs.quantities.moment import add_to_row
 from cortado.scene.parameter_values import Arrays
 

@@ -20,9 +20,8 @@ from cortado.losses.run_losses import LossesByStep, derivative_along
 from cortado.particles.state import State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.rollout.residual import Residual
-from cortado.rollout.restarts import one_for_each
-from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Rollout
+from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
+from cortado.rollout.run_checks import one_for_each
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.trajectory import noted

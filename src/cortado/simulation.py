@@ -26,14 +26,13 @@ from cortado.on_top import on_top
 from cortado.particles.state import State
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
-from cortado.rollout.durations import end_after, expected_frames, steps_of_run
 from cortado.rollout.outcome import trouble
-from cortado.rollout.parameter_checks import check_sizes
-from cortado.rollout.parameter_space import ParameterSpace
-from cortado.rollout.restarts import one_for_each
+from cortado.rollout.parameter_space import ParameterSpace, end_after, steps_of_run
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.run_checks import check_sizes, one_for_each
 from cortado.rollout.scene_parameters import SceneParameters
-from cortado.rollout.stepping import Stepping
+from cortado.rollout.step_bounds import expected_frames
+from cortado.rollout.stepper import Stepping
 from cortado.runs.pace import Film
 from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment

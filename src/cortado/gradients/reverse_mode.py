@@ -11,11 +11,10 @@ from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import EddyViscosity, Limit
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
 from cortado.particles.state import Parameters, State
-from cortado.rollout.adjoint_step import AdjointStep, ResumingStep
-from cortado.rollout.rollout import BackwardStep, Observer, Rollout
+from cortado.rollout.rollout import AdjointStep, BackwardStep, Observer, Rollout
 from cortado.scene.fields import as_number
 from cortado.scene.parameter_values import Values
-from cortado.solvers.solver import Counts
+from cortado.solvers.solver import Counts, ResumingAdjoint
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,23 @@ class ImplicitPressure(AdjointEstimator):
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         own = rollout.steps, float(self.tolerance), int(self.iterations)
-        return ResumingStep(rollout, rollout.solver.implicit_adjoint(*own))
+        return _ResumingStep(rollout, rollout.solver.implicit_adjoint(*own))
+
+
+class _ResumingStep(AdjointStep):
+    """The same, where the step is taken once more from what is known of its result."""
+
+    def __init__(self, rollout: Rollout, adjoint: ResumingAdjoint):
+        super().__init__(rollout, adjoint)
+        self._resuming = adjoint
+
+    def begin(self) -> None:
+        super().begin()
+        self._resuming.arrive(self.rollout.last_state())
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._resuming.replay(state, self._parameters, counts)
+        self._resuming.step(counts, bar, self._parameters)
 
 
 EXACT = Exact()

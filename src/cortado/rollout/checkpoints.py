@@ -1,10 +1,15 @@
-"""States that a run keeps on its way forward, so that another way may lead back."""
+"""States that a run keeps on its way forward, so that another way may lead back, and one that it goes on from."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from math import isqrt
 
+import numpy as np
+
+from cortado.errors import InputError
 from cortado.particles.state import State, StateSeries
+from cortado.rollout.step_sizes import StepSizes
 
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
@@ -66,3 +71,32 @@ class Checkpoints:
 
 def _itself(state: State) -> State:
     return state
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an earlier process came with the same first state, parameters and steps of a single scene. The rest of
+    the run has the same bits as if that process had not stopped."""
+
+    step: int = 0
+    """Steps that it took."""
+    state: State | None = None
+    """The state after them; None of the first one."""
+    diagnostics: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """(step,) by name, what was noted of these steps."""
+
+    def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
+        """The state to go on from, its number, and whether the run ends with it. Raises `InputError` where states shall
+        be kept for a backward pass, as those before are not known."""
+        if self.state is None:
+            return initial, 0, False
+        if keep:
+            raise InputError("keep is True, but must be False in a run that goes on from the middle.")
+        return self.state, self.step, sizes.go_on(self.step, self.state, self.diagnostics.get("time_steps"))
+
+    def whole(self, found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What was noted of all steps, given what the present process has noted, whose first steps mean nothing."""
+        if self.state is None:
+            return dict(found)
+        n = self.step
+        return {name: np.concatenate([self.diagnostics[name][:n], column[n:]]) for name, column in found.items()}

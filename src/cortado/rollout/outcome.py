@@ -1,4 +1,4 @@
-"""What to say of a run whose pressure did not converge, and of a batch that lost scenes."""
+"""What to say of a run: that its pressure did not converge, that its emitter runs dry, or that a batch lost scenes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from cortado.errors import DivergedError
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.supply import dry_sentence
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import Solve
 from cortado.words import counted
@@ -17,6 +16,8 @@ TORN = 0.015
 0.06, and without one dams at their limit to 0.04."""
 RARE = 0.05
 """Of all steps that may have more: the first has no pressure of a step before it, and splashes strike."""
+SAME = 1e-6
+"""Relative: a supply that lacks so little is enough."""
 
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
@@ -86,3 +87,22 @@ def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
     """What to say of the scenes of a batch that lost a particle."""
     first = min(lost, key=lambda b: lost[b].step)
     return f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"
+
+
+def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
+    """Of a run whose emitter gives all that it has before the end; None of others. Where steps are chosen, the end is
+    known once they are taken."""
+    emitter, spacing, clock = scene.emitter, scene.discretisation.spacing, rollout.clocks[0]
+    if emitter is None:
+        return None
+    flow_rate, size = float(np.max(rollout.parameters["flow_rate"].numpy())), float(rollout.time_steps.max())
+    end = clock.after(rollout.taken if scene.solver.chooses else rollout.steps, size).time
+    emitted = float(np.max(rollout.initial["emitted"].numpy()))
+    speed = max(emitter.speed(spacing) * flow_rate / emitter.flow_rate, 1e-30)
+    left = max(emitter.supply(spacing) * spacing - emitted, 0.0) / speed
+    if clock.time + left >= end * (1.0 - SAME):
+        return None
+    advice = f"scene.lasting({end:.4g}) has more in reserve, as has a scene with emitter.duration"
+    if emitter.duration is not None or scene.lasting(end) is scene:
+        advice = f"a longer emitter.{'length' if emitter.duration is None else 'duration'} gives it more"
+    return f"the emitter runs dry at {clock.time + left:.4g} s of a run to {end:.4g} s, as all of it is out: {advice}."

@@ -1,28 +1,37 @@
-"""Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back."""
+"""Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back; and how many steps
+a run takes with them."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from cortado.arrays import as_numbers, as_one_number, check_steps
 from cortado.device.threads import WARP
 from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
-from cortado.rollout.choosing import begin_choosing
-from cortado.rollout.first_positions import FirstPositions
-from cortado.rollout.parameter_checks import check_places, check_sizes, unstable_sentence
-from cortado.rollout.path_checks import path_sentence
-from cortado.rollout.restarts import check_state, origin_of
+from cortado.rollout.outcome import dry_sentence
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.run_checks import (
+    FirstPositions,
+    check_places,
+    check_sizes,
+    check_state,
+    origin_of,
+    path_sentence,
+    unstable_sentence,
+)
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
-from cortado.rollout.step_bounds import greatest_step
-from cortado.rollout.supply import dry_sentence
+from cortado.rollout.step_bounds import ROOM, begin_choosing, counted_steps, expected_steps, greatest_step
+from cortado.rollout.step_sizes import ChosenSteps
 from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.parameters import Role
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene_warnings import parameter_sentence
 from cortado.scene.stability import divergence_advice
 
+SAME = 1e-9
+"""Relative: a time that so little is missing of has been reached."""
 STATE_TIME = "time"
 """What the time of a state is called among derivatives with respect to its fields."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
@@ -315,3 +324,36 @@ class ParameterSpace:
     def _together(self, fields: list[Arrays]) -> Arrays:
         """The fields of the states of all scenes, given those of each or once those of all."""
         return fields[0] if self._batch is None else stacked(fields * (self._batch // len(fields)))
+
+
+def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
+    """The number of steps of a run, which has either so many or reaches a time [s] with them; where they are chosen, as
+    many as there is room for. Raises `InputError`."""
+    if steps is None and time is None:
+        raise InputError("steps is left out, but must be given where no time says how long the run is.")
+    if steps is not None and time is not None:
+        raise InputError("time is given, but must be left out, as steps says how long the run is.")
+    if time is None:
+        assert steps is not None
+        return check_steps(steps)
+    if not 0.0 < (number := as_one_number("time", time)) < np.inf:
+        raise InputError(f"time is {number:g}, but must be a number of seconds greater than 0.")
+    if not simulation.scene.solver.chooses:
+        given = values.get("time_step") if isinstance(values, Mapping) else None
+        sizes = as_numbers("parameter time_step", simulation.scene.solver.time_step if given is None else given)
+        shortest = float(sizes.min(initial=np.inf))
+        return counted_steps(time, time / shortest * (1.0 - SAME)) if 0.0 < shortest < np.inf else 1
+    if simulation.batch is not None:
+        raise InputError(
+            "time is given, but must be left out of a batch that chooses its time steps, whose scenes do not reach it "
+            "together: give steps."
+        )
+    # a row for each step has no meaning: nobody knows how many there are
+    own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
+    return ROOM * expected_steps(simulation, time, own)
+
+
+def end_after(rollout: Rollout, time: float | None) -> None:
+    """Have a rollout that chooses its steps end with the first state so much later than its first [s]."""
+    if time is not None and isinstance(rollout.step_sizes, ChosenSteps):
+        rollout.step_sizes.end_after(time * (1.0 - SAME))

@@ -8,9 +8,18 @@ a step alone decides, so that a run that goes on has the steps of one that did n
 """
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
+
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.device.reduction import sum_and_maximum
+from cortado.particles.state import State
+from cortado.solvers.projection.steps import ProjectionSteps
 
 PRESSED = 0.2
 """Of the density: a step that compresses a particle by more than this, beyond what it was before, is taken again. In
@@ -72,3 +81,95 @@ class Retaken:
         whole = [one for one in tries if np.isfinite(one.added)]
         stays = whole[0] if whole and not helped else now
         return None if stays is now else stays.size
+
+
+class Compressions:
+    """What the steps of one run add to the compression of a particle, at most."""
+
+    def __init__(self, solver: ProjectionSteps, steps: int):
+        layout, device = solver.layout, solver.device
+        self._solver, self._kernels = solver, compression_kernels(layout.precision)
+        self._each = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
+        self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
+        self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
+
+    def measure(self, state: State) -> None:
+        """Of the step that led to a state, whose number the solver has counted: launches alone."""
+        solver = self._solver
+        repaired = solver.repaired[0]
+        solver.launch(
+            self._kernels.compare,
+            particles=solver.layout.particles,
+            first_waiting=solver.system.waiting,
+            order=solver.search.order,
+            n=solver.fields["n"],
+            excess=repaired["excess"],
+            x_free=repaired["x_now"],
+            x=state.positions,
+            added=self._each,
+        )
+        solver.launch(
+            self._kernels.record,
+            greatest=self._greatest(self._each),
+            step=solver.step_number,
+            added=self._added,
+            threads=solver.layout.members,
+        )
+
+    def read(self, first: int, last: int) -> NDArray[np.float64]:
+        """(last - first, members) of the steps between two numbers, which were taken [-]."""
+        return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class CompressionKernels:
+    """They have no derivatives: a chosen step is held constant."""
+
+    compare: Any
+    """What a step adds to each particle's compression."""
+    record: Any
+    """The greatest of it in each scene."""
+
+
+@cache
+def compression_kernels(precision: Precision) -> CompressionKernels:
+    """The kernels for a precision."""
+    real, pair, vector = precision.real, precision.pair, precision.vector
+    module = kernel_module(f"compressions_{precision.name}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def compare(
+        particles: int,
+        first_waiting: int,
+        order: wp.array(dtype=wp.int32),
+        n: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
+        x_free: wp.array(dtype=vector),
+        x: wp.array(dtype=vector),
+        # out
+        added: wp.array(dtype=pair),
+    ):
+        """``added`` is a pair for a sum, which nobody reads, and a maximum, of sorted particles: (n - 1)+ as the last
+        repair finds it less the same before the step. What a nozzle leads, which is not where the step has left it and
+        may be in walls, adds nothing."""
+        i = wp.tid()
+        more = wp.max(excess[i], real(0.0)) - wp.max(n[i] - real(1.0), real(0.0))
+        p = order[i]
+        let_go = bool(True)
+        if p % particles >= first_waiting:
+            let_go = x[p] == x_free[i]
+        if not let_go:
+            more = real(0.0)
+        added[i] = pair(real(0.0), more)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def record(
+        greatest: wp.array(dtype=pair),
+        step: wp.array(dtype=wp.int32),
+        # out
+        added: wp.array2d(dtype=real),
+    ):
+        b = wp.tid()
+        added[step[b] - 1, b] = greatest[b][1]
+
+    return CompressionKernels(compare, record)

@@ -5,13 +5,14 @@ neighbour lists were long enough (if not, they grow and the chunk is repeated) a
 of steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
-from typing import Protocol
+from typing import Any, Protocol
 from weakref import WeakSet
 
 import numpy as np
+import warp as wp
 
 from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph
@@ -21,20 +22,21 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, checkpoint_interval
-from cortado.rollout.chunks import chunk_length
-from cortado.rollout.counted import require_counted
-from cortado.rollout.divergence import diverged
-from cortado.rollout.evaluation import Pending, PutAside
-from cortado.rollout.progress import Progress
+from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
 from cortado.rollout.step_sizes import FixedSteps, StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.solver import Counts, Solver, StepTangent
+from cortado.solvers.containment import Lost
+from cortado.solvers.narrows import shut_in
+from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
 OBSERVED = "a number of steps", "a state"
 """Its arguments, in words."""
+CHUNK = 64
+"""Steps between two looks of the host, at most."""
+FILLED = {"cpu": 32_000, "cuda": 16_000_000}
+"""Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
 
 
 class BackwardStep(Protocol):
@@ -55,6 +57,27 @@ class BackwardStep(Protocol):
 
     def parameters(self) -> Parameters:
         """Adjoints of the parameters, of all steps since `begin`."""
+
+
+class AdjointStep:
+    """A `BackwardStep`: the step is taken once more, and the adjoint goes through it in reverse."""
+
+    capturable = True
+
+    def __init__(self, rollout: "Rollout", adjoint: StepAdjoint):
+        self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
+        self._adjoint = adjoint
+
+    def begin(self) -> None:
+        self._adjoint.begin()
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self.solver.reserve(counts)
+        self.solver.replay(state, self._parameters, counts)
+        self._adjoint.step(counts, bar, self._parameters)
+
+    def parameters(self) -> Parameters:
+        return self._adjoint.collect()
 
 
 class Rollout(Staying):
@@ -108,7 +131,7 @@ class Rollout(Staying):
         self.evaluation = 0
         """Which first state and parameters these are: a way back belongs to one evaluation."""
         self._evaluations = count(1)
-        self.pending: WeakSet[Pending] = WeakSet()
+        self.pending: WeakSet[Residual] = WeakSet()
         """Who will come back to the present evaluation."""
         self._kept = self._run = -1
         """The evaluations that states were kept of, and that the last run was of."""
@@ -140,12 +163,6 @@ class Rollout(Staying):
             self._checkpoints = Checkpoints(self.initial, self._interval)
         self.pending.clear()
         self.progress, self.evaluation = Progress(), next(self._evaluations)
-
-    @in_turn
-    def bring_back(self, aside: PutAside) -> None:
-        """Have an evaluation again that was put aside."""
-        self.begin_evaluation()
-        aside.bring_back(self)
 
     # ---- forward -------------------------------------------------------------------------------------------------
 
@@ -319,3 +336,109 @@ class Rollout(Staying):
         self.solver.step_number.fill_(step)
         self.step_sizes.seek(step)
         return self.log.seek(step)
+
+
+OF_AN_EVALUATION = (
+    "clocks",
+    "origins",
+    "substeps",
+    "advice",
+    "lost",
+    "goes_on",
+    "evaluation",
+    "_checkpoints",
+    "_kept",
+    "_run",
+)
+"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
+
+
+class Residual:
+    """The present evaluation of a rollout, to come back to: whoever holds it may go back through its steps, also after
+    other evaluations of the same rollout.
+
+    Nothing is copied until another evaluation begins. From then on it keeps the first state and, as long as it is held,
+    the checkpoints.
+    """
+
+    def __init__(self, rollout: Rollout):
+        self.rollout = rollout
+        self._write_back: Callable[[], None] | None = None
+        """What was put aside, to the rollout."""
+        rollout.pending.add(self)
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the rollout."""
+        return self.rollout.turn
+
+    def put_aside(self) -> None:
+        """Copy what another evaluation is about to overwrite."""
+        rollout, log = self.rollout, self.rollout.solver.new_log(self.rollout.steps)
+        log.assign(rollout.log)
+        first, time_steps, sizes = rollout.initial.copy(), rollout.time_steps.copy(), rollout.step_sizes.recorded()
+        written = rollout.parameters.written.items()
+        rows = {name: wp.clone(row) if isinstance(row, wp.array) else row.copy() for name, row in written}
+        replaced = {name: getattr(rollout, name) for name in OF_AN_EVALUATION}
+
+        def write_back() -> None:
+            rollout.initial.assign(first)
+            rollout.parameters.set(rows)
+            rollout.time_steps[:] = time_steps
+            rollout.log.assign(log)
+            rollout.step_sizes.assign(sizes)
+            for name, value in replaced.items():
+                setattr(rollout, name, value)
+
+        self._write_back = write_back
+
+    @in_turn
+    def bring_back(self) -> None:
+        """Make this the rollout's present evaluation again."""
+        if self._write_back is not None:
+            write_back, self._write_back = self._write_back, None
+            self.rollout.begin_evaluation()
+            write_back()
+            self.rollout.pending.add(self)
+
+
+def chunk_length(steps: int, particles: int, device: Any) -> int:
+    """Of so many steps of so many particles, at least one."""
+    filled = FILLED["cpu" if device.is_cpu else "cuda"] // max(particles, 1)
+    return max(min(CHUNK, filled, steps), 1)
+
+
+def require_counted(solver: Solver, step: int) -> None:
+    """A solver that has taken its steps up to this one has counted each: otherwise it would take the first row of a
+    parameter over time in all of them, and notice no lost particle. Raises `InputError`."""
+    if (solver.step_number.numpy() != step).any():
+        name = type(solver).__name__
+        raise InputError(f"solver {name} has not counted its steps, but must: its step is to end with self.end_step.")
+
+
+AROUND = 6.0
+"""In spacings: how far from where a particle was before a step something may be that it was lost by."""
+
+
+def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
+    """Of one scene of a batch, given states up to the one after the step in which it lost a particle, at least two, and
+    what to try."""
+    containment, particles = solver.containment, solver.layout.particles
+    spacing, d = containment.walled.spacing, containment.walled.dimension
+    own = slice(member * particles, (member + 1) * particles)
+    first, was, after = (known[k].positions.numpy()[own, :d] for k in (0, -2, -1))
+    if not np.isfinite(was[lost.particle]).all():
+        where = "had been lost in steps before these"
+        return DivergedError(lost.step + 1, lost.particle, "begin that scene anew", where, lost.others)
+    position, places = after[lost.particle], np.concatenate([first, was])
+    if not lost.others:
+        places = places[np.linalg.norm(places - was[lost.particle], axis=1) < AROUND * spacing]
+    if narrow := shut_in(containment, member, places):
+        advice = f"{narrow}, or {advice}"
+    return DivergedError(
+        step=lost.step + 1,
+        particle=lost.particle,
+        advice=f"{advice}, or float64 for fluid that flies that far" if containment.is_imprecise(position) else advice,
+        where=containment.where(position),
+        others=lost.others,
+    )

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import DivergedError, InputError
-from cortado.rollout.durations import expected_frames
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.step_bounds import expected_frames
 from cortado.runs.frame_file import Marks
 from cortado.runs.solid_motion import solid_motions
 from cortado.runs.trajectory import Trajectory

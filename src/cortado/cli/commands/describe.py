@@ -25,9 +25,9 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of, plan
 from cortado.rollout.checkpoints import MEMORY_BUDGET
-from cortado.rollout.choosing import scheduled_bounds
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
+from cortado.rollout.step_bounds import scheduled_bounds
 from cortado.runs.recording import FrameChoice
 from cortado.scene.scene import Scene, load_scene, vector
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import frame_parts
-from cortado.rollout.durations import ROOM, steps_of_run
+from cortado.rollout.parameter_space import steps_of_run
+from cortado.rollout.step_bounds import ROOM
 from cortado.runs.pace import Pace
 from cortado.runs.recording import FrameChoice
 from cortado.scene.appearance import Picture

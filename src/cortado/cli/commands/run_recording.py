@@ -8,9 +8,8 @@ import numpy as np
 from cortado.files.terminal import track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
-from cortado.rollout.durations import done_of, ends_at_a_time
-from cortado.rollout.progress import Progress
-from cortado.rollout.rollout import Rollout
+from cortado.rollout.rollout import Progress, Rollout
+from cortado.rollout.step_bounds import done_of, ends_at_a_time
 from cortado.runs.frame_file import Marks, append_frame, frame_writer
 from cortado.runs.recording import FrameChoice
 from cortado.runs.run_folder import RunFolder

@@ -16,9 +16,8 @@ from cortado.pictures.run_pictures import run_pictures, trajectory_view
 from cortado.pictures.run_plots import density_errors, readings
 from cortado.pictures.shown_run import coloured_by
 from cortado.pictures.shown_solids import solid_outline
-from cortado.rollout.outcome import divergence_sentence, not_converged_sentence
+from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.supply import dry_sentence
 from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Pace
 from cortado.runs.run_folder import RunFolder

@@ -14,8 +14,7 @@ from cortado.optimisation.layers.functions import LOSS, PICTURE, READING, Measur
 from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, check_state, kept_or_made, named, part
 from cortado.problem import Problem
 from cortado.render import Renderer
-from cortado.rollout.device_states import DeviceState
-from cortado.rollout.host_states import Given
+from cortado.rollout.device_states import DeviceState, Given
 from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameter_values import Values
 from cortado.scene.restart import RestartState

@@ -33,8 +33,7 @@ from cortado.render import Renderer
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.residual import Residual
-from cortado.rollout.rollout import Rollout
+from cortado.rollout.rollout import Residual, Rollout
 from cortado.rollout.stepper import Stepper, StepResidual
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places

@@ -18,11 +18,9 @@ import warp as wp
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.fields import Entry
 from cortado.particles.state import State
-from cortado.rollout.device_rows import DeviceRows
-from cortado.rollout.device_states import DeviceState, DeviceStates
-from cortado.rollout.host_states import Given
+from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates, Given
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.restarts import check_clock, origin_of
+from cortado.rollout.run_checks import check_clock, origin_of
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation

@@ -1,0 +1,413 @@
+"""Whether what a run is given makes sense for its scene: parameters, first positions, paths of solids, and states to go
+on from."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.arrays import as_one_number, as_precise_numbers, is_whole
+from cortado.device.precision import Precision
+from cortado.discretise.pairs import check_apart, check_crowding, nearest
+from cortado.discretise.room import TOLERANCE, Room
+from cortado.errors import InputError, OutOfRangeError, shown
+from cortado.particles.state import State
+from cortado.rollout.scene_parameters import DENSITY, Simulated
+from cortado.rollout.step_bounds import Travel, moved_by
+from cortado.scene.checks import NEAREST
+from cortado.scene.discrete_scene import WHOLE
+from cortado.scene.model import resting_room, room_of
+from cortado.scene.motions import displacement_name, position_name, scale_name, told
+from cortado.scene.parameter_values import Arrays, Known
+from cortado.scene.parameters import Changing, Range
+from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.scene import Scene
+from cortado.scene.stability import broken_limits
+
+CROWDED = 0.5
+"""Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
+
+
+def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
+    """Numbers are no larger than the precision bears, nor smaller where they must be positive; else it raises
+    `OutOfRangeError`."""
+    for name, value in values.items():
+        size = np.abs(value)
+        if size.max(initial=0.0) > precision.greatest:
+            wanted = f"at most {precision.greatest:g} in {precision.name}"
+            raise OutOfRangeError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
+        if known[name].range is Range.POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
+            wanted = f"at least {1.0 / precision.greatest:g} in {precision.name}"
+            raise OutOfRangeError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
+
+
+def check_places(values: Arrays, scene: Scene, free: int) -> None:
+    """Fluid starts inside of the container, and the opening of the emitter stays there; raises `InputError`. Only the
+    first ``free`` particles do not wait in the emitter, where they may be outside."""
+    spacing = scene.discretisation.spacing
+    if "initial_positions" in values and scene.forces.pressure:
+        positions = values["initial_positions"]
+        for particle in outside(room_of(scene), positions[:free], spacing)[:1]:
+            place = place_in_words(positions[particle])
+            raise InputError(
+                f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
+            )
+        _check_room(positions[:free], spacing)
+    if scene.solver.chooses and np.ndim(values.get("nozzle_path", 0.0)) == 2:
+        raise InputError(
+            "parameter nozzle_path has a row for each step, but must be one place where time steps are chosen: move "
+            "the nozzle by the table [schedule], whose times do not depend on the steps."
+        )
+    if "nozzle_path" in values and scene.emitter is not None:
+        path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
+        places = (path[:, None] + opening).reshape(-1, scene.dimension)
+        for step in outside(room_of(scene), places, spacing)[:1] // len(opening):
+            raise InputError(
+                f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
+                "of the opening is inside the container."
+            )
+
+
+def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
+    """What to say of a time step beyond limits of stability under these parameters, of which the least counts that was
+    not told; None if there is nothing. All of them are told then."""
+    if scene.solver.time_step == "auto":
+        return None
+    time_step = float(values.get("time_step", scene.solver.time_step))
+    broken = [(name, limit) for name, limit in broken_limits(scene, values, time_step) if name not in told]
+    if not broken:
+        return None
+    told.update(name for name, _ in broken)
+    name, limit = broken[0]
+    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s"
+    return f"{found}, which comes from {name}."
+
+
+def _check_room(positions: np.ndarray, spacing: float) -> None:
+    """Positions (n, d) [m] are not crowded into a small part of the room that their fluid needs."""
+    room = np.prod(np.ptp(positions, axis=0) + spacing) if len(positions) else np.inf
+    needed = len(positions) * spacing ** positions.shape[-1]
+    if room < CROWDED * needed:
+        unit = "m2" if positions.shape[-1] == 2 else "m3"
+        raise InputError(
+            f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about the "
+            f"{needed:.3g} {unit} that their fluid fills."
+        )
+
+
+def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
+    """The numbers of the points (n, d) [m] that are outside of a room, along whose periods nothing is."""
+    return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
+
+
+def place_in_words(point: np.ndarray) -> str:
+    return f"({', '.join(f'{x:g}' for x in point)}) m"
+
+
+MOVED = 0.05
+"""In spacings: positions that have moved by less along every axis since they were judged are not judged again. A
+search, an ensemble or a check by differences moves them so little from one run to the next that it costs nothing."""
+
+
+class FirstPositions:
+    """Judges the first positions of the scenes of a batch, run after run."""
+
+    def __init__(self, simulation: Simulated):
+        self._simulation, self._warned = simulation, False
+        self._judged: dict[int, NDArray] = {}
+        """(n, d) [m], those of each scene that were judged last; at first they are the scene's own."""
+
+    def check(self, values: Arrays, member: int) -> str | None:
+        """What to warn of, once, where the positions among the values of a scene are crowded, None if there is nothing.
+        Raises `InputError` where two particles are at one place, or where they would burst."""
+        simulation = self._simulation
+        positions = values.get("initial_positions", simulation.positions)
+        spacing = simulation.scene.discretisation.spacing
+        former = self._judged.get(member, simulation.positions)
+        if np.abs(positions - former).max(initial=0.0) < MOVED * spacing:
+            return None
+        found = self._found(positions, spacing)
+        self._judged[member] = positions.copy()
+        if found is None or self._warned:
+            return None
+        self._warned = True
+        return found
+
+    def _found(self, positions: NDArray, spacing: float) -> str | None:
+        simulation, lattice = self._simulation, self._simulation.lattice
+        period = simulation.scene.container.periods(simulation.dimension)
+        check_apart("parameter initial_positions", positions, spacing, period)
+        free = positions[: simulation.free_particles]
+        if len(free) < 2 or not simulation.scene.forces.pressure:
+            return None
+        of_lattice = simulation.smoothing, lattice.support, lattice.volume, spacing
+        found = check_crowding("particles at initial_positions", free, *of_lattice, period)
+        least = nearest(free).min() / spacing
+        if found is None and least < NEAREST:
+            wanted = f"at least {NEAREST:g} of them"
+            found = f"particles at initial_positions are only {least:.2g} spacings apart, which should be {wanted}."
+        return found
+
+
+FURTHEST = 1.0
+"""In spacings: solids that go further in a step pass over fluid, which is in them then."""
+SCALES = (0.6, 1.5)
+"""Between which wall particles hold fluid as they should: twice as large, a disc lets it in by 0.8 spacings."""
+
+
+def path_sentence(
+    scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
+) -> str | None:
+    """One of those below, with the parameters that were given, all that steps take, and what changes by the time; None
+    if there is none."""
+    leap = leap_sentence(scene, values, courses) if scene.solver.chooses else None
+    return stretch_sentence(scene, values) or leap or jump_sentence(scene, first, run, courses)
+
+
+def leap_sentence(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> str | None:
+    """Of the first path that goes further than a spacing in the shortest step that is chosen for it; None if there is
+    none."""
+    spacing = scene.discretisation.spacing
+    for what, moved in moved_by(scene, values, courses).items():
+        travel = Travel.of(scene, values, [moved])
+        sizes = travel.at(travel.times + travel.least) - travel.lengths
+        if sizes.max() > FURTHEST * spacing * (1.0 + 1e-6):
+            time, size = travel.times[sizes.argmax()], sizes.max()
+            return (
+                f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at {time:g} s, which "
+                f"is further than a spacing, {spacing:g} m: fluid is left behind in it. Give it more time."
+            )
+    return None
+
+
+def jump_sentence(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> str | None:
+    """Of the first solid that goes further than a spacing in a step, from where a first state has it, of a batch in its
+    first scene, with the parameters of a run; None if there is none. Where steps are still to be chosen, those count
+    that are told step by step, and have no course."""
+    spacing = scene.discretisation.spacing
+    for table in told(scene.solid):
+        if scene.solver.chooses and displacement_name(table.name) in courses:
+            continue
+        position = position_name(table.name)
+        begun = first.numpy(scene.dimension, only=[position])[position].reshape(-1, scene.dimension)[:1]
+        places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        if len(steps) and steps.max() > FURTHEST * spacing * (1.0 + 1e-6):
+            number, size = int(steps.argmax()) + 1, steps.max()
+            return (
+                f"the solid {table.name!r} goes {size:.3g} m in step {number} of this run, which is further than a "
+                f"spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and a run that "
+                f"goes on from a state is given {position} as the first one was."
+            )
+    return None
+
+
+def stretch_sentence(scene: Scene, values: Arrays) -> str | None:
+    """Of the first solid whose scale, among the parameters of a run, is too far from 1 for its walls, makes it reach
+    over fluid that the scene puts beside it, or lets it fill a period no more; None if there is none."""
+    spacing, periods = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    for table in told(scene.solid):
+        scale = float(values.get(scale_name(table.name), 1.0))
+        if scale == 1.0:
+            continue
+        start = f"the solid {table.name!r} is {scale:.4g} times as large as in the scene"
+        least, most = SCALES
+        if not least <= scale <= most:
+            return f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
+        size = float(np.ptp(table.shape_about()[0].extent(), axis=0).max())
+        grown = 0.5 * size * (1.0 - scale if table.side == "inside" else scale - 1.0)
+        if grown > FURTHEST * spacing and "initial_positions" not in values:
+            return f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
+        lower, upper = table.solid().extent()
+        if ((periods > 0.0) & (upper - lower > periods * (1.0 - WHOLE))).any():
+            return f"{start}, so that it does not fill a period of the container, as it does there."
+    return None
+
+
+SAME = 1e-6
+"""Relative: two numbers that differ by less are the same, as one of them may have been rounded to float32."""
+MIXED = 0.02
+"""The same of the volume of particles among which phases have diffused, and of fractions that do not quite add up
+to 1."""
+BEYOND = 0.5
+"""How far fractions may be below 0 or above 1: diffusion leaves them a little outside."""
+CLOSE, FAR, PART = 0.7, 1.4, 0.1
+"""In spacings: the distance from a particle to the nearest other one is greater than the first for half of them, and
+less than the second for this part of them."""
+
+
+def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
+    """Of the particles of a run with these rest densities (phases,) [kg/m3]."""
+    scene, cut = simulation.scene, simulation.scene.discretisation
+    return Origin(
+        spacing=cut.spacing,
+        support=cut.support,
+        kernel=cut.kernel,
+        periods=tuple(map(float, scene.container.periods(scene.dimension)[1])),
+        waiting=len(simulation.positions) - simulation.free_particles,
+        rest_density=tuple(map(float, rest_density)),
+        solver=simulation.carried_by,
+    )
+
+
+def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
+    """The states to go on from, one for each scene; none for the scenes' own. Raises `InputError` for another number of
+    them, and for anything else."""
+    if state is None:
+        return []
+    states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
+    if len(states) != (batch or 1):
+        raise InputError(f"state has {len(states)} states, but must have {batch or 1}, one for each scene.")
+    for one in states:
+        if not isinstance(one, RestartState):
+            raise InputError(f"state is {shown(one)}, but must be a RestartState, such as trajectory.last_state.")
+    return states
+
+
+def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) -> None:
+    """Raises `InputError` where directions have parameters that are ``of_state``, which a state has instead."""
+    if given := [name for name in of_state if name in along]:
+        wanted = "but must be left out: give it among those of the state's fields"
+        raise InputError(f"direction {given[0]} is given, {wanted}.")
+
+
+def check_state(
+    state: RestartState, shapes: Mapping[str, tuple[int, ...]], origin: Origin, simulation: Simulated
+) -> None:
+    """A state to go on from is one of the simulation, whose fields have these shapes, and of these particles; raises
+    `InputError`. One that was judged before can only be of other rest densities, and that of a scene of a batch that
+    was lost has no numbers to judge."""
+    if state.origin is not None and state in simulation.judged_states:
+        _check_origin(state.origin, origin)
+        return
+    if state.fields.keys() != shapes.keys():
+        raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
+    fields = {name: _shaped(name, state[name], wanted) for name, wanted in shapes.items()}
+    check_clock(state.clock)
+    if simulation.batch is not None and all(np.isnan(array).all() for array in fields.values()):
+        return
+    for name, array in fields.items():
+        _check_numbers(name, array, simulation.precision)
+    scene, positions = simulation.scene, fields["positions"]
+    if state.origin is None:
+        _check_spacing(positions[: simulation.free_particles], simulation)
+    else:
+        _check_origin(state.origin, origin)
+    _check_fractions(fields["mass_fractions"])
+    _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
+    held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
+    free, spacing = positions[: simulation.free_particles], scene.discretisation.spacing
+    for particle in outside(resting_room(scene), free, spacing)[:1] if held else ():  # solids that move are elsewhere
+        place = place_in_words(positions[particle])
+        raise InputError(
+            f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
+        )
+    if scene.forces.pressure:
+        check_apart("state positions", positions, origin.spacing, scene.container.periods(scene.dimension))
+
+
+def _shaped(name: str, value: object, shape: tuple[int, ...]) -> NDArray:
+    array = as_precise_numbers(f"state {name}", value)
+    if array.shape != shape:
+        raise InputError(f"state {name} has shape {array.shape}, but must be {shape}.")
+    return array
+
+
+def _check_numbers(name: str, array: NDArray, precision: Precision) -> None:
+    if not np.isfinite(array).all():
+        raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
+    if (size := np.abs(array).max(initial=0.0)) > precision.greatest:
+        wanted = f"at most {precision.greatest:g} in {precision.name}"
+        raise InputError(f"state {name} has a value of size {size:g}, but must be {wanted}.")
+
+
+def check_clock(clock: Clock) -> None:
+    """A clock is one of a state; raises `InputError`."""
+    if not isinstance(clock, Clock):
+        raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as that of trajectory.last_state.")
+    if not is_whole(clock.steps) or clock.steps < 0:
+        raise InputError(f"state clock has {shown(clock.steps)} steps, but must have a whole number of at least 0.")
+    if not 0.0 <= as_one_number("state clock time", clock.time) < np.inf:
+        raise InputError(f"state clock is at {shown(clock.time)} s, but must be at a finite time of at least 0 s.")
+    if not 0.0 <= as_one_number("state clock time_step", clock.time_step) < np.inf:
+        raise InputError(f"state clock has a step of {shown(clock.time_step)} s, but must have a finite one, or 0.")
+
+
+def _check_origin(found: Origin, wanted: Origin) -> None:
+    """Both are of the same particles."""
+    for name, words in WORDS.items() if found != wanted else ():
+        one, other = getattr(found, name), getattr(wanted, name)
+        if one is not None and not _is_same(one, other):
+            raise InputError(
+                f"state is of a run with {words.format(_listed(one))}, but must be of one with "
+                f"{words.format(_listed(other))}, as this simulation has{ADVICE.get(name, '')}."
+            )
+
+
+WORDS = {
+    "spacing": "a spacing of {} m",
+    "support": "a support of {} spacings",
+    "kernel": "the kernel {}",
+    "periods": "periods of {} m",
+    "waiting": "{} particles in the emitter",
+    "rest_density": "a rest density of {} kg/m3",
+    "solver": "what {} carries from step to step",
+}
+"""What each field of an `Origin` is called."""
+ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}
+
+
+def _is_same(one: object, other: object) -> bool:
+    if isinstance(one, str) or isinstance(other, str):
+        return one == other
+    some, others = (np.asarray(value, dtype=np.float64) for value in (one, other))
+    return some.shape == others.shape and np.allclose(some, others, rtol=SAME, atol=0.0)
+
+
+def _listed(value: object) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(_listed, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _check_fractions(fractions: NDArray) -> None:
+    """The mass fractions (n, phases) of each particle are shares of one whole."""
+    beyond = np.abs(fractions - 0.5).max(axis=1) > 0.5 + BEYOND
+    bad = np.flatnonzero(beyond | (np.abs(fractions.sum(axis=1) - 1.0) > MIXED))
+    if bad.size:
+        found = f"state mass_fractions of particle {bad[0]} are {_listed(tuple(fractions[bad[0]].tolist()))}"
+        raise InputError(f"{found}, but must be from 0 to 1 and add up to 1.")
+
+
+def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
+    """The masses (n,) of particles over their volume at rest are those of fluid of these rest densities. With one phase
+    that is so of each particle, as it was at the start; phases that diffuse keep the volume of all of them."""
+    if (found <= 0.0).any():
+        raise InputError("state reference_density must be greater than 0.")
+    volumes = found * (fractions / rest_density).sum(axis=1)
+    room = MIXED if len(rest_density) > 1 else 10.0 * SAME
+    measured = np.array([volumes.mean()]) if len(rest_density) > 1 else volumes
+    between = (found > rest_density.min() * (1.0 - MIXED)) & (found < rest_density.max() * (1.0 + MIXED))
+    if (np.abs(measured - 1.0) > room).any() or not (between.all() or len(rest_density) == 1):
+        lowest, highest = found.min(), found.max()
+        values = f"{lowest:g}" if lowest == highest else f"from {lowest:g} to {highest:g}"
+        raise InputError(
+            f"state reference_density is {values} kg/m3, but must be that of fluid with a rest density of "
+            f"{_listed(tuple(rest_density))} kg/m3, as this run has{ADVICE['rest_density']}."
+        )
+
+
+def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
+    """The particles (n, d) of a state that does not say what it is of are about as far apart as those of the scene:
+    most of them no nearer, and some, which have others around them, no further."""
+    if len(positions) < 2 or not simulation.scene.forces.pressure:
+        return
+    spacing = simulation.scene.discretisation.spacing
+    found, first = (nearest(x) / spacing for x in (positions, simulation.positions[: len(positions)]))
+    usual, least = float(np.median(found)), float(np.quantile(found, PART))
+    if usual < CLOSE or least > FAR * max(float(np.quantile(first, PART)), 1.0):
+        raise InputError(
+            f"state positions are usually {usual:.2g} spacings of {spacing:g} m from the nearest other particle, but "
+            "must be about one: the state is of a run with another spacing."
+        )
