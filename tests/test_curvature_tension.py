@@ -14,6 +14,7 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.scene.stability import stability_limits
 from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.surface_tension import CurvatureTension, SurfaceTension
+from finite_differences import both_modes, central_difference, directional
 from oscillating_drops import C2, C4, CUBIC
 from reference_curvature import Curvature
 from scenes import plane
@@ -83,23 +84,19 @@ def problem_of(points, steps=2, **options):
 def test_few_particles_have_a_force_and_derivatives(name):
     """That are finite, the same in both directions, and those of differences, on one side and on the other."""
     problem, point = problem_of(FEW[name], pressure=False)
-    along = {
+    ways = {
         "initial_positions": 0.1 * np.random.default_rng(1).standard_normal(point["initial_positions"].shape),
         "surface_tension": np.array(0.1),
     }
     value, gradient = problem.value_and_gradient(point)
-    tangent = problem.tangent(point, along)
-    reverse = sum((gradient[key] * along[key]).sum() for key in along)
+    tangent = problem.tangent(point, ways)
     assert np.isfinite(value) and all(np.isfinite(each).all() for each in gradient.values())
-    size = sum(np.abs(gradient[key] * along[key]).sum() for key in along)
-    assert abs(reverse - tangent) <= 1e-12 * size
-
-    def moved(h):
-        return problem.value({key: point[key] + h * along[key] for key in along})
-
+    size = sum(np.abs(gradient[key] * ways[key]).sum() for key in ways)
+    assert abs(directional(gradient, ways) - tangent) <= 1e-12 * size
     for h in (1e-4, 1e-5, 1e-6):
         for one_side in (h, -h):
-            slope = (moved(1.5 * one_side) - moved(0.5 * one_side)) / one_side
+            middle = {key: point[key] + one_side * way for key, way in ways.items()}
+            slope = central_difference(problem.value, middle, ways, 0.5 * one_side)
             assert abs(slope - tangent) <= (30.0 * h + 1e-9) * size + 1e-9 * abs(value) / h * 1e-6
 
 
@@ -108,12 +105,12 @@ def test_few_particles_have_a_force_and_derivatives(name):
 @pytest.mark.parametrize("name", FEW)
 def test_few_particles_have_a_gradient_in_a_projection(name, precision):
     problem, point = problem_of(FEW[name], 3, precision=precision)
-    along = {key: 0.1 * np.random.default_rng(1).standard_normal(np.shape(value)) for key, value in point.items()}
+    ways = {key: 0.1 * np.random.default_rng(1).standard_normal(np.shape(value)) for key, value in point.items()}
     _, gradient = problem.value_and_gradient(point)
     assert all(np.isfinite(each).all() for each in gradient.values())
-    size = sum(np.abs(gradient[key] * along[key]).sum() for key in along)
-    reverse = sum((gradient[key] * along[key]).sum() for key in along)
-    assert abs(reverse - problem.tangent(point, along)) <= {"float64": 1e-12, "float32": 1e-4}[precision] * size
+    size = sum(np.abs(gradient[key] * ways[key]).sum() for key in ways)
+    off = abs(directional(gradient, ways) - problem.tangent(point, ways))
+    assert off <= {"float64": 1e-12, "float32": 1e-4}[precision] * size
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -142,17 +139,10 @@ def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(name, pressure
     problem, point = problem_of(points, 3, discretisation=discretisation, pressure=pressure, tension=80.0, **tables)
     random = np.random.default_rng(2)
     point["initial_velocities"] = 0.3 * random.standard_normal(points.shape)  # nothing is at a corner of the pressure
-    along = {key: 0.03 * random.standard_normal(value.shape) for key, value in point.items()}
-    _, gradient = problem.value_and_gradient(point)
-    tangent = problem.tangent(point, along)
-    assert abs(sum((gradient[key] * along[key]).sum() for key in along) - tangent) <= 1e-11 * abs(tangent)
+    ways = {key: 0.03 * random.standard_normal(value.shape) for key, value in point.items()}
+    gradient, tangent = both_modes(problem, point, ways, 1e-11)
     assert abs(gradient["surface_tension"]) > 1e-12
-
-    def slope(h):
-        more, less = ({key: point[key] + e * along[key] for key in point} for e in (h, -h))
-        return (problem.value(more) - problem.value(less)) / (2.0 * h)
-
-    errors = [abs(slope(h) - tangent) for h in (1e-4, 1e-5, 1e-6)]
+    errors = [abs(central_difference(problem.value, point, ways, h) - tangent) for h in (1e-4, 1e-5, 1e-6)]
     assert min(errors) <= 1e-6 * abs(tangent)
     if not pressure:  # a tape cannot go through the projection
         _, tape = problem.value_and_gradient(point, gradients.Tape())
@@ -165,11 +155,9 @@ def test_float32_follows_float64():
     points, found = stirred(grid(8, 8)), {}
     for precision in ("float64", "float32"):
         problem, point = problem_of(points, 5, precision=precision, tension=8.0)
-        along = {"surface_tension": np.array(1.0), "initial_positions": np.ones_like(points)}
-        gradient = problem.value_and_gradient(point)[1]
-        reverse = sum((gradient[key] * along[key]).sum() for key in along)
-        found[precision] = np.r_[gradient["surface_tension"], problem.tangent(point, along)]
-        assert abs(reverse - problem.tangent(point, along)) < 2e-4 * abs(reverse)
+        ways = {"surface_tension": np.array(1.0), "initial_positions": np.ones_like(points)}
+        gradient, tangent = both_modes(problem, point, ways, 2e-4)
+        found[precision] = np.r_[gradient["surface_tension"], tangent]
     np.testing.assert_allclose(found["float32"], found["float64"], rtol=2e-3)
 
 

@@ -12,8 +12,9 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import InputError, Problem, Simulation, gradients
+from cortado import InputError, Problem, Simulation
 from cortado.forces import Body, OverTime, Pair
+from finite_differences import all_ways_agree
 from scenes import plane, splash, two_layers
 
 ROOT = Path(__file__).parent.parent
@@ -77,17 +78,9 @@ def point_of(judged):
 def test_reverse_forward_tape_and_differences_agree(force, make):
     made = SCENES[make]
     judged = problem(FORCES[force](made().dimension), made)
-    point, random = point_of(judged), np.random.default_rng(7)
-    found, taped = (judged.value_and_gradient(point, estimator)[1] for estimator in (None, gradients.Tape()))
-    for name, value in point.items():
-        direction = random.standard_normal(np.shape(value)) * np.abs(value).max()
-        along = float(np.sum(found[name] * direction))
-        assert along != 0.0, name
-        np.testing.assert_allclose(judged.tangent(point, {name: direction}), along, rtol=1e-9, err_msg=name)
-        np.testing.assert_allclose(taped[name], found[name], rtol=1e-8, atol=1e-12 * np.abs(found[name]).max())
-        h = 1e-4 if "." in name else 1e-6 if np.ndim(value) < 2 else 1e-7
-        moved = [judged.value({**point, name: value + s * h * direction}) for s in (1.0, -1.0)]
-        np.testing.assert_allclose((moved[0] - moved[1]) / (2.0 * h), along, rtol=2e-4, atol=1e-13, err_msg=name)
+    point = point_of(judged)
+    steps = {name: 1e-4 if "." in name else 1e-6 if np.ndim(value) < 2 else 1e-7 for name, value in point.items()}
+    all_ways_agree(judged, point, 7, steps.get, rtol=2e-4, atol=1e-13)
 
 
 @pytest.mark.parametrize("force", FORCES)

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import Problem, Simulation, gradients
+from cortado import Problem, Simulation
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters import Axis
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Carried, Part
+from finite_differences import all_ways_agree, both_modes, central_difference
 from remembering_force import TAU, Memory, MemoryForce, U
 from scenes import jet, plane, two_layers
 
@@ -45,16 +46,7 @@ def test_what_it_does_is_what_it_says():
 @pytest.mark.parametrize("make", SCENES)
 def test_reverse_forward_tape_and_differences_agree(make):
     judged = problem(SCENES[make])
-    point, random = point_of(judged.simulation), np.random.default_rng(5)
-    exact, taped = (judged.value_and_gradient(point, estimator)[1] for estimator in (None, gradients.Tape()))
-    for name, value in point.items():
-        direction = random.standard_normal(np.shape(value)) * np.abs(value).max()
-        along = float(np.sum(exact[name] * direction))
-        assert along != 0.0
-        np.testing.assert_allclose(judged.tangent(point, {name: direction}), along, rtol=1e-9)
-        np.testing.assert_allclose(taped[name], exact[name], rtol=1e-8, atol=1e-12 * np.abs(exact[name]).max())
-        moved = [judged.value({**point, name: value + s * 1e-6 * direction}) for s in (1.0, -1.0)]
-        np.testing.assert_allclose((moved[0] - moved[1]) / 2e-6, along, rtol=1e-4)
+    all_ways_agree(judged, point_of(judged.simulation), 5, lambda name: 1e-6, rtol=1e-4)
 
 
 def test_a_run_that_is_cut_has_the_same_bits():
@@ -165,12 +157,11 @@ class Memories:
 
 def test_its_field_is_in_losses_and_derivatives_go_through_it():
     judged = Problem(Simulation(plane(), precision="float64", forces=[Memory()]), 12, Memories())
-    point, along = {"memory.k": 30.0, "gravity": [1.0, -9.81]}, {"memory.k": 2.0, "gravity": [0.3, 0.7]}
-    gradient, derivative = judged.value_and_gradient(point)[1], judged.tangent(point, along)
+    point = {"memory.k": 30.0, "gravity": np.array([1.0, -9.81])}
+    along = {"memory.k": 2.0, "gravity": np.array([0.3, 0.7])}
+    gradient, derivative = both_modes(judged, point, along, 1e-12)
     assert gradient["memory.k"] != 0.0
-    assert sum((gradient[name] * along[name]).sum() for name in along) == pytest.approx(derivative, rel=1e-12)
-    up, down = ({n: point[n] + s * 1e-5 * np.asarray(along[n]) for n in along} for s in (1.0, -1.0))
-    assert (judged.value(up) - judged.value(down)) / 2e-5 == pytest.approx(derivative, rel=1e-6)
+    assert central_difference(judged.value, point, along, 1e-5) == pytest.approx(derivative, rel=1e-6)
     assert cortado.certify(judged, ["memory.k", "gravity"]).right
 
 

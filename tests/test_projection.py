@@ -8,6 +8,7 @@ import pytest
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
 from cortado.errors import SceneError
 from cortado.rollout.outcome import divergence_sentence
+from finite_differences import both_modes, central_difference
 from reference_projection import Projection
 from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 
@@ -197,13 +198,9 @@ def test_derivatives_are_those_of_as_many_iterations_as_a_step_took():
     given, rng = thrown(simulation), np.random.default_rng(4)
     problem = Problem(simulation, 6, losses.CentreOfMass([0.3, 0.25]))
     ways = {name: rng.normal(size=value.shape) for name, value in given.items()}
-    _, gradient = problem.value_and_gradient(given)
+    _, tangent = both_modes(problem, given, ways)
     assert len(set(problem.diagnostics["iterations"])) > 1
-    reverse = sum((gradient[name] * way).sum() for name, way in ways.items())
-    assert problem.tangent(given, ways) == pytest.approx(reverse, rel=1e-10)
-    h = 1e-8
-    ends = [problem.value({name: value + s * h * ways[name] for name, value in given.items()}) for s in (1, -1)]
-    assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(reverse, rel=1e-5)
+    assert central_difference(problem.value, given, ways, 1e-8) == pytest.approx(tangent, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -290,10 +287,8 @@ def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(case):
         slope = problem.tangent(at, {name: along})
         scale = max(np.abs(gradient[name] * along).sum(), 1e-6 * value)
         assert abs(np.sum(gradient[name] * along) - slope) < 1e-11 * scale, name
-        errors = []
-        for step in 10.0 ** np.arange(-8.0, -2.4, 0.5):  # the clamp of a pressure may be near
-            ends = [problem.value({**at, name: at[name] + sign * step * along}) for sign in (1.0, -1.0)]
-            errors.append(abs((ends[0] - ends[1]) / (2.0 * step) - slope) / scale)
+        steps = 10.0 ** np.arange(-8.0, -2.4, 0.5)  # the clamp of a pressure may be near
+        errors = [abs(central_difference(problem.value, at, {name: along}, h) - slope) / scale for h in steps]
         assert min(errors) < 1e-6, (name, errors)
 
 
@@ -306,13 +301,10 @@ def test_fluid_that_moves_as_a_whole_resists_a_strain(precision):
     x = problem.simulation.positions
     strain = (x - x.mean(axis=0)) * [1.0, -1.0]
     strain[:, 0] += 0.3 * strain[:, 0]  # and a little that the pressure takes out
-    still = {"initial_velocities": np.tile([0.5, 0.25], (len(x), 1))}
+    still, strained = {"initial_velocities": np.tile([0.5, 0.25], (len(x), 1))}, {"initial_velocities": strain}
+    _, slope = both_modes(problem, still, strained, 1e-4 if precision == "float32" else 1e-11)
     step = 1e-7  # what is faster is corrected before the first iteration too
-    ends = [double.value({"initial_velocities": still["initial_velocities"] + h * strain}) for h in (step, -step)]
-    slope = problem.tangent(still, {"initial_velocities": strain})
-    assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.002)
-    gradient = problem.value_and_gradient(still)[1]["initial_velocities"]
-    assert np.sum(gradient * strain) == pytest.approx(slope, rel=1e-4 if precision == "float32" else 1e-11)
+    assert slope == pytest.approx(central_difference(double.value, still, strained, step), rel=0.002)
 
 
 def test_in_float32_the_gradient_is_near_that_of_float64():

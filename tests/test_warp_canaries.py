@@ -35,57 +35,86 @@ def weight(r: real) -> real:
 # ---- the adjoint of a kernel with a neighbour loop: x (n,) positions, t (n,) a field, near lists of count neighbours
 
 
-@wp.kernel
-def raw_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = s
-
-
-@wp.kernel
-def constant_times_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += t[near[i, k]] * weight(x[i] - x[near[i, k]])
-    out[i] = SCALE * s
-
-
-@wp.kernel
-def vector_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = wp.vec2d()
-    for k in range(count[i]):
-        j = near[i, k]
-        s += weight(x[i] - x[j]) * wp.vec2d(t[j], x[j])
-    out[i] = s[0] + SCALE * s[1]
-
-
-@wp.kernel
-def if_in_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
+SUM = "s += weight(x[i] - x[near[i, k]])"
+VECTOR = "weight(x[i] - x[near[i, k]]) * wp.vec2d(t[near[i, k]], x[near[i, k]])"
+LOOPS = {
+    "raw_sum": ("real(0.0)", SUM, "out[i] = s"),
+    "constant_times_sum": ("real(0.0)", "s += t[near[i, k]] * weight(x[i] - x[near[i, k]])", "out[i] = SCALE * s"),
+    "vector_sum": ("wp.vec2d()", f"s += {VECTOR}", "out[i] = s[0] + SCALE * s[1]"),
+    "if_in_loop": (
+        "real(0.0)",
+        """
         j = near[i, k]
         if x[j] > x[i]:
             s += t[j] * weight(x[i] - x[j])
         else:
-            s += weight(x[i] - x[j])
-    out[i] = s
-
-
-@wp.kernel
-def continue_before_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
+            s += weight(x[i] - x[j])""",
+        "out[i] = s",
+    ),
+    "continue_before_sum": (
+        "real(0.0)",
+        """
         j = near[i, k]
         if x[j] > x[i]:
             continue
-        s += t[j] * weight(x[i] - x[j])
-    out[i] = s
+        s += t[j] * weight(x[i] - x[j])""",
+        "out[i] = s",
+    ),
+    "square_after_loop": ("real(0.0)", SUM, "out[i] = s * s"),
+    "power_after_loop": ("real(0.0)", SUM, "out[i] = wp.pow(s, real(7.0))"),
+    "clamp_after_loop": ("real(0.0)", SUM, "out[i] = wp.max(s - CUT, real(0.0))"),
+    "quotient_after_loop": ("real(0.0)", SUM, "out[i] = t[i] / s"),
+    "factor_times_sum": ("real(0.0)\n    factor = -t[i]", SUM, "out[i] = factor * s"),
+    "second_loop": (
+        "real(0.0)",
+        SUM,
+        """total = real(0.0)
+    for k in range(count[i]):
+        total += s * t[near[i, k]]
+    out[i] = total""",
+    ),
+    "if_after_loop": ("real(0.0)", SUM, "if s > CUT:\n        out[i] = s"),
+    "continue_after_sum": (
+        "real(0.0)",
+        f"""
+        {SUM}
+        if x[near[i, k]] > x[i]:
+            continue
+        s += t[near[i, k]]""",
+        "out[i] = s",
+    ),
+    "break_after_counter": (
+        "real(0.0)\n    found = int(0)",
+        f"""
+        {SUM}
+        found += 1
+        if found == 3:
+            break""",
+        "out[i] = s",
+    ),
+    "recurrence": ("real(0.3)", "s = s * s + weight(x[i] - x[near[i, k]])", "out[i] = s"),
+    "fixed_point": ("real(0.0)", "s = wp.cos(s * x[i])", "out[i] = s"),
+    "plain_assignment": ("real(0.0)", "s = s + weight(x[i] - x[near[i, k]])", "out[i] = s"),
+    "vector_plain_assignment": ("wp.vec2d()", f"s = s + {VECTOR}", "out[i] = s[0] + SCALE * s[1]"),
+    "component_assignment": ("wp.vec2d()", "s[0] = s[0] + weight(x[i] - x[near[i, k]])", "out[i] = s[0]"),
+    "component_increment": ("wp.vec2d()", "s[0] += weight(x[i] - x[near[i, k]])", "out[i] = s[0]"),
+    "static_loop": ("real(0.0)", "s = s + weight(x[i] - x[near[i, k]])", "out[i] = t[i] * s * s"),
+}
+"""Of each kernel: what its sum s begins as, what stands in the loop over neighbours, and what stands after it."""
+
+
+def loop_kernel(name: str) -> Any:
+    begin, body, after = LOOPS[name]
+    text = f"""def {name}(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = {begin}
+    for k in range({8 if name == "static_loop" else "count[i]"}):
+        {body.lstrip()}
+    {after}
+"""
+    known = dict(globals())
+    exec(text, known)
+    return wp.Kernel(known[name], source=text)
 
 
 @wp.func
@@ -103,52 +132,6 @@ def function_returns_raw_sum(x: reals, t: reals, near: lists, count: integers, o
     out[i] = t[i] / s + wp.pow(s, real(3.0)) + wp.max(s - CUT, real(0.0))
 
 
-@wp.kernel
-def square_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = s * s
-
-
-@wp.kernel
-def power_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = wp.pow(s, real(7.0))
-
-
-@wp.kernel
-def clamp_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = wp.max(s - CUT, real(0.0))
-
-
-@wp.kernel
-def quotient_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = t[i] / s
-
-
-@wp.kernel
-def factor_times_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    factor = -t[i]
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    out[i] = factor * s
-
-
 @wp.func
 def square_of_sum(i: int, x: reals, near: lists, count: integers) -> real:
     s = real(0.0)
@@ -161,118 +144,6 @@ def square_of_sum(i: int, x: reals, near: lists, count: integers) -> real:
 def function_returns_square(x: reals, t: reals, near: lists, count: integers, out: reals):
     i = wp.tid()
     out[i] = square_of_sum(i, x, near, count)
-
-
-@wp.kernel
-def second_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    total = real(0.0)
-    for k in range(count[i]):
-        total += s * t[near[i, k]]
-    out[i] = total
-
-
-@wp.kernel
-def if_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-    if s > CUT:
-        out[i] = s
-
-
-@wp.kernel
-def continue_after_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        j = near[i, k]
-        s += weight(x[i] - x[j])
-        if x[j] > x[i]:
-            continue
-        s += t[j]
-    out[i] = s
-
-
-@wp.kernel
-def break_after_counter(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    found = int(0)
-    for k in range(count[i]):
-        s += weight(x[i] - x[near[i, k]])
-        found += 1
-        if found == 3:
-            break
-    out[i] = s
-
-
-@wp.kernel
-def recurrence(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.3)
-    for k in range(count[i]):
-        s = s * s + weight(x[i] - x[near[i, k]])
-    out[i] = s
-
-
-@wp.kernel
-def fixed_point(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for _k in range(count[i]):
-        s = wp.cos(s * x[i])
-    out[i] = s
-
-
-@wp.kernel
-def plain_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(count[i]):
-        s = s + weight(x[i] - x[near[i, k]])
-    out[i] = s
-
-
-@wp.kernel
-def vector_plain_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = wp.vec2d()
-    for k in range(count[i]):
-        j = near[i, k]
-        s = s + weight(x[i] - x[j]) * wp.vec2d(t[j], x[j])
-    out[i] = s[0] + SCALE * s[1]
-
-
-@wp.kernel
-def component_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = wp.vec2d()
-    for k in range(count[i]):
-        s[0] = s[0] + weight(x[i] - x[near[i, k]])
-    out[i] = s[0]
-
-
-@wp.kernel
-def component_increment(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = wp.vec2d()
-    for k in range(count[i]):
-        s[0] += weight(x[i] - x[near[i, k]])
-    out[i] = s[0]
-
-
-@wp.kernel
-def static_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
-    i = wp.tid()
-    s = real(0.0)
-    for k in range(8):
-        s = s + weight(x[i] - x[near[i, k]])
-    out[i] = t[i] * s * s
 
 
 # ---- arrays on the tape
@@ -342,7 +213,8 @@ Program = Callable[[Any, Any], Any]
 """From Warp arrays x, t to an output array, by launches."""
 
 
-def neighbour_program(kernel: Any) -> Program:
+def neighbour_program(name: str) -> Program:
+    kernel = loop_kernel(name) if name in LOOPS else globals()[name]
     random = np.random.default_rng(1)
     near = [random.permutation(np.delete(np.arange(N), i))[:NEIGHBOURS] for i in range(N)]
     near = wp.array(np.array(near, dtype=np.int32), dtype=wp.int32, device="cpu")
@@ -409,8 +281,8 @@ class Row:
         )
 
 
-def loops(right: bool, what: str, *kernels: Any) -> list[Row]:
-    return [Row(kernel.key.split(".")[-1], neighbour_program(kernel), what, right) for kernel in kernels]
+def loops(right: bool, what: str, *names: str) -> list[Row]:
+    return [Row(name, neighbour_program(name), what, right) for name in names]
 
 
 def in_place_product(x: Any, t: Any) -> Any:
@@ -469,38 +341,38 @@ def intermediate_without_gradient(x: Any, t: Any) -> Any:
 
 
 ROWS = [
-    *loops(True, "s += W, then out = s or constant * s", raw_sum, constant_times_sum),
+    *loops(True, "s += W, then out = s or constant * s", "raw_sum", "constant_times_sum"),
     *loops(
         True,
         "vector sum; if inside the loop; continue before any accumulation",
-        vector_sum,
-        if_in_loop,
-        continue_before_sum,
+        "vector_sum",
+        "if_in_loop",
+        "continue_before_sum",
     ),
-    *loops(True, "a wp.func returns the raw sum, the kernel uses it non-linearly", function_returns_raw_sum),
+    *loops(True, "a wp.func returns the raw sum, the kernel uses it non-linearly", "function_returns_raw_sum"),
     *loops(
         False,
         "s * s, pow(s, 7), max(s - c, 0), f / s after the loop",
-        square_after_loop,
-        power_after_loop,
-        clamp_after_loop,
-        quotient_after_loop,
+        "square_after_loop",
+        "power_after_loop",
+        "clamp_after_loop",
+        "quotient_after_loop",
     ),
-    *loops(False, "t * s after the loop with t read before it", factor_times_sum),
-    *loops(False, "sum and non-linear use in the same wp.func", function_returns_square),
-    *loops(False, "a second loop uses the first one's sum; if s > c after the loop", second_loop, if_after_loop),
+    *loops(False, "t * s after the loop with t read before it", "factor_times_sum"),
+    *loops(False, "sum and non-linear use in the same wp.func", "function_returns_square"),
+    *loops(False, "a second loop uses the first one's sum; if s > c after the loop", "second_loop", "if_after_loop"),
     *loops(
         False,
         "continue after an accumulation; break after a counter; s = s * s + W; fixed-point iteration",
-        continue_after_sum,
-        break_after_counter,
-        recurrence,
-        fixed_point,
+        "continue_after_sum",
+        "break_after_counter",
+        "recurrence",
+        "fixed_point",
     ),
-    *loops(True, "s = s + W on a scalar or a whole vector", plain_assignment, vector_plain_assignment),
-    *loops(False, "v[0] = v[0] + W on a local vector", component_assignment),
-    *loops(True, "v[0] += W on a local vector", component_increment),
-    *loops(True, "static loops, non-linear use included", static_loop),
+    *loops(True, "s = s + W on a scalar or a whole vector", "plain_assignment", "vector_plain_assignment"),
+    *loops(False, "v[0] = v[0] + W on a local vector", "component_assignment"),
+    *loops(True, "v[0] += W on a local vector", "component_increment"),
+    *loops(True, "static loops, non-linear use included", "static_loop"),
     Row("in_place_product", in_place_product, "y[i] *= a[i] in place", False),
     Row("in_place_square", in_place_square, "y[i] = y[i] * y[i] in place", False),
     Row("scratch_reused", scratch_reused, "a scratch array that a later launch overwrites", False),
@@ -517,7 +389,7 @@ def test_verdict_still_holds(row):
 
 
 def test_factor_before_the_loop_has_gradient_zero():
-    program = neighbour_program(factor_times_sum)
+    program = neighbour_program("factor_times_sum")
     np.testing.assert_array_equal(tape_gradient(program)[1], 0.0, "t * s after the loop: d/dt was exactly 0 in Warp")
     assert errors(program)[0] < 1e-7, "t * s after the loop: d/dx was right in Warp"
 

@@ -14,7 +14,7 @@ from cortado.losses import Series
 from cortado.runs.sensors.sensor import value_of
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import WaveGauge
-from finite_differences import distance
+from finite_differences import both_modes, distance
 from scenes import plane
 
 LEVEL = 0.5
@@ -174,7 +174,6 @@ def test_the_gradient_of_a_gauge_above_a_solid_that_moves():
     velocities = 0.5 * random.normal(size=simulation.velocities.shape)
     point = {"sill.position": np.array([0.203, 0.0611]), "initial_velocities": velocities}
     along = {"sill.position": np.array([1.0, 0.6]), "initial_velocities": random.normal(size=velocities.shape)}
-    derivative, gradient = problem.tangent(point, along), problem.value_and_gradient(point)[1]
-    assert sum((gradient[key] * along[key]).sum() for key in along) == pytest.approx(derivative, rel=1e-10)
+    _, derivative = both_modes(problem, point, along)
     steps = [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7]
     assert distance(problem.value, point, along, derivative, steps, enough=1e-5) < 1e-5
