@@ -12,18 +12,12 @@ import cortado
 from bad_scenes import assert_one_sentence
 from cortado import measured
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.optimisation.fitting.certainty import Products, correlation_time, independent_frames, score_covariance
 from cortado.optimisation.fitting.doubts import TOO_LARGE_IN_MOTION, still_and_moving
 from cortado.optimisation.fitting.figures import video_figures
-from cortado.optimisation.fitting.fitted import with_error
-from cortado.optimisation.fitting.noise import (
-    Products,
-    correlation_time,
-    independent_frames,
-    score_covariance,
-    whitened,
-)
-from cortado.optimisation.fitting.observation import Frames
+from cortado.optimisation.fitting.fit import with_error
+from cortado.optimisation.fitting.least_squares import Coordinates, whitened
+from cortado.optimisation.fitting.observations import Frames
 from cortado.sensors import PressureProbe, WallForce, WaveGauge
 from scenes import plane
 

@@ -8,10 +8,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from cortado.errors import DivergedError
-from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
+from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, TrialPoints, Weighting, slope_weights
 from cortado.optimisation.fitting.search import least, next_point, search
-from cortado.optimisation.fitting.trial_points import TrialPoints, slope_weights
 
 TIMES = np.linspace(0.0, 2.0, 40)
 SIZE = 0.01

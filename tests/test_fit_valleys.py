@@ -10,10 +10,8 @@ import cortado
 from bad_scenes import assert_one_sentence
 from cortado.errors import DivergedError, InputError
 from cortado.measured import Experiment
-from cortado.optimisation.fitting.bar_slopes import over_the_bars
-from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.least_squares import LeastSquares, Weighting
-from cortado.optimisation.fitting.other_starts import other_starts
+from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Weighting
+from cortado.optimisation.fitting.search import other_starts, over_the_bars
 from cortado.scene.parameters import Range
 
 TIMES = np.linspace(0.0, 2.0, 40)

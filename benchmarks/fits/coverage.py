@@ -14,10 +14,9 @@ from scipy.stats import t as student
 
 import cortado
 from cortado.arrays import whole_number
-from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.fitted import Fit
-from cortado.optimisation.fitting.least_squares import LeastSquares
-from cortado.optimisation.fitting.noise import correlation_time, independent_frames, score_covariance, whitened
+from cortado.optimisation.fitting.certainty import correlation_time, independent_frames, score_covariance
+from cortado.optimisation.fitting.fit import Fit
+from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, whitened
 
 from .cases import CASES, Case, CaseName
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import cortado
 from cortado.optimisation.fitting.figures import AGREE
-from cortado.optimisation.fitting.fitted import Fit, with_error
+from cortado.optimisation.fitting.fit import Fit, with_error
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.pictures.plots import images
 

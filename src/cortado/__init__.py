@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
     from cortado.optimisation.evaluate import evaluate as evaluate
+    from cortado.optimisation.fitting.fit import Fit as Fit
     from cortado.optimisation.fitting.fit import fit as fit
-    from cortado.optimisation.fitting.fitted import Fit as Fit
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.pictures.side_by_side import film_side_by_side as film_side_by_side
@@ -57,7 +57,7 @@ _HOMES = {
     "CortadoError": "errors",
     "CortadoWarning": "errors",
     "DivergedError": "errors",
-    "Fit": "optimisation.fitting.fitted",
+    "Fit": "optimisation.fitting.fit",
     "InputError": "errors",
     "Problem": "problem",
     "Scene": "scene.scene",

@@ -2,10 +2,7 @@
 
 from cortado.calls import face
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.observation import Direction, Observation
-from cortado.optimisation.fitting.sensor_series import SensorSeries
-from cortado.optimisation.fitting.tracks import Tracks
-from cortado.optimisation.fitting.video import Video
+from cortado.optimisation.fitting.observations import Direction, Observation, SensorSeries, Tracks, Video
 
 __all__ = ["Direction", "Experiment", "Observation", "SensorSeries", "Tracks", "Video"]
 

@@ -10,7 +10,7 @@ from typing import Any
 FUNCTIONS = {
     "export": "pictures.exports.formats",
     "film_page": "pictures.notebook",
-    "fit_page": "optimisation.fitting.fit_page",
+    "fit_page": "optimisation.fitting.figures",
     "labelled": "pictures.exports.formats",
     "result_page": "pictures.notebook",
     "simulation_film": "pictures.run_pictures",

@@ -7,8 +7,7 @@ from cortado.cli.commands.fit_report import for_machines, sections
 from cortado.errors import ComputationError
 from cortado.files.output_files import locked
 from cortado.files.terminal import announce, track
-from cortado.optimisation.fitting.fit import fit
-from cortado.optimisation.fitting.fitted import Fit, Profile
+from cortado.optimisation.fitting.fit import Fit, Profile, fit
 from cortado.optimisation.inverse.fit_task import FitTask, load_fit
 from cortado.pictures.report import write_report
 from cortado.runs.run_folder import RunFolder

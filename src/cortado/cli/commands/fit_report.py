@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
-from cortado.optimisation.fitting.fitted import NOISE_ALONE, Fit, Profile, unit_of
+from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, unit_of
 from cortado.optimisation.inverse.fit_task import FitTask
 from cortado.pictures.report import Section
 from cortado.scene.scene import scene_in_words

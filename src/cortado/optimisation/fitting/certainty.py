@@ -1,4 +1,25 @@
-"""How certain the end of a search is: the covariance of the estimate, and the weights that its residuals ask for."""
+"""How certain a least-squares estimate is whose residuals are correlated within a frame and from frame to frame.
+
+Near the estimate the residuals are r = e - J t, with the noise e (frames, m), the Jacobian J (frames, m, parameters)
+and the error t of the estimate. A count of pixels takes the m numbers of a frame for independent; as neighbouring
+pixels, and the light of a whole frame, vary together, its error bars are several times too small. Here instead
+
+1. noise fades from frame to frame by exp(-dt / T): its correlation time T is the one with which the residuals, as they
+   are left by the fit, would have the correlation between neighbouring frames that they have (`correlation_time`);
+   the frames are then `whitened` in time and fitted once more;
+2. within a frame the noise may have any covariance C, the same for every frame. The whitened residuals of all frames
+   are samples of it, so that the covariance of the score is the pooled sum
+
+       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T,
+
+   F times as many samples as the cluster-robust sum of (J_f^T r_f)(J_f^T r_f)^T has (Liang and Zeger 1986), and the
+   covariance of the estimate is N^-1 B N^-1 with N = sum_f J_f^T J_f;
+3. the residuals lack what the fit took: B is made larger by what it lacks on average, and the degrees of freedom of
+   Student's distribution are those of Satterthwaite (1946);
+4. T is estimated itself. With the correlation c from frame to frame the variance of an estimate goes like
+   (1 + c) / (1 - c), and that of c is (1 - c^2) / n of n independent numbers: to second order B is larger by the factor
+   1 + 2 / (n (1 - c)) on average.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,12 +28,152 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.errors import ComputationError
-from cortado.optimisation.fitting.fitted import FittedPart
-from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting
-from cortado.optimisation.fitting.noise import ScoreCovariance, correlation_time, independent_frames, score_covariance
+from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting, weighted
 
+MOST_TAKEN = 0.9
+"""Of the score's covariance that the fit may have taken; beyond it there are hardly more frames than parameters."""
+LONGEST = 3.0
+"""Correlation times are at most so many times as long as what was measured."""
+SHORTEST = 0.05
+"""Shorter ones, relative to the time between two frames, are none."""
 SINGULAR = 1e-10
 """Relative: where the Hessian has an eigenvalue below, a combination of parameters cannot be told."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """Sums over the numbers of a frame, of all pairs of frames."""
+
+    S: np.ndarray
+    """(F, F, p, p) J_f^T C J_g"""
+    K: np.ndarray
+    """(F, F, p, p) J_f^T J_g"""
+    gram: np.ndarray
+    """(F, F) r_f . r_g"""
+
+    @classmethod
+    def of(cls, J: np.ndarray, r: np.ndarray) -> "Products":
+        F = len(r)
+        flat = J.transpose(0, 2, 1).reshape(-1, J.shape[1])
+        scores = (flat @ r.T).reshape(F, -1, F)
+        S = np.einsum("fpk,gqk->fgpq", scores, scores, optimize=True) / F
+        K = (flat @ flat.T).reshape(F, J.shape[2], F, -1).transpose(0, 2, 1, 3)
+        return cls(S, K, r @ r.T)
+
+
+@dataclass(frozen=True)
+class ScoreCovariance:
+    """Of the score J^T e of one observation."""
+
+    B: np.ndarray
+    """(p, p)"""
+    products: Products
+    lost: float
+    """Share of B that the fit took on average."""
+    samples: float
+    """How many independent numbers a frame has."""
+    frames: float
+    """How many independent frames there are, before they are whitened."""
+
+    def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
+        """Of the variance of a combination of the parameters, by Satterthwaite, given N^-1; no more than there were
+        independent numbers to tell the correlation time from."""
+        F, a = len(self.products.gram), inverse @ direction
+        total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
+        return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
+
+
+def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: np.ndarray) -> float:
+    """T [s] of the noise, 0 where neighbouring frames are not correlated; ``inverse``: N^-1 of the fit with these
+    residuals."""
+    from scipy.optimize import brentq
+
+    products, gap = Products.of(J, r), float(np.median(np.diff(times)))
+    gram, total = products.gram, float(np.trace(products.gram))
+    if not total > 0.0:
+        return 0.0
+    taken = np.einsum("pq,khqp->hk", inverse, products.S, optimize=True)  # tr J_h N^-1 J_k^T C
+    found = float(np.diag(gram, 1).sum()) / total
+
+    def excess(logarithm: float) -> float:
+        """How much greater the correlation would be with this T than it is."""
+        R = np.exp(-np.abs(times[:, None] - times) / np.exp(logarithm))
+        V = inverse @ np.einsum("kl,klpq->pq", R, products.S, optimize=True) @ inverse
+        expected = R * total / len(r) - taken @ R - (taken @ R).T + np.einsum("pq,ghqp->hg", V, products.K)
+        return float(np.diag(expected, 1).sum() / np.trace(expected)) - found
+
+    shortest, longest = np.log(SHORTEST * gap), np.log(LONGEST * (times[-1] - times[0]))
+    if excess(shortest) >= 0.0:
+        return 0.0
+    if excess(longest) <= 0.0:
+        return float(np.exp(longest))
+    return float(np.exp(brentq(excess, shortest, longest, xtol=1e-3)))
+
+
+def independent_frames(times: np.ndarray, correlation_time: float) -> float:
+    """How many frames without correlation tell as much about a mean: F (1 - c) / (1 + c), c from frame to frame."""
+    kept = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
+    return float(len(times) * (1.0 - kept) / (1.0 + kept))
+
+
+def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
+    """Of whitened residuals (F, m) and Jacobians (F, m, p), weighted as in N, whose inverse is given; ``frames`` as
+    `independent_frames`."""
+    F, products = len(r), Products.of(J, r)
+    B = np.einsum("ffpq->pq", products.S)
+    once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
+    twice = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse @ B @ inverse, products.K, optimize=True) / F
+    taken = once + once.T - twice
+    total, spread = _moments(products.gram / F, F)
+    size, axes = np.linalg.eigh(B)
+    kept = size > 1e-14 * max(size.max(), 0.0)
+    root = axes[:, kept] * np.sqrt(size[kept])
+    relative = np.linalg.pinv(root) @ taken @ np.linalg.pinv(root).T
+    share, along = np.linalg.eigh(0.5 * (relative + relative.T))
+    share = np.clip(share, 0.0, MOST_TAKEN)
+    grown = root @ (along / (1.0 - share)) @ along.T @ root.T
+    lost, samples = float(share.mean()) if len(share) else 0.0, max(total / spread, 1.0)
+    kept = (F - frames) / (F + frames)
+    return ScoreCovariance(grown * (1.0 + 2.0 / (F * samples * (1.0 - kept))), products, lost, samples, frames)
+
+
+def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
+    """Estimates of (tr C)^2 and tr C^2 without bias, from a matrix whose trace estimates tr C and whose squared norm
+    tr C^2 of F samples; of one number per frame, and of none that varies, both are the same."""
+    trace, square = float(np.trace(gram)), float((gram**2).sum())
+    if not trace > 0.0:
+        return 1.0, 1.0
+    spread = (square - trace**2 / F) / (1.0 + 1.0 / F - 2.0 / F**2)
+    spread = max(spread, 1e-9 * trace**2)
+    return max(trace**2 - 2.0 * spread / F, spread), spread
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPart:
+    """An observation, beside what the fitted model says of it."""
+
+    part: Part
+    weighting: Weighting
+    residuals: np.ndarray
+    """(frames, m) predicted less measured, in the unit of the observation; 0 for what does not count."""
+    spread: float
+    """Root mean square of the residuals."""
+    inflation: float
+    """By how much correlation within frames makes variances larger than a count of numbers has it."""
+    samples: float
+    """Independent numbers in a frame."""
+    frames: float
+    """Independent frames."""
+
+    @property
+    def label(self) -> str:
+        """Its name, with the experiment's number where there are several."""
+        return self.part.label
+
+    @property
+    def correlation_time(self) -> float:
+        """Of the residuals [s]."""
+        return self.weighting.correlation_time
 
 
 class Fitted(Protocol):
@@ -47,13 +208,12 @@ class Certainty:
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
-        for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
-            times = part.observation.times
-            frames = independent_frames(times, weight.correlation_time)
-            white, slopes = weight.of(r, times), weight.of(J, times)
-            score = score_covariance(slopes, white, N_inverse, frames)
+        white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
+        for part, weight, r, own, J in zip(problem.parts, weights, at.residuals, white, slopes, strict=True):
+            frames = independent_frames(part.observation.times, weight.correlation_time)
+            score = score_covariance(J, own, N_inverse, frames)
             scores.append(score)
-            parts.append(FittedPart(part, weight, r, spread(r), _inflation(slopes, white), score.samples, frames))
+            parts.append(FittedPart(part, weight, r, spread(r), _inflation(J, own), score.samples, frames))
         covariance: Any = N_inverse @ sum(score.B for score in scores) @ N_inverse
         freedom = np.array([_freedom(scores, N_inverse, unit) for unit in np.eye(len(at.u))])
         return cls(N, covariance, freedom, tuple(scores), tuple(parts))
@@ -79,8 +239,7 @@ def counted_covariance(problem: Fitted, at: Linearised, weights: Sequence[Weight
 
 def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
     """N = J^T J of weighted Jacobians."""
-    each = zip(problem.parts, at.jacobians, weights, strict=True)
-    flat = (weight.of(J, part.observation.times).reshape(-1, len(at.u)) for part, J, weight in each)
+    flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 

@@ -1,13 +1,20 @@
-"""What residuals say against the model: sentences about where it is wrong, by more than the noise."""
+"""What residuals say against the model: sentences about where it is wrong, by more than the noise, and about causes.
 
+A cause is a trend, a clock that is late, another density, walls that slip: a direction in which predictions would
+change, fitted together with the parameters, with an error of its own by the same rules.
+"""
+
+import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cortado.optimisation.fitting.causes import cheap_causes
-from cortado.optimisation.fitting.certainty import Certainty
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
-from cortado.optimisation.fitting.noise import ScoreCovariance
+from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
+from cortado.optimisation.fitting.certainty import Certainty, ScoreCovariance, hessian, inverse, noise_of, spread
+from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, weighted
+from cortado.optimisation.fitting.observations import CLOCK
+from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE = 1.3
 """Residuals over the noise that was given."""
@@ -31,19 +38,26 @@ AT_BOUND = 1e-6
 """Of a coordinate, or of 1 if that is more: an estimate that is nearer to a bound is at it."""
 TOO_FAR = 3.0
 """Distance between what two halves of a record say, over its error."""
+SERIES = 4
+"""Numbers of a frame whose trends are looked at, each for itself."""
+SPARE = 3
+"""Frames more than numbers that are fitted, with which a cause is looked for."""
+MOST_KEPT = 0.6
+"""Correlation of noise from frame to frame, beyond which it is told from no trend."""
+BY_CHANCE = 1e-3
+"""Probability of an effect as large by noise alone, below which it is said."""
+LITTLE, MUCH = 0.05, 0.5
+"""Of the squares of residuals: what explains less is not said, and of residuals that are doubted already a density or a
+slip that explains less."""
 
 
 def doubts_of(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    certainty: Certainty,
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], certainty: Certainty
 ) -> tuple[str, ...]:
     """None where the residuals look like noise, and tell the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
-        times, noise = part.observation.times, part.observation.noise
-        size = float(np.sqrt((r**2).sum() / max(np.count_nonzero(r), 1)))
+        times, noise, size = part.observation.times, part.observation.noise, spread(r)
         if size <= EXACT * np.nanmax(np.abs(part.observation.measured)):
             continue
         is_exact = False
@@ -67,7 +81,8 @@ def doubts_of(
                 f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
     if not is_exact:
-        found += _halves(problem, at, weights, certainty.scores) + cheap_causes(problem, at, weights)
+        found += _halves(problem, at, weights, certainty.scores)
+        found += [*_trends(problem, at, weights), *_clocks(problem, at, weights)]
     return (*found, *_at_bounds(problem, at), *_vague(problem, at, certainty))
 
 
@@ -99,7 +114,7 @@ def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
     """Of positive numbers that may as well be many times as large."""
     coordinates = problem.coordinates
-    bars = np.where(coordinates.logarithmic[coordinates.free], np.sqrt(np.diag(certainty.covariance)), 0.0)
+    bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
     return [
         f"What was measured hardly tells {label}: one standard error is a factor of {np.exp(min(bar, GREATEST)):.2g}."
         for label, bar in zip(coordinates.labels, bars, strict=True)
@@ -108,22 +123,17 @@ def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[
 
 
 def _halves(
-    problem: LeastSquares,
-    at: Linearised,
-    weights: Sequence[Weighting],
-    scores: Sequence[ScoreCovariance],
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
 ) -> list[str]:
     """Where the first and the second half of the frames say different things: one step of Gauss and Newton for each."""
-    size = len(at.u)
-    steps, variances = [], []
+    size, steps, variances = len(at.u), [], []
+    white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
         N, s, B = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
-        for part, r, J, weight, score in zip(problem.parts, at.residuals, at.jacobians, weights, scores, strict=True):
-            times = part.observation.times
-            chosen = np.array_split(np.arange(len(times)), 2)[half]
-            slopes, white = weight.of(J, times)[chosen], weight.of(r, times)[chosen]
-            N += np.einsum("fmp,fmq->pq", slopes, slopes, optimize=True)
-            s += np.einsum("fmp,fm->p", slopes, white, optimize=True)
+        for r, J, score in zip(white, slopes, scores, strict=True):
+            chosen = np.array_split(np.arange(len(r)), 2)[half]
+            N += np.einsum("fmp,fmq->pq", J[chosen], J[chosen], optimize=True)
+            s += np.einsum("fmp,fm->p", J[chosen], r[chosen], optimize=True)
             B += score.products.S[chosen, chosen].sum(axis=0) / (1.0 - score.lost)
         if np.linalg.cond(N) > 1e10:
             return []
@@ -137,3 +147,172 @@ def _halves(
         for label, off in zip(problem.coordinates.labels, away, strict=True)
         if off > TOO_FAR
     ]
+
+
+@dataclass(frozen=True)
+class Widened:
+    """The problem with the sizes of causes besides, as `certainty` takes one."""
+
+    parts: list[Part]
+    labels: list[str]
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A cause that explains residuals by more than the noise does."""
+
+    sizes: np.ndarray
+    """(causes,)"""
+    share: float
+    """Of the sum of squares."""
+
+
+def explained(
+    problem: LeastSquares,
+    at: Linearised,
+    weights: Sequence[Weighting],
+    columns: Sequence[np.ndarray],
+    is_doubted: bool = False,
+) -> Explained | None:
+    """The size of a cause by one step of Gauss and Newton; ``columns`` (frames, m, causes) of each part, by how much
+    predictions change. None where it is within the noise, or cannot be told from the parameters. Residuals that are
+    doubted already are no noise: then how much a cause explains counts."""
+    from scipy.stats import f as fisher
+
+    count = columns[0].shape[-1]
+    wide = Widened(problem.parts, [*problem.labels, *(f"cause {k}" for k in range(count))])
+    free = len(wide.labels)
+    if sum(len(part.observation.times) for part in problem.parts) < free + SPARE:
+        return None
+    jacobians = [np.concatenate([J, c], axis=-1) for J, c in zip(at.jacobians, columns, strict=True)]
+    before = Linearised(np.zeros(free), at.residuals, jacobians)
+    try:
+        left = _step(wide, before, weights)
+        weights = noise_of(wide, left, weights)
+        left = _step(wide, before, weights)
+        found = Certainty.of(wide, left, weights)
+    except ComputationError:
+        return None
+    sizes, V = left.u[-count:], found.covariance[-count:, -count:]
+    statistic = float(sizes @ np.linalg.pinv(V) @ sizes) / count
+    least = fisher.isf(BY_CHANCE, count, found.degrees_of_freedom[-count:].min())
+    if not is_doubted and (statistic <= least or _fades_slowly(wide, weights)):
+        return None
+    share = 1.0 - problem.sum_of_squares(left.residuals, weights) / problem.sum_of_squares(before.residuals, weights)
+    return None if share < (MUCH if is_doubted else LITTLE) else Explained(sizes, share)
+
+
+def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+    """Sentences about the density and the slip of the container, which take a run, or two, of each experiment."""
+    values, found = problem.coordinates.values(at.u), list[str]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        said = None if "rest_density" in values else explained(problem, at, weights, _by_density(problem, values), True)
+        if said and abs(said.sizes[0]) < 1.0:
+            found.append(
+                f"A density {1.0 + said.sizes[0]:.3g} times as large would explain {said.share:.0%} of the squares of "
+                "the residuals: is rest_density right?"
+            )
+        said = explained(problem, at, weights, _by_slip(problem, values), True)
+        if said and said.sizes[0] > 0.0:
+            found.append(
+                f"The other slip of the container would explain {said.share:.0%} of the squares of the residuals: is "
+                "container.slip right?"
+            )
+    return found
+
+
+def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Linearised:
+    """Where the sum of squares of the linear model is least."""
+    N_inverse = inverse(wide, hessian(wide, before, weights))
+    white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
+    score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
+    u = -N_inverse @ score
+    return replace(before, u=u, residuals=[r + J @ u for r, J in zip(before.residuals, before.jacobians, strict=True)])
+
+
+def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
+    """Whether the noise of some part is so much like itself from frame to frame that it is told from no trend."""
+    gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
+    each = zip(weights, gaps, strict=True)
+    return any(one.correlation_time and np.exp(-gap / one.correlation_time) > MOST_KEPT for one, gap in each)
+
+
+def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
+    return [np.zeros((*part.observation.measured.shape, count)) for part in problem.parts]
+
+
+def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+    """Of single series: a line and a parabola in time."""
+    found = []
+    for k, part in enumerate(problem.parts):
+        times, measured = part.observation.times, part.observation.measured
+        x = 2.0 * (times - times[0]) / (times[-1] - times[0]) - 1.0
+        shapes = np.stack([x, 1.5 * x**2 - 0.5], axis=-1)
+        for number in range(measured.shape[1]) if measured.shape[1] <= SERIES else ():
+            columns, there = _nothing(problem, 2), ~np.isnan(measured[:, number])
+            columns[k][there, number] = shapes[there]
+            if said := explained(problem, at, weights, columns):
+                course = -shapes[there] @ said.sizes
+                which = f"number {number + 1} of " if measured.shape[1] > 1 else ""
+                found.append(
+                    f"The residuals of {which}{part.label} have a trend, from {course[0]:.2g} to {course[-1]:.2g} "
+                    f"{part.observation.unit}, which is {said.share:.0%} of their squares and no noise: the model is "
+                    "wrong in a way that grows or fades."
+                )
+    return found
+
+
+def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
+    """Of parts whose clock is not calibrated: by how much the predicted changes in time."""
+    found = []
+    for k, part in enumerate(problem.parts):
+        if CLOCK in part.observation.start:
+            continue
+        columns, measured = _nothing(problem, 1), part.observation.measured
+        rates = np.gradient(np.nan_to_num(measured) + at.residuals[k], part.observation.times, axis=0)
+        columns[k][..., 0] = np.where(np.isnan(measured), 0.0, rates)
+        said, times = explained(problem, at, weights, columns), part.observation.times
+        if said and abs(said.sizes[0]) < times[-1] - times[0]:
+            found.append(
+                f"Frames of {part.label} that are {said.sizes[0]:.2g} s later would explain {said.share:.0%} of the "
+                f'squares of the residuals: is its clock right? calibrate = ["{CLOCK}"] searches it.'
+            )
+    return found
+
+
+def _by_density(problem: LeastSquares, values: Arrays) -> list[np.ndarray]:
+    """By how much predictions change with the logarithm of all densities; 0 where that cannot be told."""
+    columns = _nothing(problem, 1)
+    for k, experiment in enumerate(problem.experiments):
+        own, density = problem.values_of(k, values), experiment.simulation.parameters()["rest_density"]
+        try:
+            _, slopes = experiment.linearised(own, [{"rest_density": density}])
+        except (DivergedError, InputError):
+            continue
+        problem.runs, problem.tangents = problem.runs + 1, problem.tangents + 1
+        for part, column in zip(problem.parts, columns, strict=True):
+            if part.experiment == k:
+                column[:] = np.where(np.isnan(part.observation.measured)[..., None], 0.0, slopes[part.name])
+    return columns
+
+
+def _by_slip(problem: LeastSquares, values: Arrays) -> list[np.ndarray]:
+    """By how much predictions change with the other slip of the container; 0 where there is none."""
+    columns = _nothing(problem, 1)
+    for k, one in enumerate(problem.experiments):
+        slip = getattr(one.simulation.scene.container, "slip", None)
+        if slip is None:
+            continue
+        try:
+            simulation = one.simulation.replaced(f"container.slip={'no' if slip == 'free' else 'free'}")
+            own = problem.values_of(k, values)
+            changed, now = one.simulated_by(simulation).predicted(own), one.predicted(own)
+        except (DivergedError, InputError):
+            continue
+        problem.runs += 2
+        for part, column in zip(problem.parts, columns, strict=True):
+            if part.experiment == k:
+                column[..., 0] = np.nan_to_num(changed[part.name] - now[part.name])
+                column[np.isnan(part.observation.measured)] = 0.0
+    return columns

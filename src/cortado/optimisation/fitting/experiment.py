@@ -1,7 +1,7 @@
 """An experiment: a simulation of it, and what was measured."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from cortado.arrays import as_numbers, check_steps, require_table
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.losses import FinalPositions, Snapshot
-from cortado.optimisation.fitting.observation import CLOCK, Again, Direction, Frames, Observation
+from cortado.optimisation.fitting.observations import CLOCK, Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer
@@ -115,19 +115,25 @@ class Experiment:
         wanted = self._wanted(frames)
         problem = self._problem(values, wanted)
         ends, dots = self._along(problem, wanted, values, [moved for moved in moves if moved])
-        still, found = self._still(ends), dict[str, Any]()
+        # where only an observation's own parameters change, such as those of a camera, states stay
+        still = {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
+        found = dict[str, np.ndarray]()
         along = [(one, moved, next(dots) if moved else still) for one, moved in zip(directions, moves, strict=True)]
+
+        def direction(name: str, step: int, given: Values, moved: Values, dots: Mapping[int, Arrays]) -> Direction:
+            at, dot = ends[step], dots[step]
+
+            def quantities(names: Iterable[str]) -> Arrays:
+                if not moved:
+                    return {name: np.zeros_like(at[name]) for name in names}
+                return problem.along(at, names, dot, values, moved)
+
+            return Direction(dot, moved, self._own(name, given), quantities)
+
         for name, one in self.observations.items():
             own, slopes = self._own(name, parameters), {}
             for step in frames[name].needed:
-                each = [
-                    Direction(
-                        dots[step], moved, self._own(name, direction), self._quantities(problem, ends[step], *rest)
-                    )
-                    for direction, moved, dots in along
-                    for rest in [(dots[step], values, moved)]
-                ]
-                slopes[step] = one.tangents(ends[step], own, each)
+                slopes[step] = one.tangents(ends[step], own, [direction(name, step, *each) for each in along])
             found[name] = frames[name].between(slopes)
             if CLOCK in one.start:
                 read = {step: one.value(ends[step], own) for step in frames[name].around}
@@ -185,22 +191,6 @@ class Experiment:
 
         each = zip(moves, map(observer, dots), strict=True)
         return problem.several_tangents(values, each, steps), iter(dots)
-
-    def _still(self, ends: Mapping[int, Snapshot]) -> dict[int, Arrays]:
-        """Tangents of states where only an observation's own parameters change, such as those of a camera."""
-        return {step: end.state.like().numpy(self.simulation.dimension) for step, end in ends.items()}
-
-    def _quantities(
-        self, problem: Problem, at: Snapshot, dot: Arrays, values: Values, moved: Values
-    ) -> Callable[..., Arrays]:
-        """What gives tangents of quantities of a state along its own tangent."""
-
-        def tangents(names: Iterable[str]) -> Arrays:
-            if not moved:
-                return {name: np.zeros_like(at[name]) for name in names}
-            return problem.along(at, names, dot, values, moved)
-
-        return tangents
 
     def _read(
         self, ends: Mapping[int, Snapshot], frames: Mapping[str, Frames], parameters: Values

@@ -1,12 +1,15 @@
-"""Pictures of a fit: residuals frame by frame, what was measured beside what was found, and profiles."""
+"""Pictures of a fit, and what a notebook shows of it: numbers, residuals, profiles, videos beside what was found."""
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 
 import numpy as np
 
-from cortado.optimisation.fitting.fitted import Fit, FittedPart, Profile, unit_of
-from cortado.optimisation.fitting.video import Video
+from cortado.optimisation.fitting.certainty import FittedPart
+from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, unit_of, with_error
+from cortado.optimisation.fitting.observations import Video
+from cortado.pictures.notebook import picture, table
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 from cortado.pictures.report import Figures
 
@@ -14,6 +17,7 @@ GREATEST_SERIES = 4
 """Numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
 AGREE = 0.2
 """Light of a pixel that shows that two pictures agree there: a middle grey."""
+HEAD = ("parameter", "unit", "start", "found", "95 %, from", "to")
 
 
 def residual_figure(fitted: Fit, path: Path) -> Figures:
@@ -84,3 +88,20 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
             )
             found.append((words, path))
     return found
+
+
+def fit_page(fitted: Fit) -> str:
+    """HTML of a fit."""
+    rows = [
+        (
+            one.label.replace("_", " "),
+            unit_of(one.label) or "-",
+            f"{one.start:.4g}",
+            with_error(one.value, one.error),
+            f"{one.lower:.4g}",
+            f"{one.upper:.4g}",
+        )
+        for one in fitted.numbers()
+    ]
+    words = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*fitted.cautions, NOISE_ALONE))
+    return table(HEAD, rows) + words + picture(fitted, lambda path: residual_figure(fitted, path))

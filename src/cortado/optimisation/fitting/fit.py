@@ -1,31 +1,300 @@
-"""`cortado.fit`: the parameters of measured experiments, with error bars."""
+"""`cortado.fit`: the parameters of measured experiments, with error bars, and what the residuals say."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import require_function, require_table, whole_number
+from cortado.arrays import as_numbers, as_one_number, require_function, require_table, whole_number
 from cortado.calls import public
 from cortado.errors import ComputationError, DivergedError, InputError, shown
-from cortado.optimisation.fitting.bar_slopes import over_the_bars
-from cortado.optimisation.fitting.causes import dear_causes
-from cortado.optimisation.fitting.certainty import Certainty, counted_covariance, noise_of, spread
-from cortado.optimisation.fitting.coordinates import Coordinates
-from cortado.optimisation.fitting.doubts import doubts_of
+from cortado.on_top import on_top
+from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
+from cortado.optimisation.fitting.doubts import dear_causes, doubts_of
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.fitted import Fit, Tried
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
-from cortado.optimisation.fitting.other_starts import elsewhere, misfit, other_starts, other_valleys
-from cortado.optimisation.fitting.search import least, search
+from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Linearised, Weighting
+from cortado.optimisation.fitting.search import TINY, least, misfit, other_starts, over_the_bars, search
+from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
+from cortado.words import counted
 
+ALIKE = 0.9
+"""Two numbers whose estimates are correlated by more are not told apart."""
+NOISE_ALONE = (
+    "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
+    "discretisation.spacing shows how much that is."
+)
+NEARLY = 0.01
+"""In squared standard errors: a point of a profile ends where a step lowers the sum of squares by less."""
+OF_VIEWS = {
+    "translation": "m",
+    "rotation": "rad",
+    "field_of_view": "degrees",
+    "width": "m",
+    "extinction": "1/m",
+    "start": "s",
+}
 POSITIVE = (Range.POSITIVE, Range.NOT_NEGATIVE)
 OTHERS = 3
 """Starts besides the one that was given, for a fit that ends in doubt."""
 ROUGHLY = 1e-3
 """Of the sum of squares: the search of weights ends where a step lowers it by less, relative to itself."""
+FAR = 3.0
+"""Standard errors: searches that end further apart ended in different valleys."""
+SAME = 1e-3
+"""Of a number: ends that are nearer are the same, however small the bars are."""
+NO_LESS_LIKELY = 9.0
+"""Of twice the logarithm of how much likelier one of two valleys is: three standard errors."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The best sum of squares with one number held, over its values."""
+
+    label: str
+    values: np.ndarray
+    """(points,) of the number, in its unit."""
+    deviance: np.ndarray
+    """(points,) by how much the sum of squares is larger than the least one, in squared standard errors."""
+    expected: np.ndarray
+    """(points,) the same of a model that is linear, from which the intervals come."""
+
+
+@dataclass(frozen=True)
+class FittedNumber:
+    """One of the numbers that were searched."""
+
+    label: str
+    start: float
+    value: float
+    error: float
+    """Standard error."""
+    lower: float
+    upper: float
+
+    @property
+    def words(self) -> str:
+        """Such as "viscosity 2.63 ± 0.05 Pa s"."""
+        return f"{self.label.replace('_', ' ')} {with_error(self.value, self.error)} {unit_of(self.label)}".rstrip()
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A start of a fit, and where the search from it ended."""
+
+    start: np.ndarray
+    """(free,) coordinates."""
+    end: np.ndarray
+    """(free,) coordinates."""
+    misfit: float
+    """The logarithm of the size of the residuals there, the mean over all numbers that were measured."""
+
+
+@public
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters that were fitted to experiments, with their error bars."""
+
+    coordinates: Coordinates = field(repr=False)
+    u: np.ndarray = field(repr=False)
+    """(free,) coordinates: numbers, or their logarithms."""
+    coordinate_covariance: np.ndarray = field(repr=False)
+    """(free, free) of the coordinates."""
+    naive_covariance: np.ndarray = field(repr=False)
+    """(free, free) what a count of numbers would make of it: far too small, kept for comparison."""
+    degrees_of_freedom: np.ndarray = field(repr=False)
+    """(free,) of Student's distribution."""
+    parts: tuple[FittedPart, ...] = field(repr=False)
+    """One for each observation."""
+    doubts: tuple[str, ...] = field(repr=False)
+    """Sentences about where the residuals do not look like noise, so that the model is wrong by more than the bars."""
+    converged: bool = True
+    """Whether it ended where the sum of squares is least around it, and not after the last iteration."""
+    tried: tuple[Tried, ...] = field(default=(), repr=False)
+    """The starts, and where the searches from them ended, this fit among them."""
+    runs: int = 0
+    """Forward runs, each of one experiment."""
+    tangents: int = 0
+    """Runs along a tangent, each of one experiment."""
+    refused: int = 0
+    """Points that were tried and whose runs diverged, of which the fit knows nothing."""
+    sum_of_squares: float = field(default=0.0, repr=False)
+    hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    problem: LeastSquares | None = field(default=None, repr=False)
+    at: Linearised | None = field(default=None, repr=False)
+    """The end of the search, with the Jacobian that the bars come from; neither is pickled."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "problem": None, "at": None}
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Parameters by name: arrays, or numbers."""
+        return {n: float(v) if not v.shape else v for n, v in self.coordinates.values(self.u).items()}
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the numbers that were searched, in the order of the covariance."""
+        return self.coordinates.labels
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(free, free) in the units of the parameters, of small errors."""
+        slopes = self.coordinates.slopes(self.u)
+        return self.coordinate_covariance * np.outer(slopes, slopes)
+
+    @property
+    def standard_errors(self) -> dict[str, Any]:
+        """By name, in the shape and the unit of the parameter; 0 for a number that was not searched."""
+        spread = self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0)
+        return {n: float(v) if not v.shape else v for n, v in spread.items()}
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """(free, free)"""
+        size = np.sqrt(np.diag(self.coordinate_covariance))
+        return self.coordinate_covariance / np.maximum(np.outer(size, size), 1e-300)
+
+    @property
+    def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
+        found, labels = self.correlation, self.labels
+        return tuple(
+            (labels[i], labels[j], float(found[i, j]))
+            for i in range(len(labels))
+            for j in range(i + 1, len(labels))
+            if abs(found[i, j]) > ALIKE
+        )
+
+    def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
+        """By name, the lower and the upper end of an interval that contains the true value with this probability, if
+        the model is right; positive numbers have an interval of their logarithm. Raises `InputError`."""
+        if not 0.0 < as_one_number("confidence", confidence) < 1.0:
+            raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
+        from scipy.stats import t as student
+
+        reach = student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom)
+        reach = reach * np.sqrt(np.diag(self.coordinate_covariance))
+        ends = [self.coordinates.values(self.u + way * reach) for way in (-1.0, 1.0)]
+        return {
+            n: (float(a), float(b)) if not a.shape else (a, b)
+            for (n, a), b in zip(ends[0].items(), ends[1].values(), strict=True)
+        }
+
+    def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
+        """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
+        parabola of a linear model, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
+        `InputError`."""
+        if label not in self.labels or self.problem is None or self.at is None:
+            raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
+        k, weights = self.labels.index(label), [part.weighting for part in self.parts]
+        V = self.coordinate_covariance
+        counted = np.linalg.inv(self.hessian)[k, k]
+        deviance, shifts = [], np.linspace(-reach, reach, points) * np.sqrt(V[k, k])
+        lower, upper = self.coordinates.bounds
+        for shift in shifts:
+            begun = np.clip(self.u + V[:, k] / V[k, k] * shift, lower, upper)
+            begun[k] = self.u[k] + shift
+            at = Linearised(begun, self.problem.residuals(begun), self.at.jacobians)
+            ended = search(self.problem, at, weights, 2, NEARLY / max(self.sum_of_squares, TINY), fixed=[k])
+            squares = self.problem.sum_of_squares(ended.at.residuals, weights) - ended.gain
+            deviance.append((squares - self.sum_of_squares) * counted / V[k, k])
+        values = np.array([self.coordinates.numbers(self.u + shift * np.eye(len(self.u))[k])[k] for shift in shifts])
+        return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
+
+    def log_posterior(self, u: Any) -> float:
+        """The logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it takes a
+        forward run.
+
+        The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
+        where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
+        `Fit.coordinates.values` makes parameters of coordinates. Raises `InputError`.
+
+        It is minus half of the weighted sum of squares, beyond its least. Correlated noise makes bars longer than the
+        curvature N of the sum of squares has them. Distances from the estimate are therefore shortened by the matrix W
+        with W^T N W = V^-1, the inverse of the covariance of the bars: the curvature adjustment of Ribatet, Cooley and
+        Davison (2012).
+        """
+        point = as_numbers("u", u)
+        if point.shape != self.u.shape:
+            raise InputError(f"u has shape {point.shape}, but must be {self.u.shape}, one for each fitted number.")
+        if self.problem is None:
+            raise InputError(
+                "The fit was pickled, but must have its experiments to say how likely other parameters are."
+            )
+        lower, upper = self.coordinates.bounds
+        root = np.linalg.cholesky(self.hessian)
+        wanted = np.linalg.cholesky(np.linalg.inv(self.coordinate_covariance))
+        shortened = self.u + np.linalg.solve(root.T, wanted.T @ (point - self.u))
+        if not (np.isfinite(point) & (lower <= point) & (point <= upper)).all():
+            return -np.inf
+        try:
+            residuals = self.problem.residuals(np.clip(shortened, lower, upper))
+        except DivergedError:
+            return -np.inf
+        squares = self.problem.sum_of_squares(residuals, [part.weighting for part in self.parts])
+        return -0.5 * (squares - self.sum_of_squares)
+
+    def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
+        """Those that were searched, with the intervals of `intervals`."""
+        ends = self.intervals(confidence)
+        free = self.coordinates.free
+        lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
+        values, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
+        each = zip(self.labels, self.coordinates.at_start[free], values, errors, lower, upper, strict=True)
+        return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
+
+    def lines(self, confidence: float = 0.95) -> list[str]:
+        """One for each number: its value, its standard error, and its interval."""
+        return [
+            f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
+            for one in self.numbers(confidence)
+        ]
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether it has not converged, or there are doubts."""
+        return not self.converged or bool(self.doubts)
+
+    def __repr__(self) -> str:
+        ended = ("; in doubt" if self.doubts else "") if self.converged else "; not converged"
+        return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
+
+    def _repr_html_(self) -> str:
+        """With a table of the numbers, what is doubted, and residuals over time."""
+        page: str = on_top("fit_page")(self)
+        return page
+
+    def __str__(self) -> str:
+        return "\n".join([*self.lines(), *self.cautions, NOISE_ALONE])
+
+    @property
+    def cautions(self) -> list[str]:
+        """Sentences: what is not told apart, whether it ended too early, what was refused, and the doubts."""
+        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
+        ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
+        lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
+        refused = [f"{lost}: try a smaller solver.time_step, or bounds."] if self.refused else []
+        return [*apart, *ended, *refused, *self.doubts]
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
+    if not np.isfinite(error) or error <= 0.0:
+        return f"{value:.6g} ± {error:.2g}"
+    power = int(np.floor(np.log10(error)))
+    digits = -power + (1 if error / 10.0**power < 3.55 else 0)
+    if digits >= 0 and abs(value) < 1e6 and digits <= 8:
+        return f"{value:.{digits}f} ± {error:.{digits}f}"
+    return f"{value:.{max(int(np.floor(np.log10(abs(value) or error))) + digits, 0)}e} ± {error:.1e}"
+
+
+def unit_of(label: str) -> str:
+    """Of a number, by its label; empty where it has none."""
+    name = label.partition("[")[0]
+    return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
 
 
 @public
@@ -42,7 +311,7 @@ def fit(
     Each residual is what a simulation predicts less what was measured. The search estimates the Jacobian by a forward
     run for each number; at its end forward-mode tangents give it. The first fit takes residuals as they are. Their
     scatter and correlation then weight the second one, from whose residuals the error bars come (see
-    `cortado.optimisation.fitting.noise`).
+    `cortado.optimisation.fitting.certainty`).
 
     Args:
         experiments: one `measured.Experiment`, or several that have these parameters in common.
@@ -84,7 +353,11 @@ def fit(
     found = _from(problem, coordinates.start, iterations)
     if starts != 1 and (starts is not None or found.in_doubt):
         found = _best(problem, found, iterations, starts)
-    return _with_causes(problem, found) if found.doubts else found
+    if not found.doubts:
+        return found
+    assert found.at is not None
+    causes = dear_causes(problem, found.at, [part.weighting for part in found.parts])
+    return replace(found, doubts=(*found.doubts, *causes), runs=problem.runs, tangents=problem.tangents)
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
@@ -97,13 +370,6 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
     return _fitted(problem, at, weights, converged if settled is None else settled, start)
-
-
-def _with_causes(problem: LeastSquares, found: Fit) -> Fit:
-    """With causes of its doubts that take runs to be looked at."""
-    assert found.at is not None
-    causes = dear_causes(problem, found.at, [part.weighting for part in found.parts])
-    return replace(found, doubts=(*found.doubts, *causes), runs=problem.runs, tangents=problem.tangents)
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
@@ -148,3 +414,28 @@ def _fitted(
         problem=problem,
         at=at,
     )
+
+
+def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
+    """The searches that ended in other valleys, the lowest one first."""
+    bars = np.sqrt(np.diag(found.coordinate_covariance))
+    near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
+    others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
+    return sorted(others, key=lambda one: one.misfit)
+
+
+def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
+    """A sentence about the lowest of the other valleys, if its residuals are hardly larger."""
+    others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
+    if not others:
+        return []
+    other, least = others[0], min(one.misfit for one in tried)
+    independent = sum(part.frames * part.samples for part in found.parts)
+    if 2.0 * independent * (other.misfit - least) > NO_LESS_LIKELY:
+        return []
+    k = int(np.argmax(np.abs(other.end - found.u) / np.maximum(bars, TINY)))
+    label, value = found.labels[k], found.coordinates.numbers(other.end)[k]
+    return [
+        f"Another search ended where {label} is {value:.3g}, with residuals {np.exp(other.misfit - least):.3g} times "
+        "as large: what was measured hardly tells which of both is right."
+    ]

@@ -1,19 +1,186 @@
-"""The least-squares problem of several experiments: residuals and Jacobian as functions of one vector."""
+"""The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+The vector has the numbers that a fit searches, positive ones by their logarithm. A search knows the Jacobian where it
+begins, and then, at its trial points, which only run forward, the residuals. Kriging interpolates them all (Sacks,
+Welch, Mitchell and Wynn 1989): a linear function, and noise of the covariance of Matérn with index 7/2 that goes
+through what it leaves. The slopes of the interpolant are the estimate of the Jacobian. Near points tell the slopes
+between them, far ones the curvature, as far as the residuals are smooth, which their likelihood says.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from cortado.errors import DivergedError
-from cortado.optimisation.fitting.coordinates import Coordinates
+from cortado.arrays import as_numbers, require_table
+from cortado.errors import DivergedError, InputError
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.fitting.noise import whitened
-from cortado.optimisation.fitting.observation import Observation
+from cortado.optimisation.fitting.observations import Observation
 
+MOST_NUMBERS = 100
+"""That a fit searches: each costs a run along its tangent."""
 DIFFERENCE = 0.02
 """Of the logarithm of a number, for an estimate of a derivative."""
+HARD_BY = 1e-3
+"""Of the size of the residuals: by so much they change up to the points that stand for the first Jacobian."""
+MOST = 5
+"""Points for each coefficient of a linear function, at which they become too many."""
+WIDTHS = (0.1, 1.0, 3.0)
+"""Of the covariance, from rough to smooth residuals, relative to the greatest distance between two points."""
+ROUND_OFF = 1e-12
+"""Of a variance."""
+TINY = 1e-300
+"""In the place of 0 below a fraction."""
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Numbers of parameters by name, in their order, and which of them are searched."""
+
+    names: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
+    at_start: np.ndarray
+    """(all,) [unit of the parameter]"""
+    logarithmic: np.ndarray
+    """(all,) whether a number is searched by its logarithm."""
+    lower: np.ndarray
+    """(all,)"""
+    upper: np.ndarray
+    """(all,)"""
+
+    @classmethod
+    def of(
+        cls,
+        start: Mapping[str, Any],
+        positive: Iterable[str],
+        bounds: Mapping[str, tuple[Any, Any]] | None,
+        unseen: Mapping[str, np.ndarray] | None = None,
+    ) -> "Coordinates":
+        """``positive`` parameters are searched by their logarithm where all of their numbers are above 0; numbers that
+        are ``unseen`` are not searched. Raises `InputError` for what does not fit."""
+        require_table("start", start, "{'viscosity': 0.5}")
+        values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
+        given = {} if bounds is None else bounds
+        require_table("bounds", given, "{'viscosity': (0.1, 10.0)}")
+        for name in given:
+            if name not in values:
+                raise InputError(f"bounds has {name}, but must be made of parameters that start has.")
+        by_logarithm = {name for name in positive if name in values and (values[name] > 0.0).all()}
+        ends = {name: _ends(name, values[name], given.get(name, (None, None))) for name in values}
+        for name, mask in ({} if unseen is None else unseen).items():
+            lower, upper = ends[name]
+            ends[name] = np.where(mask, values[name], lower), np.where(mask, values[name], upper)
+
+        def flat(rows: Iterable[np.ndarray]) -> np.ndarray:
+            return np.concatenate([np.ravel(row) for row in rows])
+
+        lower, upper = (flat(ends[name][k] for name in values) for k in range(2))
+        logarithmic = flat(np.full(np.shape(v), name in by_logarithm) for name, v in values.items())
+        lower = np.where(logarithmic, np.maximum(lower, 0.0), lower)
+        found = cls(
+            tuple(values), tuple(v.shape for v in values.values()), flat(values.values()), logarithmic, lower, upper
+        )
+        if not 0 < found.free.sum() <= MOST_NUMBERS:
+            raise InputError(f"start has {found.free.sum()} free numbers, but must have 1 to {MOST_NUMBERS}.")
+        return found
+
+    @property
+    def free(self) -> np.ndarray:
+        """(all,) whether a number is searched: its bounds are not the same."""
+        return self.lower < self.upper
+
+    @property
+    def by_logarithm(self) -> np.ndarray:
+        """(free,) whether a number is searched by its logarithm."""
+        return self.logarithmic[self.free]
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the free numbers: the name of the parameter, with its index where it has several numbers."""
+        every = [
+            name if not shape else f"{name}[{', '.join(map(str, index))}]"
+            for name, shape in zip(self.names, self.shapes, strict=True)
+            for index in np.ndindex(*shape)
+        ]
+        return [label for label, is_free in zip(every, self.free, strict=True) if is_free]
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the vector that is searched."""
+        with np.errstate(divide="ignore"):
+            logs = [np.where(self.logarithmic, np.log(np.maximum(e, 0.0)), e) for e in (self.lower, self.upper)]
+        return logs[0][self.free], logs[1][self.free]
+
+    @property
+    def start(self) -> np.ndarray:
+        """The vector that is searched, at the start."""
+        return self.vector(self.at_start)
+
+    def vector(self, numbers: np.ndarray) -> np.ndarray:
+        """(free,) of all numbers."""
+        chosen, is_log = numbers[self.free], self.by_logarithm
+        return np.where(is_log, np.log(np.where(is_log, chosen, 1.0)), chosen)
+
+    def numbers(self, u: np.ndarray) -> np.ndarray:
+        """(free,) numbers in the units of the parameters."""
+        with np.errstate(over="ignore"):  # an interval may have no upper end
+            return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
+
+    def slopes(self, u: np.ndarray) -> np.ndarray:
+        """(free,) the derivative of each number with respect to its coordinate."""
+        return np.where(self.by_logarithm, self.numbers(u), 1.0)
+
+    def values(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """Parameters by name."""
+        whole = self.at_start.copy()
+        whole[self.free] = self.numbers(u)
+        return self.named(whole)
+
+    def named(self, whole: np.ndarray) -> dict[str, np.ndarray]:
+        """(all,) numbers as arrays by name."""
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
+        return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
+
+    def directions(self, u: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """The direction of the parameters along each coordinate, only with the parameter that it moves."""
+        found, slopes = [], self.slopes(u)
+        for k, place in enumerate(np.flatnonzero(self.free)):
+            whole = np.zeros(len(self.at_start))
+            whole[place] = slopes[k]
+            found.append({name: value for name, value in self.named(whole).items() if value.any()})
+        return found
+
+    def spread(self, free: np.ndarray, otherwise: float) -> dict[str, np.ndarray]:
+        """(free,) numbers as arrays by name, in which fixed numbers are ``otherwise``."""
+        whole = np.full(len(self.at_start), otherwise)
+        whole[self.free] = free
+        return self.named(whole)
+
+
+def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bound, each of the parameter's shape."""
+    if len(pair) != 2:
+        raise InputError(f"bounds of {name} must be a pair, the lower and the upper one.")
+    try:
+        lower, upper = (
+            np.broadcast_to(way * np.inf if end is None else as_numbers(f"a bound of {name}", end), value.shape)
+            for way, end in zip((-1.0, 1.0), pair, strict=True)
+        )
+    except ValueError:
+        raise InputError(f"bounds of {name} must be numbers, or have its shape, {value.shape}.") from None
+    if not ((lower <= value) & (value <= upper)).all():
+        raise InputError(f"start of {name} is {value.tolist()}, but must be within its bounds.")
+    return lower, upper
+
+
+def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
+    """(frames, ...) what is new in each frame, with the same standard deviation."""
+    if not correlation_time:
+        return values
+    kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
+    return np.concatenate([values[:1], (values[1:] - kept * values[:-1]) / np.sqrt(1.0 - kept**2)])
 
 
 @dataclass(frozen=True)
@@ -52,8 +219,14 @@ class Linearised:
     """Of each part, (frames, m, free)."""
 
 
+def weighted(parts: Sequence[Part], weights: Sequence[Weighting], values: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """(frames, ...) of each part, as its weighting has them."""
+    each = zip(parts, weights, values, strict=True)
+    return [weight.of(own, part.observation.times) for part, weight, own in each]
+
+
 class LeastSquares:
-    """Counts what it costs."""
+    """The problem as a search sees it, which counts what it costs."""
 
     def __init__(
         self,
@@ -95,7 +268,7 @@ class LeastSquares:
     def estimated(self, u: np.ndarray) -> Linearised:
         """At a point, with derivatives of positive numbers by differences: a forward run costs less than one along a
         tangent, and this is enough to search. Raises `DivergedError`."""
-        positive = self.coordinates.logarithmic[self.coordinates.free]
+        positive = self.coordinates.by_logarithm
         at = self._along(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
         for k in np.flatnonzero(positive):
@@ -116,10 +289,8 @@ class LeastSquares:
         for k, experiment in enumerate(self.experiments):
             own = {number: self.values_of(k, direction) for number, direction in directions.items()}
             run = [number for number, one in own.items() if one]
-            self.runs += 1
-            self.tangents += len(run)
-            at = self.values_of(k, values)
-            along = [own[number] for number in run]
+            self.runs, self.tangents = self.runs + 1, self.tangents + len(run)
+            at, along = self.values_of(k, values), [own[number] for number in run]
             with self._counting():
                 predicted, slopes = experiment.linearised(at, along) if run else (experiment.predicted(at), {})
             for part in self.parts:
@@ -133,15 +304,12 @@ class LeastSquares:
 
     def stacked(self, at: Linearised, weights: Sequence[Weighting]) -> tuple[np.ndarray, np.ndarray]:
         """The Jacobian (numbers, free) and the residuals (numbers,) of all parts, weighted."""
-        times = [part.observation.times for part in self.parts]
-        J = [w.of(J, t).reshape(-1, len(at.u)) for w, J, t in zip(weights, at.jacobians, times, strict=True)]
-        r = [w.of(r, t).ravel() for w, r, t in zip(weights, at.residuals, times, strict=True)]
-        return np.concatenate(J), np.concatenate(r)
+        J = [own.reshape(-1, len(at.u)) for own in weighted(self.parts, weights, at.jacobians)]
+        return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
     def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
         """Of weighted residuals."""
-        each = zip(self.parts, residuals, weights, strict=True)
-        return float(sum((weight.of(r, part.observation.times) ** 2).sum() for part, r, weight in each))
+        return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
     @contextmanager
     def _counting(self) -> Iterator[None]:
@@ -159,3 +327,79 @@ class LeastSquares:
 
     def _residual(self, part: Part, predicted: np.ndarray) -> np.ndarray:
         return np.nan_to_num(predicted - part.observation.measured, nan=0.0)
+
+
+class TrialPoints:
+    """Points with their residuals, in coordinates in which the first Jacobian is orthonormal: it knows no units."""
+
+    def __init__(self, problem: LeastSquares, weights: Sequence[Weighting], at: Linearised):
+        J, r = problem.stacked(at, weights)
+        self._metric = np.asarray(np.linalg.qr(J, mode="r"))
+        self._scales = [weight.scale for weight in weights]
+        self._points, self._residuals = [at.u], [at.residuals]
+        changes = HARD_BY * np.linalg.norm(r) / np.maximum(np.linalg.norm(J, axis=0), TINY)
+        for k, change in enumerate(changes):
+            moved = [r + change * J[..., k] for r, J in zip(at.residuals, at.jacobians, strict=True)]
+            self.add(at.u + change * np.eye(len(at.u))[k], moved)
+
+    def add(self, u: np.ndarray, residuals: list[np.ndarray]) -> int:
+        """A point that was run; returns its number."""
+        self._points.append(u)
+        self._residuals.append(residuals)
+        return len(self._points) - 1
+
+    @property
+    def are_many(self) -> bool:
+        """Whether to begin anew from the lowest, before they take too much memory."""
+        return len(self._points) >= MOST * (len(self._points[0]) + 1)
+
+    def linearised(self, number: int) -> Linearised:
+        """At one of the points."""
+        x = np.array(self._points) @ self._metric.T
+        parts = [np.array(part) for part in zip(*self._residuals, strict=True)]
+        flat = [part.reshape(len(x), -1) / scale for part, scale in zip(parts, self._scales, strict=True)]
+        products = np.sum([part @ part.T for part in flat], axis=0)
+        weights = self._metric.T @ slope_weights(x, products, number)
+        jacobians = [np.tensordot(part, weights, (0, 1)) for part in parts]
+        return Linearised(self._points[number], self._residuals[number], jacobians)
+
+
+def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
+    """(d, points) weights of the values at points ``x`` (points, d), whose sums are the slopes at one of the points of
+    what interpolates them. ``products`` (points, points) of the values at two points, summed over all residuals."""
+    from scipy.spatial.distance import cdist
+
+    points, d = x.shape
+    size = max(float(cdist(x, x).max()), TINY)
+    x = (x - x[number]) / size
+    linear, apart = np.column_stack([np.ones(points), x]), cdist(x, x)
+    width = _most_likely_width(apart, linear, products)
+    system = np.block([[_covariance(apart / width), linear], [linear.T, np.zeros((d + 1, d + 1))]])
+    near = apart[:, [number]] / width
+    of_noise = (3.0 + 3.0 * near + near**2) * np.exp(-near) / 15.0 * x / width**2
+    slopes = np.vstack([of_noise, np.zeros(d), np.eye(d)])
+    return np.asarray(np.linalg.lstsq(system, slopes)[0][:points].T / size)
+
+
+def _covariance(apart: np.ndarray) -> np.ndarray:
+    """Of the noise at points that are so many widths apart."""
+    smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
+    return smooth + ROUND_OFF * np.eye(len(apart))
+
+
+def _most_likely_width(apart: np.ndarray, linear: np.ndarray, products: np.ndarray) -> float:
+    """That with the greatest likelihood of the contrasts that no linear function changes; a single one tells none."""
+    from scipy.linalg import null_space
+
+    contrasts = null_space(linear.T)
+    count = contrasts.shape[1]
+    if count < 2:
+        return 1.0
+    found = contrasts.T @ products @ contrasts
+
+    def deviance(width: float) -> float:
+        K = contrasts.T @ _covariance(apart / width) @ contrasts
+        variance = float(np.trace(np.linalg.solve(K, found)))
+        return count * np.log(max(variance, TINY)) + float(np.linalg.slogdet(K)[1])
+
+    return min(WIDTHS, key=deviance)

@@ -1,14 +1,22 @@
-"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs tell."""
+"""The search for the least sum of squares, in few runs: Gauss and Newton's steps, with a Jacobian that runs tell.
+
+What particles predict is a rough function of a parameter: the height of a surface moves in small jumps, as particles
+pass each other. Its derivative at a point may be many times as steep as what a change by a standard error does, and
+bars from it are as many times too small. So at the end of a search a forward run for each number looks two standard
+errors away (`over_the_bars`). Where that is not what the tangents say, differences over the width of the bars replace
+them, until the bars that follow are those that the differences were taken over.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weighting
-from cortado.optimisation.fitting.trial_points import TINY, TrialPoints
+from cortado.optimisation.fitting.certainty import Certainty, spread
+from cortado.optimisation.fitting.least_squares import TINY, LeastSquares, Linearised, TrialPoints, Weighting
 
 NEAR = 1e-6
 """A search ends, too, where a step is shorter than this, relative to the size of the coordinates."""
@@ -21,7 +29,6 @@ POOR, GOOD = 0.25, 0.75
 gains more, half as much."""
 MOST_FAILURES = 3
 """Trial points in succession that are no lower: then the Jacobian is estimated anew, and after as many more it ends."""
-
 NEARBY = 9.0
 """In squared standard errors: where a step is predicted to lower the sum of squares by less, tangents are taken."""
 ENOUGH = 0.01
@@ -32,6 +39,26 @@ ONE_BAR = 1.0
 """The same of the way from where tangents were taken to the end: if it is longer, they are taken again."""
 MOST_JACOBIANS = 4
 """By tangents."""
+REACH = 2.0
+"""Standard errors, to about the ends of intervals of 95 %: how far away it looks."""
+STRAIGHT = 0.3
+"""Of what tangents say of the change up to there: by so much it may be off."""
+ROUNDING = 1e-5
+"""Of the largest number measured: bars that change what is predicted by less are not looked at."""
+MOST_ROUNDS = 8
+"""Of differences, each over the bars of the one before."""
+SETTLED = 0.3
+"""Of that distance: a round that moves the estimate by less, and changes no bar by more of itself, is the last."""
+LEAST_SHARE = 0.1
+"""Of that distance: nearer points, as at a bound, tell no difference."""
+ROUND_OFF = 1e-12
+"""Of a variance."""
+RANGE = np.log(100.0)
+"""To both sides of the start, of positive numbers that have no bounds: two decades."""
+POINTS, MOST_POINTS = 8, 64
+"""That are looked at: for each number, and in all."""
+APART = 0.2
+"""Of the range of some number: by less no two starts differ."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +108,7 @@ def search(
     to lower it by a share of at most ``enough``, with the coordinates of some numbers ``fixed``.
 
     A trial point takes one forward run, also one that is no lower, and the Jacobian follows from all of them, see
-    `trial_points`. After one that is no lower, or where the run diverges, steps are damped (Levenberg 1944, Marquardt
+    `TrialPoints`. After one that is no lower, or where the run diverges, steps are damped (Levenberg 1944, Marquardt
     1963); after several the Jacobian is estimated anew.
     """
     points, base = TrialPoints(problem, weights, at), 0
@@ -133,10 +160,133 @@ def next_point(
     reduced: Any = np.linalg.qr(np.column_stack([J[:, free], r]), mode="r")
     R, q = reduced[:, :-1], reduced[:, -1]
     damped = np.vstack([R, np.diag(np.sqrt(damping) * np.linalg.norm(R, axis=0))])
-    reach = np.where(problem.coordinates.logarithmic[problem.coordinates.free], GREATEST_LOGARITHM, np.inf)
+    reach = np.where(problem.coordinates.by_logarithm, GREATEST_LOGARITHM, np.inf)
     lower, upper = problem.coordinates.bounds
     ends = np.maximum(lower - at.u, -reach)[free], np.minimum(upper - at.u, reach)[free]
     shift = lsq_linear(damped, np.append(-q, np.zeros(len(free))), ends, method="bvls").x
     point = at.u.copy()
     point[free] = np.clip(at.u[free] + shift, lower[free], upper[free])
     return point, float((q**2).sum() - ((R @ shift + q) ** 2).sum())
+
+
+def over_the_bars(
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
+) -> tuple[Linearised, bool | None]:
+    """The end of a search with slopes that hold over the width of the bars, and whether they settled; None where the
+    tangents do hold."""
+    axes = _axes(problem, at, weights)
+    if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
+        return at, None
+    at = Linearised(at.u, problem.residuals(at.u), at.jacobians)  # the end of a search was not run
+    for _ in range(MOST_ROUNDS):
+        at, tried = _differences(problem, at, weights, axes)
+        point, _ = next_point(problem, at, weights)
+        tried = [at, *tried, *_moved(problem, at, point - at.u)]
+        ended = min(tried, key=lambda one: problem.sum_of_squares(one.residuals, weights))
+        wider = _axes(problem, ended, weights)
+        moved = np.abs(np.linalg.solve(wider, ended.u - at.u)).max()
+        grown = np.linalg.norm(wider, axis=0) / np.linalg.norm(axes, axis=0) - 1.0
+        at, axes = ended, np.where(grown < 0.0, 0.5 * (axes + wider), wider)  # else they alternate
+        if max(moved, np.abs(grown).max()) <= SETTLED:
+            return at, True
+    return at, False
+
+
+def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
+    """(free, free) columns of independent moves by so many standard errors, none longer than a step of a search."""
+    covariance = Certainty.of(problem, at, weights).covariance
+    axes = REACH * np.linalg.cholesky(covariance + (ROUND_OFF * np.trace(covariance) + TINY) * np.eye(len(covariance)))
+    logarithmic = problem.coordinates.by_logarithm
+    longest = np.abs(axes[logarithmic]).max(axis=0, initial=TINY)
+    return np.asarray(axes * np.minimum(1.0, GREATEST_LOGARITHM / longest))
+
+
+def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
+    """Whether at the end of an axis it is as the tangents say, on the side to which the search did not get."""
+    each = zip(problem.parts, at.jacobians, strict=True)
+    if all(np.abs(J @ axis).max() <= ROUNDING * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
+        return True
+    J, r = problem.stacked(at, weights)
+    onwards = -1.0 if (problem.coordinates.start - at.u) @ axis > 0.0 else 1.0
+    for way in (onwards, -onwards):
+        for one in _moved(problem, at, way * axis):
+            said = J @ (one.u - at.u)
+            off = problem.stacked(one, weights)[1] - r - said
+            return bool(np.linalg.norm(off) <= STRAIGHT * np.linalg.norm(said))
+    return True
+
+
+def _differences(
+    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
+) -> tuple[Linearised, list[Linearised]]:
+    """The same point with differences along the axes as its Jacobian, and the points that were run for them.
+
+    Of the differences to both sides and of that across the one in which least changes is taken: the point itself may
+    lie on a kink, or in a hole that is far narrower than the bars."""
+    tried, columns = list[Linearised](), list[list[np.ndarray]]()
+    for axis in axes.T:
+        ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
+        pairs = [(a, b, float((b.u - a.u) @ axis / (axis @ axis))) for a, b in combinations([at, *ends], 2)]
+        slopes = [  # by two points that are a share of the axis apart what changes along all of it, of each part
+            [(after - before) / share for before, after in zip(a.residuals, b.residuals, strict=True)]
+            for a, b, share in pairs
+            if abs(share) > LEAST_SHARE
+        ]
+        slopes = slopes or [[J @ axis for J in at.jacobians]]
+        columns.append(min(slopes, key=lambda one: problem.sum_of_squares(one, weights)))
+        tried += ends
+    inverse = np.linalg.inv(axes)
+    jacobians = [np.stack(part, axis=-1) @ inverse for part in zip(*columns, strict=True)]
+    return Linearised(at.u, at.residuals, jacobians), tried
+
+
+def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
+    """The point that is so far away, within the bounds, with the Jacobian of this one; none where its run diverges."""
+    point = np.clip(at.u + shift, *problem.coordinates.bounds)
+    try:
+        return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
+    except DivergedError:
+        return []
+
+
+def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
+    """The logarithm of the size of the residuals, the mean over all numbers that were measured: of Gaussian noise whose
+    size is not known, the least is the likeliest."""
+    counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
+    return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
+
+
+def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
+    """At most so many points (free,), that which explains best what was measured first: of a Sobol sequence over the
+    bounds, and over two decades to both sides of positive numbers without bounds. All other numbers are those of the
+    start."""
+    start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds
+    reach = np.where(problem.coordinates.by_logarithm, RANGE, 0.0)
+    lower, upper = (
+        np.where(np.isfinite(lower), lower, start - reach),
+        np.where(np.isfinite(upper), upper, start + reach),
+    )
+    found, chosen = [], list[np.ndarray]()
+    for point in lower + (upper - lower) * _sequence(upper > lower):
+        try:
+            found.append((misfit(problem, problem.residuals(point)), point))
+        except DivergedError:
+            continue
+    for _, point in sorted(found, key=lambda one: one[0]):
+        away = [np.abs(point - one) / np.maximum(upper - lower, TINY) for one in chosen]
+        if len(chosen) < count and all(one.max() > APART for one in away):
+            chosen.append(point)
+    return chosen
+
+
+def _sequence(searched: np.ndarray) -> np.ndarray:
+    """(points, free) from 0 to 1, each number of those that are searched evenly."""
+    from scipy.stats import qmc
+
+    dimensions = int(searched.sum())
+    if not dimensions:
+        return np.zeros((0, len(searched)))
+    power = int(np.ceil(np.log2(min(POINTS * dimensions, MOST_POINTS))))
+    points = np.zeros((2**power, len(searched)))
+    points[:, searched] = qmc.Sobol(dimensions, scramble=False).random_base2(power) + 0.5 ** (power + 1)
+    return points

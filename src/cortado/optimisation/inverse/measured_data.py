@@ -7,10 +7,7 @@ import numpy as np
 
 from cortado.errors import InputError
 from cortado.files.input_files import read_columns
-from cortado.optimisation.fitting.observation import Observation
-from cortado.optimisation.fitting.sensor_series import SensorSeries
-from cortado.optimisation.fitting.tracks import Tracks
-from cortado.optimisation.fitting.video import Video
+from cortado.optimisation.fitting.observations import Observation, SensorSeries, Tracks, Video
 from cortado.optimisation.inverse.measured_tables import MeasuredTable, SensorSeriesTable, TracksTable, VideoTable
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping
 from cortado.runs.sensors.placement import sensors_of

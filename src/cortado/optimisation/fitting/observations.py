@@ -1,0 +1,344 @@
+"""What was measured of an experiment, and what a simulation says of the same: videos, series of sensors, and tracks."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
+from cortado.device.threads import WARP
+from cortado.discretise.pairs import wrapped
+from cortado.errors import InputError, shown
+from cortado.fixed import fixed
+from cortado.losses import Snapshot
+from cortado.render import Renderer
+from cortado.render.calibration import Calibration
+from cortado.runs.sensors.sensor import Sensor, Weights, checked_sensor, value_of
+from cortado.scene.parameter_values import Arrays
+from cortado.simulation import Simulation
+
+CLOCK = "start"
+"""The parameter of an observation that says when its frames are."""
+LEAST_FRAMES = 4
+"""Of an observation: the scatter from frame to frame is what error bars are made of."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A direction of a derivative, as an observation of one state sees it."""
+
+    fields: Arrays
+    """The tangent of the state, by fields: vectors (n, d), fractions (n, phases)."""
+    parameters: Mapping[str, np.ndarray]
+    """The direction of the parameters of the simulation, by name."""
+    own: Mapping[str, np.ndarray]
+    """The direction of the observation's own parameters, by name."""
+    quantities: Callable[[Iterable[str]], Arrays]
+    """The tangents of quantities of the particles, by name."""
+
+
+class Observation(Protocol):
+    """Numbers that were measured at several times, which are called frames, and how a state predicts them."""
+
+    times: np.ndarray
+    """(frames,) [s] after the start of the run, rising."""
+    measured: np.ndarray
+    """(frames, m); NaN for a number that does not count."""
+    noise: float | None
+    """Standard deviation of a number, as far as it is known; None where the residuals shall tell."""
+    unit: str
+    """Of the numbers."""
+
+    @property
+    def start(self) -> Mapping[str, np.ndarray]:
+        """Its own parameters, such as those of a camera, as the fit starts. One that is called "start" is a clock [s]:
+        frames are later by as much as it grows, which an `Experiment` sees to."""
+
+    def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(m,) what a state predicts, given values of its own parameters."""
+
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        """(m, directions) the derivatives of `value` along directions."""
+
+
+class Again:
+    """An observation with other numbers measured."""
+
+    def __init__(self, observation: Observation, measured: np.ndarray):
+        _, values, _ = checked(observation.times, measured, observation.noise)
+        if values.shape != observation.measured.shape:
+            raise InputError(f"measured has shape {values.shape}, but must be {observation.measured.shape}.")
+        self._observation, self.measured = observation, values
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_observation":  # while it is unpickled
+            raise AttributeError(name)
+        return getattr(self._observation, name)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where the frames of an observation are between the steps of a run: in between two states what they predict is
+    interpolated linearly."""
+
+    steps: np.ndarray
+    """(frames,) number of steps before each frame."""
+    shares: np.ndarray
+    """(frames,) of the state after the next step, from 0 to 1."""
+
+    @classmethod
+    def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
+        """Raises `InputError` for times beyond the run."""
+        places = times / time_step
+        if places[-1] > steps + 1e-6:
+            raise InputError(
+                f"times go up to {times[-1]:g} s, but must end with the run, after {steps} steps of {time_step:g} s."
+            )
+        whole = np.minimum(np.floor(places + 1e-6).astype(int), steps)
+        shares = np.clip(places - whole, 0.0, 1.0)
+        return cls(whole, np.where(shares < 1e-6, 0.0, shares))
+
+    @property
+    def needed(self) -> set[int]:
+        """The states that are read."""
+        return {int(k) for k in self.steps} | {int(k) + 1 for k in self.steps[self.shares > 0.0]}
+
+    @property
+    def around(self) -> set[int]:
+        """The states that `rates` reads."""
+        return {int(k) + more for k in self.steps for more in (0, 1)}
+
+    def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
+        """(frames, ...) of what was read of the states, by how much it changes in a second."""
+        return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
+
+    def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
+        """(frames, ...) of what was read of the states."""
+        last = max(read)
+        after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
+        before = np.array([read[int(k)] for k in self.steps])
+        shares = self.shares.reshape(-1, *[1] * (before.ndim - 1))
+        return (1.0 - shares) * before + shares * np.array(after)
+
+
+def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
+    """The parameter of a clock that is calibrated, which shows ``start`` [s] of the run where it should show 0."""
+    return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
+
+
+def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
+    """The same; raises `InputError` where anything else is calibrated."""
+    for name in calibrate:
+        if name != CLOCK:
+            raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
+    return clock_of(calibrate, start)
+
+
+def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
+    """The times, the numbers and the noise of an observation; raises `InputError` for what cannot be fitted. ``clock``
+    [s] is added to the times."""
+    moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
+    values = read_only("measured", measured)
+    if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
+        found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
+        raise InputError(
+            f"times {found}, but must be a list of at least {LEAST_FRAMES} rising numbers, as error bars come from "
+            "the scatter from frame to frame."
+        )
+    if (falls := np.flatnonzero(np.diff(moments) <= 0.0)).size:
+        before, after = moments[falls[0] : falls[0] + 2]
+        raise InputError(f"times has {after:g} s after {before:g} s, but must rise from frame to frame.")
+    if not np.isfinite(moments).all() or moments[0] < 0.0:
+        raise InputError(f"times begin with {moments[0]:g} s, but must be finite and not before the run.")
+    if values.ndim != 2 or len(values) != len(moments):
+        raise InputError(f"measured has shape {values.shape}, but must have {len(moments)} rows, one for each time.")
+    if np.isinf(values).any() or np.isnan(values).all():
+        raise InputError("measured must be finite, or NaN for what does not count, but not for all of it.")
+    if noise is not None and not 0.0 < as_one_number("noise", noise) < np.inf:
+        raise InputError(f"noise is {shown(noise)}, but must be greater than 0.")
+    return moments, values, None if noise is None else float(noise)
+
+
+@fixed
+class Video:
+    """Frames of a video, beside pictures of the simulation."""
+
+    unit = "of light"
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        times: Any,
+        frames: Any,
+        mask: Any = None,
+        noise: float | None = None,
+        calibrate: tuple[str, ...] | list[str] = (),
+        clock: float = 0.0,
+    ):
+        """``renderer`` such as `Simulation.renderer` makes, with the camera where it was aimed; ``times`` (frames,)
+        [s] after the start of the run; ``frames`` (frames, rows, columns, 3) linear light from 0 to 1, as
+        `cortado.pictures.read_picture` reads it; ``mask`` (rows, columns), true where pixels count; ``noise``, standard
+        deviation of a number of a frame, if it is known; ``calibrate``, what of the view is searched beside the
+        parameters: "translation", "rotation", "field_of_view" or "width", "extinction", and "start", the ``clock`` [s]
+        that is added to the times.
+        """
+        require_methods("renderer", renderer, ("render", "tangent", "seen_by"), "a renderer such as of a Simulation")
+        pictures = as_numbers("frames", frames)
+        if pictures.shape[1:] != renderer.shape:
+            raise InputError(f"frames has shape {pictures.shape}, but must be (frames, *{renderer.shape}).")
+        rows, columns, _ = renderer.shape
+        inside = np.ones((rows, columns), dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        if inside.shape != (rows, columns) or not inside.any():
+            raise InputError(f"mask has shape {inside.shape}, but must be {(rows, columns)} and true somewhere.")
+        self.renderer, self.mask = renderer, inside
+        seen = pictures[:, inside].reshape(len(pictures), -1)
+        self.times, self.measured, self.noise = checked(times, seen, noise, clock)
+        self.calibration = Calibration(renderer.view, tuple(name for name in calibrate if name != CLOCK))
+        self._clock = clock_of(calibrate, clock)
+        self._seen: dict[str, tuple[bytes, Renderer]] = {}
+
+    @property
+    def start(self) -> Mapping[str, np.ndarray]:
+        """The camera as it was aimed, and its clock, as far as they are calibrated."""
+        return {**self.calibration.start, **self._clock}
+
+    @property
+    def unseen(self) -> Mapping[str, np.ndarray]:
+        """By name, true for the numbers of the camera that no picture shows."""
+        return self.calibration.unseen
+
+    def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(rows, columns, 3) of a state, with values of what is calibrated."""
+        return self._renderer(own).render(at.state.positions, at.state.mass_fractions, at.colours)
+
+    def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
+        return self.picture(at, own)[self.mask].ravel()
+
+    @WARP
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        self.picture(at, own)
+        renderer, found = self._renderer(own), []
+        for one in along:
+            given = one.fields["positions"], one.fields["mass_fractions"], one.parameters.get("colours")
+            found.append(renderer.tangent(*given, self.calibration.tangent(own, one.own))[self.mask].ravel())
+        return np.stack(found, axis=1)
+
+    def _renderer(self, own: Mapping[str, np.ndarray]) -> Renderer:
+        """That of the view with these values; the last one is kept."""
+        if not self.calibration.names:
+            return self.renderer
+        key = b"".join(np.asarray(own[name]).tobytes() for name in self.calibration.names)
+        if self._seen.get("last", (b"",))[0] != key:
+            self._seen["last"] = key, self.renderer.seen_by(self.calibration.view(own))
+        return self._seen["last"][1]
+
+
+@fixed
+class SensorSeries:
+    """What a sensor measured over time."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        times: Any,
+        values: Any,
+        dimension: int,
+        columns: Sequence[str] | None = None,
+        noise: float | None = None,
+        calibrate: Sequence[str] = (),
+        clock: float = 0.0,
+    ):
+        """``sensor`` of `cortado.sensors`; ``times`` (frames,) [s] after the start of the run; ``values`` (frames,) or
+        (frames, k) in the sensor's units, NaN for what does not count; ``dimension`` of the scene; ``columns``, the
+        names of the k numbers of the sensor that were measured, all of them if left out; ``noise``, their standard
+        deviation, if it is known; ``clock`` [s], what is added to the times, which ``calibrate=["start"]`` searches."""
+        self.start = only_a_clock(calibrate, clock)
+        self.sensor = checked_sensor(sensor)
+        known = dict(sensor.columns(dimension))
+        names = list(known) if columns is None else list(columns)
+        for name in names:
+            if name not in known:
+                raise InputError(f"a column is {shown(name)}, but must be one of {', '.join(known)}.")
+        array = as_numbers("values", values)
+        array = array[:, None] if array.ndim == 1 else array
+        if array.ndim != 2 or array.shape[1] != len(names):
+            raise InputError(f"values has shape {array.shape}, but must have columns for {', '.join(names)}.")
+        if len({known[name] for name in names}) > 1:
+            raise InputError(f"columns are {', '.join(names)}, but must be of one unit: give each unit a series.")
+        self.times, self.measured, self.noise = checked(times, array, noise, clock)
+        self.unit, self.columns = known[names[0]], tuple(names)
+        self._picked = np.array([list(known).index(name) for name in names])
+        self._width = len(known)
+
+    def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
+        return value_of(self.sensor, at)[self._picked]
+
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        """By the adjoint of each number, which is all that sensors have."""
+        rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
+        others = [name for name in rows[0] if along and name not in along[0].fields]
+        found = np.zeros((len(rows), len(along)))
+        for k, one in enumerate(along):
+            dots = {**one.fields, **one.quantities(others)}
+            found[:, k] = [sum(float((bar * dots[name]).sum()) for name, bar in row.items()) for row in rows]
+        return found
+
+
+@fixed
+class Tracks:
+    """Where tracers are over time. A tracer moves as the particles around its first place do:
+
+    X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
+
+    with the weights of Wendland (1995) at the start, which add up to 1 within the support radius. Along a periodic axis
+    images of particles count like themselves at the start, and paths go on beyond the end of the period: a tracer that
+    has gone around once is a period further.
+    """
+
+    unit = "m"
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        first: Any,
+        times: Any,
+        positions: Any,
+        noise: float | None = None,
+        calibrate: Sequence[str] = (),
+        clock: float = 0.0,
+    ):
+        """``first`` (tracers, d) places at the start of the run [m]; ``times`` (frames,) [s] after it; ``positions``
+        (frames, tracers, d) [m], NaN where a tracer was not seen; ``noise``, standard deviation of a coordinate [m], if
+        it is known; ``clock`` [s], what is added to the times, which ``calibrate=["start"]`` searches. Raises
+        `InputError` for a tracer that has no fluid around it."""
+        self.start = only_a_clock(calibrate, clock)
+        begun, places = as_numbers("first", first), as_numbers("positions", positions)
+        tracers, d = begun.shape if begun.ndim == 2 else (0, 0)
+        if not tracers or d != simulation.dimension:
+            raise InputError(f"first has shape {begun.shape}, but must be (tracers, {simulation.dimension}).")
+        if places.shape[1:] != begun.shape:
+            raise InputError(f"positions has shape {places.shape}, but must be (frames, {tracers}, {d}).")
+        self.times, self.measured, self.noise = checked(times, places.reshape(len(places), -1), noise, clock)
+        x, domain = simulation.positions, simulation.lattice.domain
+        support, period = simulation.scene.discretisation.support_radius, np.array(domain.lengths)
+        some, others = (
+            cKDTree(wrapped(points - np.array(domain.lower), period), boxsize=period if period.any() else None)
+            for points in (begun, x)
+        )
+        near = some.sparse_distance_matrix(others, support, output_type="coo_matrix")
+        w = csr_array((Weights.of(near.data / support).values, (near.row, near.col)), shape=(tracers, len(x)))
+        sums = np.asarray(w.sum(axis=1)).ravel()
+        if not (sums > 0.0).all():
+            lost = int(np.argmin(sums > 0.0))
+            raise InputError(f"first[{lost}] is {begun[lost].tolist()}, but must be within {support:g} m of fluid.")
+        self._weights = csr_array(w / sums[:, None])
+        self._offset = begun - self._weights @ x
+
+    def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
+        return (self._offset + self._weights @ at.positions).ravel()
+
+    def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
+        return np.stack([(self._weights @ one.fields["positions"]).ravel() for one in along], axis=1)
