@@ -13,8 +13,8 @@ import cortado
 import cortado.environments
 from cortado import InputError, Simulation
 from cortado.discretise.room import Domain
-from cortado.environments.actuators import Position, Velocity
 from cortado.environments.catalogue import TASKS
+from cortado.environments.task import Position, Velocity
 from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
 
 SOME = ("Carry", "Raft")

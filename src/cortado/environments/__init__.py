@@ -7,9 +7,7 @@ from typing import Any
 
 from cortado.calls import face
 from cortado.environments.catalogue import TASKS
-from cortado.environments.fluid_env import FluidEnv
-from cortado.environments.fluid_vector_env import FluidVectorEnv
-from cortado.environments.gym import gymnasium
+from cortado.environments.fluid_env import FluidEnv, FluidVectorEnv, gymnasium
 from cortado.environments.task import Task
 from cortado.environments.twin import Twin
 
@@ -26,7 +24,7 @@ for _name, _task in TASKS.items():
     gymnasium.register(
         f"cortado/{_name}-v0",
         entry_point="cortado.environments.fluid_env:FluidEnv",
-        vector_entry_point="cortado.environments.fluid_vector_env:FluidVectorEnv",
+        vector_entry_point="cortado.environments.fluid_env:FluidVectorEnv",
         max_episode_steps=_task.horizon,
         kwargs={"task": _name},
     )

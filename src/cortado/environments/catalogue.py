@@ -1,13 +1,330 @@
-"""All tasks, by name."""
+"""All tasks, by name: a cup that is carried, a latte, a jug that pours, a raft, a splash, and a cup that is stirred."""
 
-from cortado.environments.task import Task
-from cortado.environments.tasks.carry import Carry
-from cortado.environments.tasks.latte import Latte
-from cortado.environments.tasks.pour import Pour
-from cortado.environments.tasks.raft import Raft
-from cortado.environments.tasks.splash import Splash
-from cortado.environments.tasks.stir import Stir
-from cortado.errors import InputError, shown
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.environments.task import Actuator, Position, Task, Velocity
+from cortado.environments.terms import Distance, Missed, OneBox, Pose, Reward, Share, Spread
+from cortado.errors import CortadoWarning, InputError, shown
+from cortado.scene.scene import Scene
+from cortado.simulation import Simulation
+
+WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.1, 0.3, 0.8]}
+COFFEE = {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.20, 0.09, 0.04]}
+MILK = {"name": "milk", "rest_density": 950.0, "viscosity": 0.05, "colour": [0.95, 0.92, 0.85]}
+LED = {"motion": "path", "velocity": [0.0, 0.0], "colour": [0.6, 0.6, 0.65]}
+"""A solid that actions move."""
+
+
+def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[str, Any]:
+    """The table of a box with these corners [m], and with other keys."""
+    return {"shape": "box", "lower": lower, "upper": upper, **others}
+
+
+class Carry(Task):
+    """A cup of water is carried to a place, without spilling.
+
+    Actions: velocity of the cup along x, and rate at which it leans. Goal: where its middle shall be. After
+    TransportWater of SoftGym (Lin et al. 2020), with its reward: minus the distance of the cup to its goal [m], minus
+    10 times the share of the water that is not in the cup. SoftGym counts particles; here they count smoothly
+    (`cortado.environments.terms.Share`). The cup can lean as well.
+    """
+
+    name = "Carry"
+    horizon, repeats = 75, 6
+    coarse_spacing, coarse_step = 0.0125, 0.0025
+    lowest = -12.0
+    goal_names: ClassVar[tuple[str, ...]] = ("x of the cup [m]",)
+    width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
+    """Of the inside of the cup, of its water, of the cup above the floor of its inside, and of its walls [m]."""
+    floor = -0.15
+    """Height of what spilt water falls on: deeper than a corner of the cup ever is [m]."""
+    fastest, turning = 0.6, 1.0
+    """[m/s], [rad/s]"""
+
+    @property
+    def scene(self) -> Scene:
+        cup = {"name": "cup", "shape": "cup", "base": [0.5 * self.width, -self.wall], "radius": 0.5 * self.width}
+        cup |= {"height": self.wall + self.height, "thickness": self.wall}
+        reach = 1.1 * self.fastest * self.horizon * self.repeats * self.coarse_step
+        return self.scene_of(
+            container=box([-0.2 - reach, self.floor], [self.width + 0.2 + reach, 0.5]),
+            phase=[WATER],
+            fluid=[box([0.0, 0.0], [self.width, self.depth], phase="water")],
+            solid=[{**cup, **LED}],
+        )
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        along = Velocity("cup.displacement", (0.0, 0.0), (0,), (self.fastest,))
+        return along, Velocity("cup.turn", (0.0,), (0,), (self.turning,), is_number=True)
+
+    @property
+    def goals(self) -> tuple[NDArray, NDArray]:
+        start = 0.5 * self.width
+        return np.array([start + 0.3]), np.array([start + 0.5])
+
+    def reward(self, simulation: Simulation) -> Reward:
+        middle = simulation.scene.solid[0].middle()
+        inside = OneBox(tuple(-middle), tuple(np.array([self.width, self.height]) - middle))
+        share = Share(inside, self.coarse_spacing, solid="cup")
+        return Reward(((-1.0, Distance("cup")), (10.0, share)), constant=-10.0)
+
+
+class Latte(Task):
+    """Milk flows from a nozzle into coffee, and shall lie where a hidden path of the nozzle would have put it.
+
+    Actions: where the nozzle is sent to, along x. After LatteArt of FluidLab (Xian et al. 2023), with its reward but
+    for scale and a constant: minus the squared distances of the milk that has been poured from where it is under the
+    hidden path at the same time, their mean over the squared radius of the cup.
+    """
+
+    name = "Latte"
+    horizon, repeats = 32, 6
+    coarse_spacing, coarse_step = 0.0025, 0.0014
+    lowest = -4.0
+    radius, depth, opening, column = 0.03, 0.015, 0.0025, 0.0625
+    """Of the cup, of its coffee, of the nozzle, and of the milk in it [m]."""
+    height = depth + 0.005
+    """Of the nozzle above the floor [m]."""
+    reach, lag, pouring = 0.6 * radius, 0.03, 25
+    """How far the nozzle can be sent [m], how it follows [s], and for how many steps of the environment it pours."""
+
+    @property
+    def scene(self) -> Scene:
+        jet: dict[str, Any] = {"phase": "milk", "outlet": [0.0, self.height], "radius": self.opening}
+        return self.scene_of(
+            container=box([-self.radius, 0.0], [self.radius, 2.5 * self.depth]),
+            phase=[{**one, "viscosity": 0.3} for one in (COFFEE, MILK)],
+            fluid=[box([-self.radius, 0.0], [self.radius, self.depth], phase="coffee")],
+            emitter={**jet, "length": self.column, "flow_rate": self.speed * 2.0 * self.opening},
+        )
+
+    @property
+    def speed(self) -> float:
+        """Of the milk in the nozzle [m/s]."""
+        return self.column / (self.pouring * self.repeats * self.coarse_step)
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        return (Position("nozzle_path", (0.0, self.height), (0,), (self.reach,), lag=self.lag),)
+
+    def reward(self, simulation: Simulation) -> Reward:
+        targets, weights = _hidden(self, simulation.device.alias, simulation.precision.name)
+        return Reward(((-1.0, Missed(targets, weights)),))
+
+
+def hidden_actions(task: Latte) -> NDArray:
+    """(horizon, 1) the breadth of a heart, as somebody goes once around it, and then the middle."""
+    angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
+    return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
+
+
+@cache
+def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
+    """Positions under the hidden path after each step of the environment (horizon, n, d) [m], and the weights of the
+    particles of milk that have been poured until then (horizon, n) [1/m2]."""
+    simulation = Simulation(task.scene, device, precision)
+    (nozzle,), steps = task.actuators, task.horizon * task.substeps
+    path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
+    with warnings.catch_warnings():  # of the milk, which is out before the end
+        warnings.simplefilter("ignore", CortadoWarning)
+        run = simulation.run(steps, {nozzle.parameter: path}, record_every=task.substeps)
+    emitter = simulation.scene.emitter
+    assert emitter is not None
+    sample, first = emitter.sample(task.spacing), simulation.free_particles
+    weights = np.zeros((task.horizon, simulation.particles))
+    poured = sample.upstream < sample.speed * run.times[1:, None]
+    weights[:, first:] = poured / np.maximum(poured.sum(axis=1, keepdims=True), 1) / task.radius**2
+    return run.positions[1:], weights
+
+
+class Pour(Task):
+    """A jug is turned, and moved a little, so that its syrup ends in a glass.
+
+    Actions: velocity of the jug along x, and rate at which it turns, counterclockwise. After PourWater of SoftGym (Lin
+    et al. 2020), with its reward: the share of the fluid that is in the glass. SoftGym counts particles; here they
+    count smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
+    """
+
+    name = "Pour"
+    horizon, repeats = 75, 10
+    coarse_spacing, coarse_step = 0.0125, 0.00154
+    lowest = 0.0
+    lower, upper, wall = (0.25, -0.28), (0.45, -0.12), 0.05
+    """Corners of the inside of the glass, and the thickness of walls [m]."""
+    fastest, turning = 0.1, 4.0
+    """[m/s], [rad/s]"""
+
+    @property
+    def scene(self) -> Scene:
+        (left, low), (right, high) = self.lower, self.upper
+        cup = {"shape": "cup", "thickness": self.wall, "colour": LED["colour"]}
+        jug: dict[str, Any] = {"name": "jug", "base": [0.075, -0.05], "radius": 0.075, "height": 0.25}
+        glass: dict[str, Any] = {"name": "glass", "base": [0.5 * (left + right), low - self.wall]}
+        glass |= {"radius": 0.5 * (right - left), "height": high - low + self.wall}
+        return self.scene_of(
+            container=box([-0.3, low - self.wall], [0.7, 0.4]),
+            phase=[{**WATER, "name": "syrup", "viscosity": 0.3, "colour": [0.8, 0.45, 0.1]}],
+            fluid=[box([0.0, 0.0], [0.15, 0.125], phase="syrup")],
+            solid=[{**cup, **jug, "motion": "path", "angular_velocity": 0.0}, {**cup, **glass}],
+        )
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        along = Velocity("jug.displacement", (0.0, 0.0), (0,), (self.fastest,))
+        return along, Velocity("jug.turn", (0.0,), (0,), (self.turning,), is_number=True)
+
+    def reward(self, simulation: Simulation) -> Reward:
+        return Reward(((1.0, Share(OneBox(self.lower, self.upper), 2.0 * self.coarse_spacing)),))
+
+
+class Raft(Task):
+    """A paddle makes waves that bring a raft to a place, and keep it level.
+
+    Actions: where the paddle is sent to, along x. Goal: where the middle of the raft shall be. The reward is
+    -(x - x*)^2 / l^2 - 2 (1 - cos angle), with the goal x* and the length l of the raft.
+    """
+
+    name = "Raft"
+    horizon, repeats = 40, 8
+    coarse_spacing, coarse_step = 0.025, 0.003
+    lowest = -15.0
+    free_solids: ClassVar[tuple[str, ...]] = ("raft",)
+    goal_names: ClassVar[tuple[str, ...]] = ("x of the raft [m]",)
+    length = 0.25
+    """Of the raft [m]."""
+    reach, lag = 0.05, 0.1
+    """How far the paddle can be sent [m], and how it follows [s]."""
+
+    @property
+    def scene(self) -> Scene:
+        raft = {"name": "raft", "motion": "free", "density": 500.0, "colour": [0.6, 0.4, 0.2]}
+        return self.scene_of(
+            container=box([-0.2, 0.0], [0.96, 0.5]),
+            phase=[{**WATER, "viscosity": 0.1}],
+            fluid=[box([0.16, 0.0], [0.96, 0.2], phase="water")],
+            solid=[
+                box([0.06, -0.1], [0.16, 0.4], name="paddle", **LED),
+                box([0.36, 0.15], [0.36 + self.length, 0.25], **raft),
+            ],
+        )
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        return (Position("paddle.displacement", (0.0, 0.0), (0,), (self.reach,), lag=self.lag),)
+
+    @property
+    def goals(self) -> tuple[NDArray, NDArray]:
+        return np.array([0.45]), np.array([0.6])
+
+    def reward(self, simulation: Simulation) -> Reward:
+        return Reward(((-1.0, Pose("raft", self.length)),))
+
+
+class Splash(Task):
+    """A dam breaks in a box that is shaken, until its water has the shape of the letter L.
+
+    Actions: the acceleration of the box along x and y, which its water feels as gravity that leans, and grows. Goal:
+    where the left side of the stem is. The reward is the share of the water that is in the letter: in its foot along
+    the floor, or in its stem, which stands at a goal's place, each particle counted smoothly
+    (`cortado.environments.terms.Share`).
+    """
+
+    half = 0.3
+    """Half of the width of the box [m]."""
+    name = "Splash"
+    horizon, repeats = 40, 5
+    coarse_spacing, coarse_step = half / 12, 0.003
+    lowest = 0.0
+    goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
+    gravity, strength, lag = 9.81, 12.0, 0.05
+    """What the box is shaken with at most, besides gravity [m/s2], and how it follows [s]."""
+
+    @property
+    def scene(self) -> Scene:
+        return self.scene_of(
+            container=box([0.0, 0.0], [2.0 * self.half, 2.0 * self.half]),
+            phase=[WATER],
+            fluid=[box([0.0, 0.0], [self.half, self.half], phase="water")],
+            forces={"gravity": [0.0, -self.gravity]},
+        )
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        return (Position("gravity", (0.0, -self.gravity), (0, 1), (-self.strength, -self.strength), lag=self.lag),)
+
+    @property
+    def goals(self) -> tuple[NDArray, NDArray]:
+        return np.array([0.0]), np.array([1.5 * self.half])
+
+    def reward(self, simulation: Simulation) -> Reward:
+        return Reward(((1.0, Share(Letter(self.half), self.coarse_spacing)),))
+
+
+@dataclass(frozen=True)
+class Letter:
+    """The boxes of the foot and of the stem, which have the area of the water."""
+
+    half: float
+    """Side of the square that the water fills at first [m]."""
+
+    def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
+        lower, upper = np.zeros((len(goal), 2, 2)), np.zeros((len(goal), 2, 2))
+        upper[:, 0] = [2.0 * self.half, 0.25 * self.half]
+        lower[:, 1, 0], lower[:, 1, 1] = goal[:, 0], 0.25 * self.half
+        upper[:, 1, 0], upper[:, 1, 1] = goal[:, 0] + 0.5 * self.half, 1.25 * self.half
+        return lower, upper
+
+
+class Stir(Task):
+    """Milk lies in a corner of a cup of coffee, and a spoon stirs until it is everywhere.
+
+    Actions: where the spoon, a disc in the plane, is sent to. After Mixing of FluidLab (Xian et al. 2023), with its
+    reward but for scale: the mean distance of all pairs of milk particles, component by component, over that of all
+    particles at the start, less 1.
+    """
+
+    name = "Stir"
+    horizon, repeats = 50, 16
+    coarse_spacing, coarse_step = 0.005, 0.001
+    lowest = -1.0
+    width, depth, milky = 0.08, 0.045, 0.02
+    """Of the cup, of what is in it, and of the part whose left half is milk [m]."""
+    spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
+    """Where the spoon begins, its radius, how far it can be sent [m], and how it follows [s]."""
+
+    @property
+    def scene(self) -> Scene:
+        border, half = self.depth - self.milky, 0.5 * self.width
+        spoon = {"name": "spoon", "shape": "sphere", "centre": self.spoon, "radius": self.radius, "slip": "no"}
+        return self.scene_of(
+            container=box([0.0, 0.0], [self.width, 1.8 * self.depth]),
+            phase=[COFFEE, MILK],
+            fluid=[
+                box([0.0, 0.0], [self.width, border], phase="coffee"),
+                box([half, border], [self.width, self.depth], phase="coffee"),
+                box([0.0, border], [half, self.depth], phase="milk"),
+            ],
+            solid=[{**spoon, **LED}],
+        )
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        return (Position("spoon.displacement", (0.0, 0.0), (0, 1), self.reach, lag=self.lag),)
+
+    def reward(self, simulation: Simulation) -> Reward:
+        milk, x, n = np.flatnonzero(simulation.mass_fractions[:, 1]), simulation.positions, simulation.particles
+        # the mean distance of all pairs of particles, component by component [m]
+        spread = float(2.0 * ((2.0 * np.arange(n) - n + 1.0) @ np.sort(x, axis=0)).sum() / n**2)
+        return Reward(((1.0, Spread(milk, spread)),), constant=-1.0)
+
 
 TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Latte, Pour, Raft, Splash, Stir)}
 

@@ -1,4 +1,4 @@
-"""Many scenes of one task in one launch: what steps them, rewards them, and begins their episodes."""
+"""Many scenes of one task in one launch: what steps them, rewards them, begins their episodes, and observes them."""
 
 import warnings
 from collections.abc import Mapping
@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import launch
 from cortado.device.threads import WARP
-from cortado.environments.actuators import split
 from cortado.environments.kernels import environment_kernels
-from cortado.environments.sensing import checked_sensors, readings
-from cortado.environments.task import JITTER, Task
+from cortado.environments.task import JITTER, Task, split
 from cortado.errors import CortadoWarning, InputError, shown
+from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
+from cortado.rollout.rollout import Rollout
 from cortado.rollout.stepper import Stepper
+from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, velocity_name
 from cortado.simulation import Simulation
 
@@ -192,3 +193,32 @@ class Scenes:
         rate = state[angular_velocity_name(name)].numpy()[:, None]
         place = self._domain.wrapped(place)
         return np.concatenate([place, axis + [1.0, 0.0], velocity, rate], axis=1)
+
+
+def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
+    """Sensors by names that are not ``taken``; raises `InputError` for anything else."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"sensors is {shown(given)}, but must be a table of sensors by name, {{'gauge': sensor}}.")
+    for name in given:
+        if not isinstance(name, str) or name in taken:
+            raise InputError(
+                f"sensors has the name {shown(name)}, but must have texts other than {', '.join(sorted(taken))}."
+            )
+    return {name: checked_sensor(sensor) for name, sensor in given.items()}
+
+
+def readings(
+    sensors: Mapping[str, Sensor], simulation: Simulation, rollout: Rollout, state: State, driven: Mapping[str, NDArray]
+) -> dict[str, NDArray]:
+    """(scenes, k) by name, of states of all scenes. Parameters are those of the last step of the rollout, but for those
+    that are ``driven`` (scenes, 1, ...)."""
+    if not sensors:
+        return {}
+    row = rollout.steps - 1
+    parameters = {**row_of(rollout, rollout.parameters.written, row), **driven}
+    moment = Moment(state, parameters, rollout.substeps, row, simulation.evaluator)
+    scenes = simulation.batch or 1
+    end = SnapshotBatch(state, simulation.dimension, np.zeros((scenes, len(simulation.scene.phase), 3)), moment)
+    return {name: np.array([value_of(sensor, end[b]) for b in range(scenes)]) for name, sensor in sensors.items()}

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_at_most, whole_number
-from cortado.environments.actuators import split
-from cortado.environments.reward import MinusReward
 from cortado.environments.scenes import Scenes
-from cortado.environments.spaces import checked_actions
+from cortado.environments.task import checked_actions, split
+from cortado.environments.terms import MinusReward
 from cortado.errors import InputError, shown
 from cortado.gradients import GradientEstimator
 from cortado.losses import Frames
