@@ -58,7 +58,7 @@ SHARED = {
     "losses.image_losses": {"adjoint", "reduce_transposed"},
     "losses.distances": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
-    "render.interpolation": {"interpolation_functions.trilinear_weight"},
+    "render.rays": {"interpolation_functions.trilinear_weight"},
     "solvers.contact_kernels": {"strength_kernels.part"},
     "solvers.pcisph.relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},

@@ -1,5 +1,8 @@
 """The colour field: how much fluid there is at the nodes of a regular grid, and of what colour.
 
+The colour of a particle is mixed from those of its phases, and both are spread over the nodes around it:
+
+    colour_j = sum_k c_jk colours_k
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
 The coverage A is 1 within a filled fluid. P is the colour times the coverage; neither is ever divided by the other.
@@ -7,16 +10,29 @@ Along a periodic axis the images of a particle count like itself.
 Both sums are gathers: of particles, cell by cell, on the way there, of the nodes within the support on the way back.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property, partial
+from math import prod
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from cortado.device.cells import cell_functions, cell_grid_type
+from cortado.device.cells import CellSort, cell_functions, cell_grid_type
+from cortado.device.grid import Grid
+from cortado.device.launching import launch
+from cortado.device.memory import field_parts, require
+from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision
+from cortado.device.reduction import sum_of
+from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
+from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
+
+MOST_NODES = 2**27
+"""Of a colour field: 2 GiB in float32."""
+MOST_CELLS = 2**20
+"""Of the grid in which particles are sorted."""
 
 
 @cache
@@ -51,19 +67,10 @@ def nodes_type(precision: Precision) -> Any:
     return wp.struct(Nodes)
 
 
-@dataclass(frozen=True)
-class NodeFunctions:
-    """Warp functions of the nodes of a field."""
-
-    place: Any
-    nearest: Any
-    image: Any
-
-
 @cache
-def node_functions(precision: Precision) -> NodeFunctions:
-    """Warp functions ``place``: where a node is [m]; ``nearest``: a separation from the nearest image; ``image``: where
-    one of the images of a particle is that nodes may feel."""
+def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
+    """Warp functions ``place`` (where a node is [m]), ``nearest`` (a separation from the nearest image) and ``image``
+    (where one of the images of a particle is that nodes may feel)."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -87,20 +94,74 @@ def node_functions(precision: Precision) -> NodeFunctions:
         q = vector(real(number % n_x), real((number // n_x) % n_y), real(number // (n_x * n_y)))
         return x + wp.cw_mul(q - vector(wp.floor(t[0]), wp.floor(t[1]), wp.floor(t[2])), nodes.period)
 
-    return NodeFunctions(place=place, nearest=nearest, image=image)
-
-
-@dataclass(frozen=True)
-class ColourFieldKernels:
-    """The kernel of the field of colours, its tangent and its adjoint."""
-
-    forward: Any
-    tangent: Any
-    adjoint: Any
+    return place, nearest, image
 
 
 @cache
-def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
+def colours_type(precision: Precision, phases: int) -> Any:
+    """Warp matrix type (phases, 3)."""
+    return wp.types.matrix(shape=(phases, 3), dtype=precision.real)
+
+
+@cache
+def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
+    """Kernels ``forward`` and ``tangent`` (which sort positions besides), and ``adjoint``."""
+    vector, fractions = precision.vector, precision.fractions(phases)
+    colours_matrix = colours_type(precision, phases)
+    module = kernel_module(f"phase_colour_{phases}_{precision.name}")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def phase_colour(
+        colours: wp.array(dtype=colours_matrix),
+        order: wp.array(dtype=wp.int32),
+        x_scene: wp.array(dtype=vector),
+        c_scene: wp.array(dtype=fractions),
+        # out
+        x: wp.array(dtype=vector),
+        colour: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        j = order[i]
+        x[i] = x_scene[j]
+        colour[i] = wp.transpose(colours[0]) * c_scene[j]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def phase_colour_tangent(
+        colours: wp.array(dtype=colours_matrix),
+        order: wp.array(dtype=wp.int32),
+        c_scene: wp.array(dtype=fractions),
+        x_scene_dot: wp.array(dtype=vector),
+        c_scene_dot: wp.array(dtype=fractions),
+        colours_dot: wp.array(dtype=colours_matrix),
+        # out
+        x_dot: wp.array(dtype=vector),
+        colour_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        j = order[i]
+        x_dot[i] = x_scene_dot[j]
+        colour_dot[i] = wp.transpose(colours[0]) * c_scene_dot[j] + wp.transpose(colours_dot[0]) * c_scene[j]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def phase_colour_adjoint(
+        colours: wp.array(dtype=colours_matrix),
+        c_scene: wp.array(dtype=fractions),
+        colour_scene_bar: wp.array(dtype=vector),
+        # out
+        c_scene_bar: wp.array(dtype=fractions),
+        colours_bar: wp.array(dtype=colours_matrix),
+    ):
+        """``colours_bar`` gathers the adjoint of the colours particle by particle."""
+        j = wp.tid()
+        bar = colour_scene_bar[j]
+        c_scene_bar[j] = colours[0] * bar
+        colours_bar[j] = wp.outer(c_scene[j], bar)
+
+    return Kernels(phase_colour, phase_colour_tangent, phase_colour_adjoint)
+
+
+@cache
+def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward`` and ``tangent``, over nodes, and ``adjoint``, over sorted particles."""
     precision = discretisation.precision
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
@@ -108,8 +169,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
     cells, smooth = cell_functions(precision), smoothing_functions(discretisation.smoothing, precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
     weight, gradient = smooth.weight, smooth.gradient
-    node = node_functions(precision)
-    place, nearest, image = node.place, node.nearest, node.image
+    place, nearest, image = node_functions(precision)
     module = discretisation.module(False, "colour_field")
 
     @wp.func
@@ -235,4 +295,117 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         x_scene_bar[order[p]] = volume * x_bar
         colour_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
 
-    return ColourFieldKernels(forward=colour_field, tangent=colour_field_tangent, adjoint=colour_field_adjoint)
+    return Kernels(colour_field, colour_field_tangent, colour_field_adjoint)
+
+
+def nodes_over(
+    lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
+) -> Any:
+    """The struct of nodes of that distance [m] over a region (d,) to (d,) [m], and beyond as far as particles in it
+    are felt, but not along axes with a period [m]. In 2-D they are one layer."""
+    margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
+    counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
+    if np.prod(counts) > MOST_NODES:
+        raise InputError(
+            f"cell is {cell:g}, which makes {np.prod(counts):.1e} nodes; {MOST_NODES} at most, take a larger."
+        )
+    flat = 3 - len(lower)
+    nodes = nodes_type(precision)()
+    nodes.origin = precision.vector(*(lower - margin * cell), *[0.0] * flat)
+    nodes.cell, nodes.frequency = cell, 1.0 / cell
+    nodes.shape = wp.vec3i(*(int(n) for n in counts), *[1] * flat)
+    turns = np.divide(1.0, periods, out=np.zeros(len(periods)), where=periods > 0.0)
+    images = np.floor((cell * (counts - 1) + 2 * support) * turns) + 1
+    nodes.periodic = int(periods.any())
+    nodes.period, nodes.turn = (precision.vector(*values, *[0.0] * flat) for values in (periods, turns))
+    nodes.images = wp.vec3i(*(int(n) for n in images), *[1] * flat)
+    return nodes
+
+
+class ColourField:
+    """Gathers a fixed number of particles into a field. What `adjoint` returns is overwritten by its next call."""
+
+    def __init__(
+        self,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        periods: np.ndarray,
+        cell: float,
+        smoothing: SmoothingKernel,
+        support: float,
+        volume: float,
+        particles: int,
+        phases: int,
+        precision: Precision,
+        device: Any,
+    ):
+        """Of particles in a region (d,) to (d,) [m]; arguments as those of the `Renderer`."""
+        self._particles = particles
+        self._tint = phase_colour_kernels(precision, phases)
+        self._field = colour_field_kernels(Discretisation(smoothing, precision))
+        self._device, self._precision = device, precision
+        grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
+        self._sort = CellSort(grid, particles, precision, device)
+        sigma = smoothing.normalisation(len(lower), support)
+        self._kernel = {"h": support, "per_h": 1.0 / support, "sigma": sigma, "volume": volume}
+        zeros, mix, palette = (
+            partial(wp.zeros, device=device),
+            precision.fractions(phases),
+            colours_type(precision, phases),
+        )
+        self._x, self._x_bar, self._colour, self._colour_bar = (
+            zeros(particles, dtype=precision.vector) for _ in range(4)
+        )
+        self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
+        self._colours, self._colours_dot = zeros(1, dtype=palette), zeros(1, dtype=palette)
+        self._colours_bar = zeros(particles, dtype=palette)
+        self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
+        self._sum = sum_of(palette, particles, device)
+        self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
+        """The struct that kernels see."""
+        require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
+        self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
+        """(nz, ny, nx) colour times coverage, and coverage [-]."""
+
+    def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:
+        """Make the field of positions (n,) [m], mass fractions (n,) [-] and the colours (phases, 3) of the phases."""
+        self._sort(positions)
+        wp.copy(self._fractions, fractions)
+        self._colours.assign(colours[None])
+        own = {"x": self._x, "colour": self._colour}
+        launch(self._tint.forward, self._particles, self._device, self._known, own, x_scene=positions)
+        grid, shape = self._sort.grid, self.values.shape
+        launch(
+            self._field.forward, shape, self._device, self._kernel, own, nodes=self.nodes, grid=grid, field=self.values
+        )
+
+    def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
+        """The tangent (nz, ny, nx) of the last field, along those of positions (n,), fractions (n,) and colours
+        (phases, 3). The next call overwrites it, and what `adjoint` returned."""
+        own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
+        along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
+        self._colours_dot.assign(colours_dot[None])
+        launch(self._tint.tangent, self._particles, self._device, self._known, own, along)
+        out = {"nodes": self.nodes, "grid": self._sort.grid, "field_dot": self._values_dot}
+        launch(self._field.tangent, self.values.shape, self._device, self._kernel, own, out)
+        return self._values_dot
+
+    @cached_property
+    def _values_dot(self) -> wp.array:
+        require(field_parts(prod(self.nodes.shape), self._precision.bytes), "take a larger cell", self._device)
+        return wp.zeros_like(self.values)
+
+    def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
+        """The derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with respect
+        to the field."""
+        own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
+        bars = {
+            "x_scene_bar": self._x_bar,
+            "colour_scene_bar": self._colour_bar,
+            "c_scene_bar": self._fractions_bar,
+            "colours_bar": self._colours_bar,
+        }
+        launch(self._field.adjoint, self._particles, self._device, self._kernel, self._known, own, bars)
+        launch(self._tint.adjoint, self._particles, self._device, self._known, bars)
+        colours = self._sum(self._colours_bar).numpy()[0].astype(np.float64)
+        return self._x_bar, self._fractions_bar, colours

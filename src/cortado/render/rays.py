@@ -1,9 +1,14 @@
-"""Rays of a camera: where its pixels look, where along a ray samples lie, and which of them lie in a box.
+"""Rays of a camera, and what a sample on one sees of the colour field.
+
+Where its pixels look, where along a ray samples lie, and which of them lie in a box.
 
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) run from -1 to 1 over the
 width of the picture, v upwards and in the same unit; at depth z the pixel (u, v) sees (w u, w v, -z), with the half
 width w = half_width + growth z. So one formula holds for parallel rays (growth 0) and for rays from a point
 (half_width 0).
+
+A sample is interpolated trilinearly between the nodes of the field, which is 0 at all nodes that are not there. So it
+is continuous everywhere, and a field of one layer (2-D) is a sheet that is one node distance thick.
 """
 
 from dataclasses import dataclass
@@ -13,6 +18,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.render.colour_field import nodes_type, rgba_type
 
 
 @cache
@@ -44,7 +50,7 @@ def camera_type(precision: Precision) -> Any:
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
-    """The Warp struct of how a view changes; see `cortado.render.calibration.ViewTangent`."""
+    """The Warp struct of how a view changes; see `cortado.render.cameras.ViewTangent`."""
     real, vector = precision.real, precision.vector
 
     class CameraTangent:
@@ -174,12 +180,96 @@ def ray_functions(precision: Precision) -> RayFunctions:
             int(wp.clamp(wp.ceil(bottom) + real(1.0), real(0.0), n_y)),
         )
 
-    return RayFunctions(
-        start=start,
-        direction=direction,
-        distance=distance,
-        start_tangent=start_tangent,
-        direction_tangent=direction_tangent,
-        samples_within=samples_within,
-        pixels_before=pixels_before,
-    )
+    return RayFunctions(start, direction, distance, start_tangent, direction_tangent, samples_within, pixels_before)
+
+
+@dataclass(frozen=True)
+class InterpolationFunctions:
+    """Warp functions of trilinear interpolation between the nodes of a field."""
+
+    value: Any
+    gradient: Any
+    derivative: Any
+    trilinear_weight: Any
+
+
+@cache
+def interpolation_functions(precision: Precision) -> InterpolationFunctions:
+    """Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
+    direction) and ``trilinear_weight`` (of one node)."""
+    real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
+    nodes_struct = nodes_type(precision)
+
+    @wp.func
+    def node(i: int, j: int, k: int, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+        n = nodes.shape
+        if i >= 0 and j >= 0 and k >= 0 and i < n[0] and j < n[1] and k < n[2]:
+            return field[k, j, i]
+        return rgba()
+
+    @wp.func
+    def part(f: real, side: int) -> real:
+        return wp.where(side == 0, real(1.0) - f, f)
+
+    @wp.func
+    def cell(x: vector, nodes: nodes_struct):
+        """The node at which the cell of a point begins, and how far the point is from it, in node distances."""
+        s = nodes.frequency * (x - nodes.origin)
+        i = int(wp.floor(s[0]))
+        j = int(wp.floor(s[1]))
+        k = int(wp.floor(s[2]))
+        f = s - vector(real(i), real(j), real(k))
+        return i, j, k, f
+
+    @wp.func
+    def value(x: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+        i, j, k, f = cell(x, nodes)
+        total = rgba()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    w = part(f[0], a) * part(f[1], b) * part(f[2], c)
+                    total += w * node(i + a, j + b, k + c, field, nodes)
+        return total
+
+    @wp.func
+    def slope(f: vector, a: int, b: int, c: int) -> vector:
+        """The gradient of a corner's weight, in node distances."""
+        return vector(
+            real(2 * a - 1) * part(f[1], b) * part(f[2], c),
+            real(2 * b - 1) * part(f[2], c) * part(f[0], a),
+            real(2 * c - 1) * part(f[0], a) * part(f[1], b),
+        )
+
+    @wp.func
+    def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
+        """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
+        i, j, k, f = cell(x, nodes)
+        total = vector()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    total += wp.dot(bar, node(i + a, j + b, k + c, field, nodes)) * slope(f, a, b, c)
+        return nodes.frequency * total
+
+    @wp.func
+    def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
+        """Of the value at a point that moves; on the face of a cell as `gradient`."""
+        i, j, k, f = cell(x, nodes)
+        total = rgba()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    total += wp.dot(slope(f, a, b, c), x_dot) * node(i + a, j + b, k + c, field, nodes)
+        return nodes.frequency * total
+
+    @wp.func
+    def trilinear_weight(x: vector, x_g: vector, nodes: nodes_struct) -> real:
+        """The weight of the node at x_g in the value at x."""
+        s = nodes.frequency * (x - x_g)
+        w_x = wp.max(real(1.0) - wp.abs(s[0]), real(0.0))
+        w_y = wp.max(real(1.0) - wp.abs(s[1]), real(0.0))
+        w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
+        return w_x * w_y * w_z
+
+    return InterpolationFunctions(value, gradient, derivative, trilinear_weight)

@@ -16,11 +16,10 @@ from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.particles.arrays import padded
-from cortado.render.calibration import ViewTangent
+from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import positive, vector
-from cortado.render.fields import ColourField
-from cortado.render.marching import RayMarcher
-from cortado.render.views import View
+from cortado.render.colour_field import ColourField
+from cortado.render.views import View, ViewTangent
 from cortado.words import counted
 
 
