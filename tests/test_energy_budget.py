@@ -13,8 +13,8 @@ import pytest
 import warp as wp
 
 from cortado import Simulation
-from cortado.particles.arrays import to_device
 from cortado.particles.neighbourhood import neighbourhood_type
+from cortado.particles.state import to_device
 from scenes import plane, plane_of_three, scene, two_layers
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6}

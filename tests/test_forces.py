@@ -6,9 +6,8 @@ import warp as wp
 
 from cortado import Simulation
 from cortado.device.precision import FLOAT64
-from cortado.particles.arrays import Fields
 from cortado.particles.solid_shares import SolidShares
-from cortado.particles.state import Layout
+from cortado.particles.state import Fields, Layout
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares

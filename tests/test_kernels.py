@@ -19,10 +19,10 @@ from cortado.device.launching import Bundles, bound, bundles_of
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
-from cortado.particles.wall_arrays import WallArrays
 from cortado.scene.parameter_values import (
     reference_density,
     reference_density_adjoint,

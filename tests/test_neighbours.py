@@ -15,10 +15,10 @@ from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles import candidates
+from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
-from cortado.particles.wall_arrays import WallArrays
 
 SUPPORT = 0.1
 REACH = (1 + SKIN) * SUPPORT

@@ -73,7 +73,7 @@ SHARED = {
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
     "environments.kernels": "of rewards, which are no losses of these scenes: tests/test_environments.py",
-    "particles.by_hand": "it notes adjoints and has none",
+    "particles.pair_sums": "it notes adjoints and has none",
     "device.compiling": "it compiles adjoints and has none",
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
     "sph.own_force": "made from functions of users, which scenes do not have: tests/test_own_functions.py",

@@ -6,7 +6,7 @@ import warp as wp
 
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.particles.pointwise import pointwise_kernels
+from cortado.particles.made_derivatives import pointwise_kernels
 
 MEMBERS, PARTICLES = 2, 5
 

@@ -10,7 +10,7 @@ from bad_scenes import GOOD_SCENE, RENDER
 from bad_scenes import plane as plane_tables
 from cortado.device.precision import FLOAT64
 from cortado.errors import InputError, SceneError
-from cortado.particles.arrays import to_device
+from cortado.particles.state import to_device
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView

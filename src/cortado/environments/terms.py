@@ -17,8 +17,7 @@ from cortado.discretise.pairs import apart
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.environments.kernels import EnvironmentKernels, environment_kernels
 from cortado.losses.loss import Snapshot, SnapshotBatch, precision_of
-from cortado.particles.arrays import padded, to_device
-from cortado.particles.state import State
+from cortado.particles.state import State, padded, to_device
 from cortado.scene.motions import AXES, position_name, turn_name
 
 

@@ -18,8 +18,7 @@ from cortado.files.image_encoding import LIGHT, check_light
 from cortado.fixed import fixed
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Adjoint, Snapshot, SnapshotAdjoint, SnapshotBatch
-from cortado.particles.arrays import to_device
-from cortado.particles.state import State
+from cortado.particles.state import State, to_device
 from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 

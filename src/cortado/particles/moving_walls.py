@@ -1,5 +1,7 @@
-"""The wall particles of solids that move: where they are at the end of a step, sorted by cell, and how fast the point
-of the surface above each gets there. Of a solid that turns that is not as fast as the particle.
+"""Wall particles as a search for neighbours is given them, and those of solids that move.
+
+Of solids that move they tell where they are at the end of a step, sorted by cell, and how fast the point of the surface
+above each gets there. Where a solid turns that is not as fast as the particle.
 
 A solid may be stretched about its middle by a scale sigma. Its wall particles stay as deep beneath the surface as they
 are: one that has the place r, the foot f = q - r to the point q of the surface, and the weight w, in the frame of the
@@ -21,7 +23,32 @@ from cortado.device.launching import bundle, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.particles.state import Layout
-from cortado.particles.wall_arrays import WallArrays
+
+
+@dataclass(frozen=True)
+class WallArrays:
+    """Wall particles, in any order."""
+
+    positions: np.ndarray
+    """(b, 3) [m]; of solids that move in their own frames"""
+    weights: np.ndarray
+    """(b,) what each counts for in the density, a fluid particle being 1 [-]"""
+    grips: np.ndarray
+    """(b,) the same of those without slip, and 0 of those along which fluid slips freely"""
+    feet: np.ndarray
+    """(b, 3) from each to the surface [m]"""
+    slides: np.ndarray
+    """(b, 3) how fast their surface slides along the solid [m/s]"""
+    solid: np.ndarray
+    """(b,) the number of the solid whose each is: of those that move from 0 on, of those at rest from -2 on
+    downwards; -1 of the container's"""
+
+    def some(self, which: np.ndarray) -> "WallArrays":
+        """Those that are chosen."""
+        return WallArrays(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    def __len__(self) -> int:
+        return len(self.weights)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,16 @@
-"""What a particle sees: its neighbours and the walls, as one argument of every kernel that sums over them."""
+"""What a particle sees: its neighbours, the walls and images in these, as one argument of kernels that sum over them.
+
+Flat walls mirror the fluid: an image of particle j is what one of them mirrors, or two or three that meet. A reflection
+has a bit for each wall: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32 for the upper ones. It is
+x -> R x + o, with R diagonal. Seen from particle i, the image of j is where the image of i sees j, so that every image
+that i can see is one of its neighbours, or its own. In lists of neighbours the image of j by a reflection has the
+number ``REFLECTIONS j + reflection``. A wall mirrors what is in front of it, for what is in front of it, and not a
+column that waits behind it to come out of an opening.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -11,13 +20,13 @@ from cortado.device.modules import kernel_module, kind_of
 from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
-from cortado.particles.loads import loads
-from cortado.particles.mirrors import mirror_functions
-from cortado.particles.wall_functions import wall_functions
+from cortado.particles.loads import loads, wall_functions
 
 UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
 with the particle itself, which adds nothing to a sum but W(0) to the density's."""
+REFLECTIONS = 64
+"""More than the bits of a reflection say."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Of one scene: particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
         """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours, then images that
-        it sees (`cortado.particles.mirrors`)."""
+        it sees."""
         fluid_count: wp.array(dtype=wp.int32)
         """Of the filled list, a multiple of `UNROLL`."""
         filling: wp.array(dtype=wp.int32)
@@ -137,44 +146,58 @@ def neighbourhood_type(precision: Precision) -> Any:
     return wp.struct(Neighbourhood)
 
 
-@dataclass(frozen=True)
-class PairFunctions:
-    """Warp functions of a pair of particles: see `pair_functions`."""
+@cache
+def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]:
+    """Warp functions by name: ``near_mirrors`` and ``before_mirrors`` (the bits of the walls within reach of a
+    position, on either side, and of those that it is in front of), ``reflects`` (whether bits are those of a reflection
+    in some of them) and ``reflection`` (the diagonal of R, and o)."""
+    real, vector = precision.real, precision.vector
 
-    separation: Any
-    weight: Any
-    slope: Any
-    slope_change: Any
-    slope_gradient: Any
-    gradient: Any
-    hessian_product: Any
-    per_size: Any
-    factor: Any
-    factor_gradient: Any
-    neighbour: Any
-    wall_position: Any
-    wall_weight: Any
-    wall_grip: Any
-    wall_foot: Any
-    wall_velocity: Any
-    wall_solid: Any
-    weight_in: Any
-    wall_position_dot: Any
-    wall_velocity_dot: Any
-    wall_turn_dot: Any
-    wall_growth_dot: Any
-    near_mirrors: Any
-    before_mirrors: Any
-    reflects: Any
-    reflection: Any
-    several: Any
-    vectors: Any
-    numbers: Any
-    sixes: Any
+    @wp.func
+    def near_mirrors(x: vector, s: neighbourhood) -> int:
+        found = int(0)
+        for axis in range(3):
+            if x[axis] - s.mirror_lower[axis] < s.reach:
+                found = found | (1 << axis)
+            if s.mirror_upper[axis] - x[axis] < s.reach:
+                found = found | (8 << axis)
+        return found
+
+    @wp.func
+    def before_mirrors(x: vector, s: neighbourhood) -> int:
+        found = int(0)
+        for axis in range(3):
+            if x[axis] >= s.mirror_lower[axis]:
+                found = found | (1 << axis)
+            if x[axis] <= s.mirror_upper[axis]:
+                found = found | (8 << axis)
+        return found
+
+    @wp.func
+    def reflects(bits: int, near: int) -> bool:
+        """A wall does not mirror what the one across from it does."""
+        return (bits & near) == bits and (bits & (bits >> 3)) == 0
+
+    @wp.func
+    def reflection(bits: int, s: neighbourhood):
+        flip, offset = vector(real(1.0), real(1.0), real(1.0)), vector()
+        for axis in range(3):
+            lower, upper = (bits >> axis) & 1, (bits >> (axis + 3)) & 1
+            if lower + upper == 1:
+                flip[axis] = real(-1.0)
+                offset[axis] = real(2.0) * wp.where(lower == 1, s.mirror_lower[axis], s.mirror_upper[axis])
+        return flip, offset
+
+    return {
+        "near_mirrors": near_mirrors,
+        "before_mirrors": before_mirrors,
+        "reflects": reflects,
+        "reflection": reflection,
+    }
 
 
 @cache
-def pair_functions(discretisation: Discretisation) -> PairFunctions:
+def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     """Warp functions of a separation in given neighbourhood.
 
     ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
@@ -273,7 +296,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     def sixes(a: wp.array(dtype=six), j: wp.vec4i) -> six_rows:
         return wp.matrix_from_rows(load_six(a, j[0]), load_six(a, j[1]), load_six(a, j[2]), load_six(a, j[3]))
 
-    return PairFunctions(
+    return SimpleNamespace(
         separation=nearest_image if discretisation.periodic else difference,
         weight=weight,
         slope=slope,

@@ -50,7 +50,7 @@ def camera_type(precision: Precision) -> Any:
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
-    """The Warp struct of how a view changes; see `cortado.render.cameras.ViewTangent`."""
+    """The Warp struct of how a view changes; see `cortado.render.views.ViewTangent`."""
     real, vector = precision.real, precision.vector
 
     class CameraTangent:

@@ -15,7 +15,7 @@ from cortado.device.warp_start import start_warp
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
-from cortado.particles.arrays import padded
+from cortado.particles.state import padded
 from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import positive, vector
 from cortado.render.colour_field import ColourField

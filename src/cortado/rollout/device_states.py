@@ -16,9 +16,8 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict
-from cortado.particles.arrays import components
 from cortado.particles.fields import Entry
-from cortado.particles.state import Parameters, State
+from cortado.particles.state import Parameters, State, components
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import one_for_each

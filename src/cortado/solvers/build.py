@@ -12,11 +12,10 @@ from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solid import Hollow, Mass, Solid
 from cortado.errors import InputError, shown
-from cortado.particles.arrays import padded
+from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.state import Layout
-from cortado.particles.wall_arrays import WallArrays
+from cortado.particles.state import Layout, padded
 from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.fluid_particles import reserve_offset

@@ -14,9 +14,8 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.discretise.room import TOLERANCE, Region
 from cortado.discretise.shapes import Points
-from cortado.particles.arrays import padded
 from cortado.particles.moving_walls import MovingWalls, Poses, matrix_of
-from cortado.particles.state import Layout, State
+from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1

@@ -19,11 +19,10 @@ from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
 from cortado.fixed import Staying
-from cortado.particles.arrays import Fields
 from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.state import Fields, Layout, Parameters, State
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.density import Density

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
 from cortado.device.threads import Turn
-from cortado.particles.arrays import Fields
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.state import Fields, Layout, Parameters, State
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext, Tangents
 

@@ -26,9 +26,8 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75

@@ -14,9 +14,8 @@ import warp as wp
 
 from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import pair_sum
+from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
 from cortado.particles.solid_shares import solid_kernel
 
 

@@ -25,9 +25,8 @@ from cortado.device.modules import Kernels
 from cortado.discretise.calibration import diffusion_limit
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import OutOfRangeError
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.scene.scene import Scene
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy, Mobility
 

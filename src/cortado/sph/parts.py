@@ -30,11 +30,10 @@ from cortado.device.modules import kernel_module, kind_of
 from cortado.device.reduction import add, type_name
 from cortado.discretise.walls import WallLayers
 from cortado.errors import MissingDerivativeError
-from cortado.particles.arrays import Arrays, Fields, zeros
 from cortado.particles.fields import StateField
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.solid_shares import SolidShares
-from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.state import Arrays, Fields, Layout, Parameters, State, zeros
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import argument
 from cortado.scene.parameters import Axis

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.device.precision import Precision
 from cortado.errors import InputError
-from cortado.particles.arrays import padded
+from cortado.particles.state import padded
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import stress_of

@@ -18,9 +18,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import rubbing_sum
+from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.sph.moment_functions import matrix_type
 
 

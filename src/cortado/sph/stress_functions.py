@@ -23,9 +23,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import rubbing_sum
+from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
 from cortado.sph.stress_forces import contact_functions

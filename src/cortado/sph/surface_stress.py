@@ -20,9 +20,8 @@ import warp as wp
 
 from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 
 PART = 2.0 / 3.0
 """How much less of the stress acts across the surface than along it; see above."""

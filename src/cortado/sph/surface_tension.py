@@ -20,11 +20,9 @@ from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
-from cortado.particles.arrays import zeros
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.pair_sums import fluid_sum
-from cortado.particles.state import Layout
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.state import Layout, zeros
 from cortado.scene.scene import Scene
 from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.curvature_kernels import curvature_kernels, entries

@@ -18,9 +18,8 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import arithmetic
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import rubbing_sum
+from cortado.particles.pair_sums import adjoint_of, rubbing_sum, tangent_of
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.implicit_viscosity import stress_of

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
-from cortado.particles.arrays import Fields
-from cortado.particles.state import Parameters, State
+from cortado.particles.state import Fields, Parameters, State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantities.formulas import OnDevice, Particles, Pressures, Sums, formulas
 from cortado.runs.quantities.moment import Moment

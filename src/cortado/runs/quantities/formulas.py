@@ -21,8 +21,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
-from cortado.particles.arrays import Fields, padded
 from cortado.particles.solid_shares import ALL_WALLS
+from cortado.particles.state import Fields, padded
 from cortado.scene.quantity_names import load_name
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver

@@ -23,7 +23,7 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solid import Solid
 from cortado.fixed import fixed
-from cortado.particles.arrays import padded
+from cortado.particles.state import padded
 from cortado.runs.sensors.sensor import (
     ACROSS,
     Reading,

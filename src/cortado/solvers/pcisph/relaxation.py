@@ -30,9 +30,8 @@ import warp as wp
 
 from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
-from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.sph.walls import wall_slope_sums
 
 SOFTNESS = 0.2

@@ -8,8 +8,7 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.reduction import add
-from cortado.particles.arrays import zeros
-from cortado.particles.state import Layout
+from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import density_name
 from cortado.solvers.projection.body_kernels import body_kernels
 from cortado.solvers.projection.body_motion import motion_kernels

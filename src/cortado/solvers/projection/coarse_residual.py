@@ -21,9 +21,8 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.solvers.projection.coarse_nodes import source_type
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums

@@ -1,4 +1,4 @@
-"""Images of the fluid in flat walls that mirror it (`cortado.particles.mirrors`), in place of the walls' particles.
+"""Images of the fluid in flat walls that mirror it (`cortado.particles.neighbourhood`), in place of wall particles.
 
 Wall particles hold what is alone, but rows that a wave draws out beside a wall are out of their order: D takes them for
 compressed, which damps waves, and still water is stirred. A mirror is right wherever rows stand. So images count h

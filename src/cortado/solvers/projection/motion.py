@@ -34,8 +34,8 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
+from cortado.particles.made_derivatives import pointwise_kernels
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.pointwise import pointwise_kernels
 from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type

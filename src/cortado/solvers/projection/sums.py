@@ -11,9 +11,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import arithmetic
-from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
 CROWDED = 0.25
