@@ -7,9 +7,7 @@ from tyro.extras import SubcommandApp
 
 from benchmarks.bench.timing import MOST_REPEATS
 from cortado.arrays import require_at_most
-from cortado.cli.arguments import Flag, require_at_least
-from cortado.cli.command import Work, command
-from cortado.cli.parsing import Program
+from cortado.cli.arguments import Flag, Program, Work, command, require_at_least
 from cortado.cli.process import main
 
 app = SubcommandApp()

@@ -7,9 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Flag, Overrides, as_text
-from cortado.cli.command import Work, command
-from cortado.cli.parsing import Program
+from cortado.cli.arguments import Flag, Overrides, Program, Work, as_text, command
 from cortado.cli.process import main
 
 app = SubcommandApp()

@@ -17,7 +17,7 @@ from PIL import Image
 
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.view import opened
+from cortado.cli.viewer.views import opened
 from cortado.cli.viewer.window import PULL
 
 PORT = 18410

@@ -20,7 +20,6 @@ import pytest
 
 import cortado.cli.commands.optimise
 import cortado.cli.commands.run
-import cortado.cli.commands.run_recording
 import cortado.files.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
@@ -177,7 +176,7 @@ def interrupting(after):
 
 
 def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatch):
-    monkeypatch.setattr(cortado.cli.commands.run_recording, "track", interrupting(after=3))
+    monkeypatch.setattr(cortado.cli.commands.run, "track", interrupting(after=3))
     code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
@@ -213,7 +212,7 @@ def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command
         told.append(whole)
         yield lambda n: told.append(n)
 
-    monkeypatch.setattr(cortado.cli.commands.run_recording, "track", track)
+    monkeypatch.setattr(cortado.cli.commands.run, "track", track)
     arguments = ["--time", 0.02, "--set", "solver.time_step=auto", "--no-pictures", "--out", "dam"]
     assert cortado_command("run", "scene.toml", *arguments)[0] == 0
     assert told[0] == (100, "run, % of its time") and sum(told[1:]) == 100 and min(told[1:]) >= 0
@@ -221,9 +220,9 @@ def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command
 
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
-    for module in (cortado.cli.commands.run_recording, cortado.cli.commands.optimise):
+    for module in (cortado.cli.commands.run, cortado.cli.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.cli.commands.run_recording, "frame_writer", interrupting(after=-1))
+    monkeypatch.setattr(cortado.cli.commands.run, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 

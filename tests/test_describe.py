@@ -10,10 +10,9 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.drawing_time import seconds_of_picture
+from cortado.cli.commands.describe import RunLength, seconds_of_picture
 from cortado.cli.commands.run import RunRequest, run_scene
-from cortado.cli.commands.run_length import RunLength
-from cortado.cli.commands.run_summary import Energy, RunSummary
+from cortado.cli.commands.run_report import Energy, RunSummary
 from cortado.discretise.calibration import SLACK
 from cortado.discretise.smoothing import KERNELS
 from cortado.optimisation.inverse.in_words import task_in_words
@@ -109,7 +108,7 @@ def test_the_run_and_its_film_are_told(capsys):
 
 def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
     drawn, ticks = [], iter([3.0, 5.5])
-    monkeypatch.setattr("cortado.cli.commands.drawing_time.time.perf_counter", lambda: next(ticks))
+    monkeypatch.setattr("cortado.cli.commands.describe.time.perf_counter", lambda: next(ticks))
     monkeypatch.setattr(PlanePainter, "image", lambda _, *state: drawn.append(len(state[0])))
     simulation = cortado.Simulation("scene.toml")
     assert seconds_of_picture(simulation) == 2.5 and drawn == 2 * [simulation.particles]

@@ -25,7 +25,7 @@ from cortado import (
     Simulation,
     executors,
 )
-from cortado.cli.commands.executor import Where
+from cortado.cli.commands.options import Where
 from cortado.device import worker_calls as calls
 from cortado.device.threads import usable_cores
 from cortado.errors import CortadoError, OutOfRangeError
@@ -512,7 +512,7 @@ def test_no_more_processes_than_items(monkeypatch):
         started.append((number, device))
         yield InProcess()
 
-    monkeypatch.setattr("cortado.cli.commands.executor.local_workers", local_workers)
+    monkeypatch.setattr("cortado.cli.commands.options.local_workers", local_workers)
     for workers, items in ((40, 1), (3, 8), (2, 0)):
         with Where(workers=workers).executor("cuda:0", items):
             pass

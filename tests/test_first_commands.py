@@ -17,10 +17,8 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
 from cortado.cli.commands.new import scene_text, templates
-from cortado.cli.commands.overview import COMMANDS
-from cortado.cli.gradient_commands import gradients
-from cortado.cli.subcommands import app
-from cortado.cli.usage import usage_sentence
+from cortado.cli.process import usage_sentence
+from cortado.cli.subcommands import COMMANDS, app, gradients
 from cortado.files.input_files import SCHEMA, examples_folder
 from cortado.optimisation.inverse.file_schema import file_schema, file_schema_text
 

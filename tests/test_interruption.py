@@ -28,7 +28,7 @@ except KeyboardInterrupt as stop:
 WORKERS = f"""{START}
 import os, signal
 from multiprocessing.context import SpawnProcess
-from cortado.cli.commands.executor import Where
+from cortado.cli.commands.options import Where
 
 start, begun = SpawnProcess.start, []
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.cli.commands.run_recording as run_recording
+import cortado.cli.commands.run as run_recording
 from bad_scenes import assert_one_sentence
 from cortado import InputError, Simulation, Trajectory, load_scene
 from cortado.runs.frame_file import Marks

@@ -10,7 +10,7 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
 from cortado.certificate import certify
-from cortado.cli.commands.run_summary import Energy, RunSummary
+from cortado.cli.commands.run_report import Energy, RunSummary
 from cortado.scene.motions import Course
 from cortado.scene.parameter_values import Tilt
 from cortado.scene.scene import scene_in_words

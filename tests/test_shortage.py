@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from bad_tasks import TINY_SCENE
-from cortado.cli.shortage import shortage
+from cortado.cli.process import shortage
 
 MAPPING = "libx.so: failed to map segment from shared object"
 

@@ -301,7 +301,7 @@ def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
         numbers.append(number)
         yield InProcess()
 
-    monkeypatch.setattr("cortado.cli.commands.executor.local_workers", local_workers)
+    monkeypatch.setattr("cortado.cli.commands.options.local_workers", local_workers)
     one = ("task.toml", "--set", "problem.steps=4", "--out", "all")
     assert sweep(*one, "--workers", 40)[0] == 0 and numbers == [1]
     code, out, err = sweep(*one, "--workers", 10**6)

@@ -10,13 +10,9 @@ from scipy.spatial.transform import Rotation
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.view import opened
-from cortado.cli.viewer import quantities as view_quantities
-from cortado.cli.viewer.live import LiveView
-from cortado.cli.viewer.quantities import AHEAD, upwards
-from cortado.cli.viewer.recorded import RecordedView
-from cortado.cli.viewer.task import TaskView
-from cortado.cli.viewer.window import LONGEST_ARROW, PULL
+from cortado.cli.viewer import window as view_window
+from cortado.cli.viewer.views import LiveView, RecordedView, TaskView, opened
+from cortado.cli.viewer.window import AHEAD, LONGEST_ARROW, PULL, upwards
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
 from cortado.pictures.shown_solids import solid_outline
@@ -123,7 +119,7 @@ def test_pressures_carry_the_fluid(scene):
     at_rest = simulation.run(600, record_every=600).last_state
 
     def pressures(state, controls):
-        return view_quantities.quantities_of(state["velocities"], lambda: simulation, state, controls)["pressure"]()
+        return view_window.quantities_of(state["velocities"], lambda: simulation, state, controls)["pressure"]()
 
     found = pressures(at_rest, {})
     depth = 0.4 - at_rest["positions"][:, 1]
@@ -138,7 +134,7 @@ def test_the_pull_is_minus_the_gradient(scene):
     """That of the same problem from the first state, in the public face."""
     simulation = cortado.Simulation(scene, precision="float64")
     first = simulation.run(1)[:1]
-    pull = view_quantities.pull_on_height(lambda: simulation, first.last_state, {})()
+    pull = view_window.pull_on_height(lambda: simulation, first.last_state, {})()
     steps = round(AHEAD / simulation.scene.solver.time_step)
     loss = cortado.losses.CentreOfMassAlong(upwards(simulation.scene))
     problem = cortado.Problem(simulation, steps, loss)
@@ -173,7 +169,7 @@ def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypa
         assert "without a pressure" in shown.window.legend.content
     finally:
         shown.window.close()
-    monkeypatch.setattr(view_quantities, "ParticleSolver", int)  # a solver of another kind
+    monkeypatch.setattr(view_window, "ParticleSolver", int)  # a solver of another kind
     own = coloured(live, "phase")
     np.testing.assert_array_equal(coloured(live, "density"), own)
     assert "no densities" in live.window.legend.content
@@ -221,7 +217,7 @@ def test_a_step_that_fails_says_why(task, monkeypatch):
     def fails(*_args, **_options):
         raise cortado.ComputationError("The run diverged.")
 
-    monkeypatch.setattr("cortado.cli.viewer.task.optimise", fails)
+    monkeypatch.setattr("cortado.cli.viewer.views.optimise", fails)
     task._wished, loss = True, task.loss
     task.tick()
     assert "The run diverged." in task.told.content and task.loss == loss and not task.button.disabled

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from tyro.extras import SubcommandApp
 
-from cortado.cli.command import Work, command
-from cortado.cli.parsing import Program
+from cortado.cli.arguments import Program, Work, command
 from cortado.cli.process import main
 
 from .cases import CaseName

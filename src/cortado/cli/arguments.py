@@ -1,49 +1,96 @@
-"""Arguments that several commands have, and what is asked of their values before a command begins."""
+"""How a function becomes a command, the arguments that several commands have, and words that name a command.
 
+What is asked of the values of arguments is checked here, before a command begins and imports what it needs.
+"""
+
+import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
+from functools import partial, wraps
+from inspect import Parameter, signature
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
 from tyro.conf import Positional, UseAppendAction, arg
+from tyro.extras import SubcommandApp
 
 from cortado.errors import InputError
+from cortado.files.terminal import quietly
 from cortado.scene.toml import read_toml
 
 if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice
 
+Work = Callable[[], str]
+"""What a command does once its arguments are understood; returns what it prints."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
+Task = Annotated[Positional[Path], arg(metavar="TASK.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 """An option without a value, of which the help says no default."""
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
 Device = Annotated[str, arg(help='"cpu", or "cuda:0" for the first GPU.')]
 Precision = Annotated[str, arg(help='"float32" or "float64".')]
 Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="")]
-
+Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 STEPS = 200
 """Of a run that is not said to be longer or shorter."""
 
 
-def require_at_least(least: int, value: int, option: str) -> None:
-    """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
-    if value < least:
-        raise InputError(f"{option} is {value}, but must be at least {least}.")
+def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
+    """Makes a function a command of a group, with an option --quiet. What it prints at the end is either what was asked
+    for, as it ``answers``, or a line about the files that it wrote."""
+
+    def register(function: Callable[..., Work]) -> Callable[..., Work]:
+        @wraps(function)
+        def with_quiet(*arguments: Any, quiet: bool = False, **options: Any) -> Work:
+            work = function(*arguments, **options)
+            return partial(_quiet, work, answers) if quiet else work
+
+        own = signature(function)
+        option = Parameter("quiet", Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
+        with_quiet.__signature__ = own.replace(parameters=[*own.parameters.values(), option])  # type: ignore[attr-defined]
+        with_quiet.__annotations__ = {**function.__annotations__, "quiet": Quiet}
+        del with_quiet.__wrapped__  # of which tyro would take the annotations
+        group.command(with_quiet)
+        return function
+
+    return register
 
 
-def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """The number of steps, `STEPS` if neither was given; None with a time [s]. Raises `InputError` for both, and for a
-    time that is none."""
-    if time is None:
-        return STEPS if steps is None else steps
-    if steps is not None:
-        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
-    if not 0.0 < time < inf:
-        raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
-    return None
+def _quiet(work: Work, answers: bool) -> str:
+    with quietly():
+        text = work()
+    return text if answers else ""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A group of commands, and what one types to run it."""
+
+    name: str
+    app: SubcommandApp
+    description: str
+    overview: Callable[[], str] | None = None
+    """What it prints without arguments, if not its help."""
+
+    def parsed(self, arguments: Sequence[str]) -> Any:
+        """What the command returns that the arguments name; prints help and exits where they ask for it, or where they
+        are misused."""
+        config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+        return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
+
+    def completion_script(self, shell: str) -> str:
+        """The script for a shell, as tyro prints it and exits; bash completes names of files where nothing else
+        fits."""
+        box = io.StringIO()
+        with redirect_stdout(box), suppress(SystemExit):
+            self.parsed(["--tyro-print-completion", shell])
+        return box.getvalue().rstrip("\n").replace("complete -F ", "complete -o bashdefault -o default -F ")
 
 
 @dataclass(frozen=True)
@@ -71,10 +118,36 @@ class FrameOptions:
 ALL_FRAMES = FrameOptions()
 
 
-def require_toml(file: Path, overrides: Sequence[str] = ()) -> None:
-    """Raises `SceneError` for a file that cannot be read, or for overrides of what it has not: at once, as what a
-    command imports after that takes a second."""
-    read_toml(file, overrides)
+def require_at_least(least: int, value: int, option: str) -> None:
+    """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
+    if value < least:
+        raise InputError(f"{option} is {value}, but must be at least {least}.")
+
+
+def require_one_of_both(resume: bool, overwrite: bool) -> None:
+    """Raises `InputError` where a command is to go on with a run and to replace it."""
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+
+
+def steps_or_time(steps: int | None, time: float | None) -> int | None:
+    """The number of steps, `STEPS` if neither was given; None with a time [s]. Raises `InputError` for both, and for a
+    time that is none."""
+    if time is None:
+        return STEPS if steps is None else steps
+    if steps is not None:
+        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
+    if not 0.0 < time < inf:
+        raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
+    return None
+
+
+def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
+    """What was given to --set for a file, as `as_text`. Raises `SceneError` for a file that cannot be read, or for
+    overrides of what it has not: at once, as what a command imports after that takes a second."""
+    words = as_text(overrides)
+    read_toml(file, words)
+    return words
 
 
 def as_text(options: Sequence[str]) -> list[str]:

@@ -1,20 +1,24 @@
-"""A command from its words to its exit code, with a sentence where it fails."""
+"""A command from its words to its exit code, with a sentence where it fails.
+
+The sentence is ours where tyro cannot understand the words, and where the computer, or a limit set to the process, has
+no more memory, open files or threads to give.
+"""
 
 import io
 import logging
 import os
+import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stderr
+from difflib import get_close_matches
+from errno import EMFILE, ENFILE, ENOMEM
 from signal import SIGINT
 
-from cortado.cli.command import Work
-from cortado.cli.parsing import Program, parsed
-from cortado.cli.shortage import shortage
+from cortado.cli.arguments import Program, Work
 from cortado.cli.subcommands import CORTADO
-from cortado.cli.usage import usage_sentence
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, MassWarning
+from cortado.errors import LONGEST, ComputationError, CortadoError, CortadoWarning, InputError, MassWarning
 from cortado.files.interruption import Interrupted
 from cortado.files.terminal import say, tell, to_stdout
 from cortado.version import __version__
@@ -38,20 +42,21 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
             text = work()
             if text:
                 tell(text)
-    except ComputationError as error:
-        sys.exit(_say(error, 1))
     except CortadoError as error:
-        sys.exit(_say(error, 2))
+        say(str(error))
+        sys.exit(1 if isinstance(error, ComputationError) else 2)
     except KeyboardInterrupt as stop:
         stop = stop if isinstance(stop, Interrupted) else Interrupted(SIGINT)
-        sys.exit(_say(stop, stop.code))
+        say(str(stop))
+        sys.exit(stop.code)
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
     except Exception as error:
         sentence = shortage(error) or _complaint(error)
         if sentence is None:
             raise
-        sys.exit(_say(sentence, 1))
+        say(sentence)
+        sys.exit(1)
 
 
 def _understood(program: Program, arguments: Sequence[str]) -> Work:
@@ -65,16 +70,11 @@ def _understood(program: Program, arguments: Sequence[str]) -> Work:
             if list(arguments) == ["--version"]:
                 print(f"cortado {__version__}")
                 sys.exit(0)
-            return parsed(program, arguments)
+            return program.parsed(arguments)
     except SystemExit as end:
         if not end.code:
             raise
         raise InputError(usage_sentence(box.getvalue(), arguments, program.name)) from None
-
-
-def _say(error: BaseException | str, code: int) -> int:
-    say(str(error))
-    return code
 
 
 def _complaint(error: Exception) -> str | None:
@@ -86,3 +86,95 @@ def _complaint(error: Exception) -> str | None:
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:
     if issubclass(category, CortadoWarning) and not issubclass(category, MassWarning):
         say(f"Warning: {message}")
+
+
+_COMMAND = re.compile(
+    r"(new|examples|describe|run|compare|convergence|optimise|fit|picture|export|view|sweep|dataset|schema|completion"
+    r"|gradients( check)?|figure|study)(?= |$)"
+)
+_EDGES = "│|╭╮╰╯─-+ "
+
+
+def _unknown_command(match: re.Match[str]) -> str:
+    word, commands = match.groups()
+    close = get_close_matches(word, commands.split(", "), n=1)
+    return (
+        f"{word} is unknown; {close[0]} may be meant" if close else f"{word} is unknown, but must be one of {commands}"
+    )
+
+
+_SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r"Expected one of \{(.*)\}", r"a command is missing, one of \1"),
+    (r"Unrecognized or misplaced options: (\S+?),?(?: .*)?", r"\1 is no option here"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Perhaps you meant: (\S+).*", r"\1 is unknown; \2 may be meant"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Available subcommands: (.*)", _unknown_command),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)?", r"\1 is unknown, or one too many"),
+    (r"Missing from .*?: (\S+) .*", r"\1 is missing"),
+    (r"Missing value for argument '(-\S+)'.*", r"\1 is given without a value"),
+    (r"Missing value for argument '(\S+)'.*", r"the \1 is missing"),
+    (r"invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)", r"\2 is '\1', but must be one of \3"),
+    (r"Error parsing (\S+): invalid literal for int.*?: (.*)", r"\1 is \2, but must be a whole number"),
+    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2, but must be a number"),
+    (
+        r"Error parsing (\S+): no type .*\|INT .*? from \[(.*?)\]\. .*",
+        r"\1 is \2, but must be a whole number",
+    ),
+    (
+        r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*",
+        r"\1 is \2, but must be a number",
+    ),
+    (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
+)
+"""What tyro says, and what we say; where its words are none of these, as of another release, they come as they are."""
+MOVED = {
+    "bench": "python -m benchmarks bench",
+    "gradients figure": "python -m experiments figure",
+    "gradients study": "python -m experiments study",
+}
+"""Commands of before, and what one types in a clone of the repository in their place."""
+
+
+def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
+    """What tyro says in its box about the arguments of a program, as a sentence of ours."""
+    words = " ".join(arguments)
+    for before, now in MOVED.items():
+        if program == "cortado" and f"{words} ".startswith(f"{before} "):
+            return f"cortado {before} is now {now}, in a clone of the repository."
+    lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
+    text = " ".join(line for line in lines if line)
+    text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")
+    found = ((re.fullmatch(theirs, text), ours) for theirs, ours in _SENTENCES)
+    said = next((ours(match) if callable(ours) else match.expand(ours) for match, ours in found if match), text)
+    said = said if len(said) <= 2 * LONGEST else f"{said[: 2 * LONGEST]}..."
+    command = _COMMAND.match(words)
+    return f"{said}; see {program} {f'{command[0]} ' if command else ''}--help."
+
+
+_MEMORY = (os.strerror(ENOMEM), "failed to map segment")
+_FILES = (os.strerror(EMFILE), os.strerror(ENFILE))
+_THREADS = ("can't start new thread",)
+"""Told by their words: an error of the dynamic linker is an `ImportError`, or an `OSError` without a number."""
+
+
+def shortage(error: BaseException) -> str | None:
+    """A sentence for an error that came of a shortage, directly or as the cause of another; None for any other."""
+    for cause in _causes(error):
+        if isinstance(cause, MemoryError) or _says(cause, _MEMORY):
+            what = f" ({cause})" if str(cause) else ""
+            return f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every."
+        if _says(cause, _FILES):
+            return f"Too many files are open ({cause}); allow this process more of them (ulimit -n 1024)."
+        if _says(cause, _THREADS):
+            return "No more threads can be started; allow this process more of them (ulimit -u) or more memory."
+    return None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """The error, what it came of, what that came of, and so on."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _says(error: BaseException, words: tuple[str, ...]) -> bool:
+    return isinstance(error, OSError | ImportError | RuntimeError) and any(word in str(error) for word in words)

@@ -1,4 +1,7 @@
-"""Every command but those of ``cortado gradients``: their arguments and their help."""
+"""The commands of ``cortado`` alone and of ``cortado gradients``: their arguments and their help.
+
+Those of runs that are there, and of many runs, are functions of `cortado.cli.runs_and_sweeps`.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -15,20 +18,59 @@ from cortado.cli.arguments import (
     Json,
     Overrides,
     Precision,
+    Program,
     Scene,
+    Task,
+    Work,
     as_text,
+    command,
     command_line,
-    require_toml,
+    require_at_least,
+    require_one_of_both,
     steps_or_time,
+    text_overrides,
 )
-from cortado.cli.command import Work, command
-from cortado.cli.gradient_commands import gradients
-from cortado.cli.many_runs import convergence, dataset, sweep
-from cortado.cli.parsing import Program, completion_script
-from cortado.cli.show_commands import export, picture, view
+from cortado.cli.runs_and_sweeps import compare, convergence, dataset, export, picture, sweep, view
 from cortado.errors import InputError
+from cortado.version import __version__
 
+gradients = SubcommandApp()
 app = SubcommandApp()
+
+
+@command(gradients, answers=True)
+def check(
+    scene: Scene,
+    steps: int = 50,
+    parameters: tuple[str, ...] = ("gravity",),
+    loss: str = "positions",
+    perturbation: float = 0.05,
+    out: Path | None = None,
+    overrides: Overrides = (),
+    device: Device = "cpu",
+    json: Flag = False,
+    seed: int = 0,
+) -> Work:
+    """Check the gradients of a scene, in float64: are they right, up to which step are they useful, what to use beyond.
+
+    Args:
+        scene: The scene file.
+        steps: Number of time steps.
+        parameters: Parameters whose horizon is measured; the adjoint is checked for all of them.
+        loss: How far the fluid has come, by "positions" of particles, "centre-of-mass" or "image".
+        perturbation: How large a meaningful perturbation of a parameter is, relative to its size.
+        out: Folder for a figure and the numbers.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        json: Print JSON for machines instead of a table.
+        seed: Of the random directions.
+    """
+    require_at_least(0, seed, "--seed")
+    words = text_overrides(scene, overrides)
+    from cortado.cli.commands.check import check_scene
+
+    return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
+
+
 app.command(gradients, name="gradients", help="Check the gradients of a scene; the gradient study.")
 
 
@@ -63,7 +105,7 @@ def examples(
     """
     if to is not None and not copy:
         raise InputError("--to is given, but must be left out, as --copy says of nothing that it is copied.")
-    from cortado.cli.commands.examples import list_examples
+    from cortado.cli.commands.new import list_examples
 
     return partial(list_examples, as_text(copy), to or Path())
 
@@ -92,8 +134,7 @@ def describe(
     """
     frames.check()
     steps = steps_or_time(steps, time)
-    words = as_text(overrides)
-    require_toml(scene, words)
+    words = text_overrides(scene, overrides)
     from cortado.cli.commands.describe import describe_scene
 
     return partial(describe_scene, scene, steps, time, frames.choice(), words, device, precision, picture, json)
@@ -129,43 +170,22 @@ def run(
         pictures: Leave out the shaded pictures and the film.
         record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
     """
-    if resume and overwrite:
-        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    require_one_of_both(resume, overwrite)
     frames.check()
     steps = steps_or_time(steps, time)
-    words, wanted, told = as_text(overrides), as_text(record), command_line()
-    require_toml(scene, words)
+    wanted, words, told = as_text(record), text_overrides(scene, overrides), command_line()
     from cortado.cli.commands.run import RunRequest, run_scene
 
     asked = (steps, time, words, device, precision, frames.choice(), wanted, state, resume, overwrite, pictures, told)
     return partial(run_scene, scene, RunRequest(out, *asked))
 
 
-@command(app, answers=True)
-def compare(
-    first: Annotated[Positional[Path], arg(metavar="RUN")],
-    second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
-    json: Json = False,
-) -> Work:
-    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made. Or
-    compare the sensors of a run with measured data.
-
-    Args:
-        first: The folder of a run.
-        second: The folder of another, or a table of measured data with the columns of sensors.csv.
-    """
-    if second.suffix.lower() == ".csv":
-        from cortado.cli.commands.measured import compare_with_data
-
-        return partial(compare_with_data, first, second, json)
-    from cortado.cli.commands.compare import compare_runs
-
-    return partial(compare_runs, first, second, json)
+command(app, answers=True)(compare)
 
 
 @command(app)
 def optimise(
-    task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
+    task: Task,
     out: Path = Path("runs/optimise"),
     overrides: Overrides = (),
     device: Device = "cpu",
@@ -188,12 +208,10 @@ def optimise(
         workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
         pictures: Leave out the shaded pictures and the films.
     """
-    if resume and overwrite:
-        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
-    words, told = as_text(overrides), command_line()
-    require_toml(task, words)
-    from cortado.cli.commands.executor import Where
+    require_one_of_both(resume, overwrite)
+    words, told = text_overrides(task, overrides), command_line()
     from cortado.cli.commands.optimise import optimise_task
+    from cortado.cli.commands.options import Where
 
     where = Where(scheduler, workers)
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
@@ -201,7 +219,7 @@ def optimise(
 
 @command(app, answers=True)
 def fit(
-    task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
+    task: Task,
     out: Path = Path("runs/fit"),
     overrides: Overrides = (),
     device: Device = "cpu",
@@ -216,16 +234,14 @@ def fit(
         overrides: Replace a value of the file, such as fit.profiles=0; may be given again.
         overwrite: Replace an earlier run in the same folder.
     """
-    words, told = as_text(overrides), command_line()
-    require_toml(task, words)
+    words, told = text_overrides(task, overrides), command_line()
     from cortado.cli.commands.fit import fit_task
 
     return partial(fit_task, task, out, words, device, precision, overwrite, told)
 
 
-for show in (picture, export, view):
-    command(app)(show)
-command(app)(sweep)
+for function in (picture, export, view, sweep):
+    command(app)(function)
 command(app, answers=True)(convergence)
 command(app)(dataset)
 
@@ -233,9 +249,9 @@ command(app)(dataset)
 @command(app, answers=True)
 def schema() -> Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
-    from cortado.cli.commands.schema import print_schema
+    from cortado.optimisation.inverse.file_schema import file_schema_text
 
-    return print_schema
+    return lambda: file_schema_text().rstrip("\n")
 
 
 @command(app, answers=True)
@@ -245,18 +261,54 @@ def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar=
     Args:
         shell: bash or zsh.
     """
-    return partial(completion_script, CORTADO, shell)
+    return partial(CORTADO.completion_script, shell)
 
 
-def _overview() -> str:
-    from cortado.cli.commands.overview import overview
+_GROUPS = {
+    "Begin": (
+        ("cortado new dam.toml", "write a commented scene that runs at once"),
+        ("cortado describe dam.toml", "particles, memory, time, what limits its time step"),
+        ("cortado run dam.toml --out runs/dam", "run it; open runs/dam/report.html"),
+        ("cortado picture runs/dam", "a shaded picture of it; --film for a film"),
+        ("cortado export runs/dam --to usd", "for Blender, Houdini; --to vtp for ParaView"),
+        ("cortado view runs/dam", "play it in the browser; a scene runs there, live"),
+        ("cortado examples", "list the examples; --copy NAME brings one here"),
+    ),
+    "Go on": (
+        ("cortado run dam.toml --out runs/fine --set discretisation.spacing=0.02", "replace a value"),
+        ("cortado compare runs/dam runs/fine", "two runs: the same scene? how far apart?"),
+        ("cortado optimise task.toml --out runs/found", "find what a task file asks for; --resume goes on"),
+        ("cortado fit task.toml --out runs/fit", "a viscosity with an error bar, from a video or a force"),
+        ("cortado sweep dam.toml --set phase.0.viscosity=0.05,0.1", "every combination of some values"),
+        ("cortado picture runs/sweep --film", "its runs side by side"),
+        ("cortado convergence runs/sweep", "of several spacings: the order, the limit"),
+        ("cortado dataset dam.toml --runs 100 --out data", "varied runs to train on, as LagrangeBench's"),
+        ("cortado gradients check dam.toml --steps 20", "are gradients right, and for how long?"),
+    ),
+    "Set up": (
+        ("cortado schema", "the JSON schema of scenes, for editors"),
+        ("cortado completion bash", "completion of commands and options by the shell"),
+    ),
+}
+COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
+"""Every example, as one would type it."""
 
-    return overview()
+
+def overview() -> str:
+    """What one can do, each with an example: what ``cortado`` alone prints."""
+    lines = [f"Cortado {__version__}, a differentiable SPH fluid simulator."]
+    for title, entries in _GROUPS.items():
+        lines += ["", f"{title}:"]
+        for typed, meaning in entries:
+            fits = len(typed) <= 41
+            lines += [f"  {typed:<41}  {meaning}"] if fits else [f"  {typed}", f"  {'':<41}  {meaning}"]
+    lines += ["", "Every command has --help, and --quiet for no more than results, warnings and errors."]
+    return "\n".join(lines)
 
 
 CORTADO = Program(
     "cortado",
     app,
     "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples.",
-    _overview,
+    overview,
 )

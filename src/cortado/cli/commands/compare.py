@@ -1,40 +1,57 @@
-"""``cortado compare``: two runs, how far apart they ended and why that may be."""
+"""Runs beside others: ``cortado compare`` of two, or of sensors and measured data, and ``cortado convergence``.
+
+Two runs: how far apart they ended, and why that may be. Several at other resolutions: the order of convergence, and the
+limit.
+"""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError, shown
-from cortado.files.input_files import content, reason
-from cortado.files.output_files import parsed_json
+from cortado.cli.commands.options import OwnQuantity, named_runs
+from cortado.errors import InputError, shown, warn
+from cortado.optimisation.sweep import Extrapolation
+from cortado.pictures.run_plots import beside_measured
 from cortado.pictures.side_by_side import differences
+from cortado.runs.run_files import read_json
 from cortado.runs.run_folder import RunFolder
+from cortado.runs.sensors.readings import MeasuredColumn, measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
-_LARGEST = 2**31
-"""Bytes of a file that is read."""
-_IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
+IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
 """Keys of environment.json that differ between any two runs, or are compared apart."""
 SAME_TIME = 1e-9
 """Relative: times that differ by less are the same, as so many steps of another length add up to."""
-_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
+FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 """Of the fields of a frame."""
+
+
+SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
+SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
+LEAST_RUNS = 3
+"""Runs that an order takes."""
+SAME_MASS = 0.005
+"""Relative: masses of fluid that differ by less are the same."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
     """What is the same and what differs, as text or as JSON. Two runs that differ are no failure."""
     found = _compared(RunFolder.open(first), RunFolder.open(second))
-    return json.dumps(found, indent=2) if as_json else _as_text(found)
+    return json.dumps(found, indent=2) if as_json else _in_words(found)
 
 
 def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    here, there = (_json(folder.environment) for folder in (one, other))
-    environments = [{key: value for key, value in noted.items() if key not in _IGNORED} for noted in (here, there)]
+    here, there, *scenes = (
+        _table(read_json(path)) if path.exists() else {}
+        for path in (one.environment, other.environment, one.scene, other.scene)
+    )
+    environments = [{key: value for key, value in noted.items() if key not in IGNORED} for noted in (here, there)]
     settings = [{"kind": noted.get("kind"), **_table(noted.get("settings"))} for noted in (here, there)]
-    scenes = [_json(folder.scene) for folder in (one, other)]
     found: dict[str, Any] = {
         "runs": [str(one.path), str(other.path)],
         "scene": differences(scenes[0], scenes[1]),
@@ -51,24 +68,12 @@ def _is_equal(found: Mapping[str, Any]) -> bool:
     """Whether nothing differs but where the runs were made."""
     state = found["last_state"]
     same_state = state is None or (
-        "unlike" not in state and _at_one_time(*state["times_s"]) and not any(map(_size, state["fields"].values()))
+        "unlike" not in state
+        and _at_one_time(*state["times_s"])
+        and not any(field["greatest"] for field in state["fields"].values())
     )
     same = not any(found[part] for part in ("scene", "settings", "result")) and not found["metrics"]
     return same and same_state
-
-
-def _size(field: Mapping[str, Any]) -> float:
-    return field["greatest"]
-
-
-def _json(path: Path) -> dict[str, Any]:
-    """Of a file that may not be there; raises `InputError`."""
-    if not path.exists():
-        return {}
-    try:
-        return _table(parsed_json(content(path, _LARGEST)))
-    except (OSError, ValueError) as problem:
-        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
 
 
 def _table(value: Any) -> dict[str, Any]:
@@ -128,7 +133,7 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
         words = [f"{particles} particles in {dimension}-D" for particles, dimension in shapes]
         return {**found, "unlike": f"{words[0]} and {words[1]} cannot be compared one by one", "fields": {}}
     fields = {}
-    for name, unit in _UNITS.items():
+    for name, unit in FIELD_UNITS.items():
         values = [getattr(frame, name) for frame in frames]
         if all(value is not None for value in values) and values[0].shape == values[1].shape:
             fields[name] = {"unit": unit, **_distance(*(value.astype(np.float64) for value in values))}
@@ -161,10 +166,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
     }
 
 
-# ---- words -------------------------------------------------------------------------------------------------------
-
-
-def _as_text(found: Mapping[str, Any]) -> str:
+def _in_words(found: Mapping[str, Any]) -> str:
     lines = [f"first: {found['runs'][0]}", f"second: {found['runs'][1]}"]
     lines += [_part("scene", found["scene"]), _part("settings", found["settings"])]
     lines += [_state(found["last_state"]), _metric_line(found["metrics"])]
@@ -211,3 +213,165 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
         at_most = f", at most {greatest}" if greatest else ""
         words.append(f"the first that differs is line {metrics['first_different_line']}{at_most}")
     return f"metrics: {'; '.join(words)}"
+
+
+def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
+    """The errors, as text or as JSON; the plot is written into the run's figures."""
+    folder = RunFolder.open(run)
+    readings = folder.read_sensors()
+    if not readings:
+        raise InputError(f"{folder.path} has no sensors.csv, but must be a run of a scene with [[sensor]]s.")
+    found = measured_beside(data, readings)
+    plot = beside_measured(readings, found, folder.figures / "measured.png")
+    if as_json:
+        each = {one.name: {"unit": one.unit, "points": len(one.times), **one.errors} for one in found}
+        return json.dumps({"run": str(folder.path), "data": str(data), "plot": str(plot), "errors": each}, indent=2)
+    return "\n".join([*map(_line, found), f"The plot is {plot}."])
+
+
+def _line(one: MeasuredColumn) -> str:
+    errors, unit = one.errors, one.unit
+    left_out = f", {one.left_out} more are outside of the run" if one.left_out else ""
+    return (
+        f"{one.name}: simulated less measured {errors['root_mean_square']:.3g} {unit} (root mean square), mean "
+        f"{errors['mean']:.3g} {unit}, at most {errors['greatest']:.3g} {unit} at {errors['greatest_at_s']:g} s; "
+        f"{len(one.times)} points{left_out}"
+    )
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """One of the runs."""
+
+    path: Path
+    scene: dict[str, Any]
+    precision: str
+    end: float
+    """[s]"""
+    mass: float
+    """Of all fluid [kg], in 2-D of a layer 1 m thick."""
+    numbers: dict[str, tuple[str, float]]
+    """The unit and the value of each, by name."""
+
+    @classmethod
+    def read(cls, folder: RunFolder, quantities: Sequence[OwnQuantity]) -> "Resolved":
+        """With ``quantities`` of the user's own. Raises `InputError` for a run that has not ended well."""
+        result = folder.read_result()
+        if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
+            raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
+        trajectory = Trajectory.load(folder.trajectory)
+        last = trajectory[-1:]
+        numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
+        scene, masses = read_json(folder.scene), last.constants["reference_density"].astype(np.float64)
+        centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
+        numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}
+        readings = folder.read_sensors()
+        for name, columns in summary(readings).items():
+            for column, found in columns.items():
+                unit = readings[name].units[column]
+                numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
+        numbers |= {one.name: ("", one(trajectory)) for one in quantities}
+        precision = read_json(folder.environment).get("settings", {}).get("precision", "")
+        mass = float(masses.sum()) * float(scene["discretisation"]["spacing"]) ** last.dimension
+        return cls(folder.path, scene, precision, float(last.times[0]), mass, numbers)
+
+    def size(self, key: str) -> float:
+        """The spacing [m] or the time step [s]; raises `InputError` for one that is chosen."""
+        table, name = key.split(".")
+        value = self.scene[table][name]
+        if not isinstance(value, float | int):
+            raise InputError(f"{self.path} chooses its {name}, but must have one that is fixed.")
+        return float(value)
+
+
+def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
+    """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
+    own = [OwnQuantity.named(one) for one in quantities]
+    runs = [Resolved.read(folder, own) for folder in named_runs(folders)]
+    if len(runs) < LEAST_RUNS:
+        raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST_RUNS}.")
+    key = _varied(runs)
+    runs.sort(key=lambda run: -run.size(key))
+    sizes = [run.size(key) for run in runs]
+    for coarse, fine in pairwise(runs):
+        if coarse.size(key) == fine.size(key):
+            raise InputError(f"{coarse.path} and {fine.path} have one {key}, but all of them must differ.")
+        if abs(coarse.end - fine.end) > SAME_TIME * abs(fine.end):
+            raise InputError(
+                f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s, but all runs must end at "
+                "the same time: choose a --time that is a multiple of every time step."
+            )
+    _warn_of_masses(runs)
+    rows = []
+    for name, (unit, _) in runs[0].numbers.items():
+        values = [run.numbers[name][1] for run in runs]
+        found = Extrapolation.of(sizes, values)
+        rows.append({"name": name, "unit": unit, "values": values, **vars(found)})
+    others = [
+        other for other in (SPACING, TIME_STEP) if other != key and runs[0].scene["solver"]["time_step"] != "auto"
+    ]
+    told = {other: [run.size(other) for run in runs] for other in others}
+    table = {
+        "by": key,
+        "end_s": runs[-1].end,
+        "runs": [str(run.path) for run in runs],
+        key: sizes,
+        **told,
+        "rows": rows,
+    }
+    return json.dumps(table, indent=2) if as_json else _convergence_in_words(table)
+
+
+def _warn_of_masses(runs: Sequence[Resolved]) -> None:
+    """Say where runs have unlike amounts of fluid, which no order of convergence is about."""
+    least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
+    if most.mass > (1.0 + SAME_MASS) * least.mass:
+        warn(
+            f"the runs do not have the same fluid: {least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, "
+            f"{most.mass:.4g} kg with {most.size(SPACING):g} m. Choose spacings that divide the sizes of all bodies of "
+            "fluid."
+        )
+
+
+def _varied(runs: Sequence[Resolved]) -> str:
+    """What tells the runs apart: the spacing, or else the time step. Raises `InputError` where more does."""
+    changed: set[str] = set()
+    for run in runs[1:]:
+        changed |= differences(runs[0].scene, run.scene).keys()
+        if run.precision != runs[0].precision:
+            raise InputError(f"{run.path} is in {run.precision}, but must be in {runs[0].precision} as {runs[0].path}.")
+    if more := sorted(changed - SIZE_UNITS.keys()):
+        raise InputError(f"The runs differ in {', '.join(more)}, but must only differ in {SPACING} and {TIME_STEP}.")
+    if not changed:
+        raise InputError(f"The runs do not differ, but must differ in {SPACING} or {TIME_STEP}.")
+    return SPACING if SPACING in changed else TIME_STEP
+
+
+def _convergence_in_words(table: dict[str, Any]) -> str:
+    """A line for each number, the finest run on the right."""
+    key = table["by"]
+    lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error", ""]]
+    sizes = (key, *(other for other in SIZE_UNITS if other != key and other in table))
+    lines += [
+        [f"{name} [{SIZE_UNITS[name]}]", *(f"{size:g}" for size in table[name]), "", "", "", ""] for name in sizes
+    ]
+    for row in table["rows"]:
+        limit, error, finest = row["limit"], row["error"], row["values"][-1]
+        share = f" ({100.0 * error / abs(finest):.2g} %)" if error is not None and finest else ""
+        lines.append(
+            [
+                f"{row['name']} [{row['unit']}]" if row["unit"] else row["name"],
+                *(f"{value:.6g}" for value in row["values"]),
+                "" if row["order"] is None else f"{row['order']:.2f}",
+                "" if limit is None else f"{limit:.6g}",
+                "" if error is None else f"{error:.2g}{share}",
+                row["flag"],
+            ]
+        )
+    return "\n".join([f"{len(table['runs'])} runs until {table['end_s']:g} s, by {key}", *_aligned(lines)])
+
+
+def _aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """In columns, the first one to the left."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cortado.cli.commands.executor import HERE, Where
+from cortado.cli.commands.options import HERE, Where
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, shown, warn
 from cortado.files.interruption import keeping
 from cortado.files.output_files import LOCK, UNFINISHED, locked, sentences, write_atomically

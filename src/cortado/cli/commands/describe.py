@@ -1,4 +1,4 @@
-"""``cortado describe``: what a scene will be before it is run: particles, limits of the time step, memory, time."""
+"""``cortado describe``: a scene before it is run: particles, limits of the time step, memory, time, and the film."""
 
 import json
 import math
@@ -12,23 +12,23 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.cli.commands.drawing_time import seconds_of_picture
-from cortado.cli.commands.emitter_words import SAME, emitter_rows, of_emitter
-from cortado.cli.commands.memory_use import estimated_bytes
-from cortado.cli.commands.run_length import RunLength
-from cortado.device.memory import step_parts
-from cortado.errors import DivergedError, InputError
+from cortado.device.memory import frame_parts, gradient_parts, simulation_parts, step_parts
+from cortado.discretise.shapes import EXCESS
+from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.files.output_files import sentences
 from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.painter import colours_of, plan
+from cortado.pictures.painter import colours_of, painter, plan
 from cortado.rollout.checkpoints import MEMORY_BUDGET
+from cortado.rollout.parameter_space import steps_of_run
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
-from cortado.rollout.step_bounds import scheduled_bounds
+from cortado.rollout.step_bounds import ROOM, scheduled_bounds
+from cortado.runs.pace import Pace
 from cortado.runs.recording import FrameChoice
+from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, load_scene, vector
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.scene.toml import overrides_of, read_toml
@@ -39,8 +39,16 @@ from cortado.words import counted
 
 MANY = 1_000_000
 """Particles: so many are announced before they are made, as that takes some seconds or minutes."""
-FIRST, MOST, ENOUGH = 4, 100, 0.5
+FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
 """Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
+
+
+SAME = 1e-6
+"""Relative: a time step that is rounded to float32 is the same."""
+MOST_FRAMES = 1_000_000
+"""Frames of a film; nobody looks at more."""
+HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
+"""Bytes of a trajectory file besides its frames, measured: its heads, what no step changes, what the solver notes."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +63,7 @@ class MeasuredSpeed:
     @classmethod
     def measured(cls, simulation: Simulation) -> "MeasuredSpeed":
         """Raises `DivergedError` of a scene that does not even bear these steps."""
-        steps = FIRST
+        steps = FIRST_STEPS
         while True:
             rollout = simulation.rollout(steps)
             watch = Watch(simulation, rollout).step if simulation.scene.sensor else None
@@ -65,9 +73,67 @@ class MeasuredSpeed:
             rollout.forward(watch, keep=False)
             wp.synchronize_device(simulation.device)
             seconds = (time.perf_counter() - begun) / steps
-            if steps == MOST or steps * seconds > 0.5 * ENOUGH:
+            if steps == MOST_STEPS or steps * seconds > 0.5 * ENOUGH:
                 return cls(steps, seconds)
-            steps = min(math.ceil(ENOUGH / seconds), MOST)
+            steps = min(math.ceil(ENOUGH / seconds), MOST_STEPS)
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """Of a run that is asked for by a number of steps or by a time."""
+
+    steps: int
+    """About as many, where it ends at a time and chooses its steps."""
+    is_about: bool
+    """Whether the number of steps is an estimate."""
+    time: float | None
+    """That it simulates [s]; None of a number of steps that are chosen."""
+    frames: int | None
+    """That it records, the first and the last among them; None where that depends on a time that is not known."""
+    trajectory: float | None
+    """[bytes] of them on disk."""
+    film: Pace | None
+    """Which frames its film shows, and how fast; None where there is no film, or its length is not known."""
+
+    @classmethod
+    def of(cls, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice) -> "RunLength":
+        """Of a run with so many steps, or for a time [s]. Raises `InputError` for what is neither."""
+        solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
+        is_about = solver.chooses and time is not None
+        count = steps_of_run(simulation, steps, time, {}) // (ROOM if is_about else 1)
+        if not solver.chooses:
+            time = count * float(solver.time_step)
+        frames = choice.count(count, time)
+        film = None
+        if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
+            film = Pace.of(np.linspace(0.0, time, frames), picture.film_frames, picture.film_speed, choice.rate)
+        numbers = simulation.numbers_in_frame(components=3)  # as in the file
+        size = None
+        if frames is not None:
+            size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
+            size += HEADS + PER_PARTICLE * simulation.particles + PER_STEP * count
+        return cls(count, is_about, time, frames, size, film)
+
+    def for_machines(self) -> dict[str, Any]:
+        """By names that end in units."""
+        film = {} if self.film is None else {"film_seconds": self.film.seconds, "film_speed": self.film.speed}
+        return {
+            "steps": self.steps,
+            "steps_are_estimated": self.is_about,
+            "simulated_time_s": self.time,
+            "frames": self.frames,
+            "trajectory_bytes": self.trajectory,
+            "film_frames": None if self.film is None else len(self.film.frames),
+            **film,
+        }
+
+    @property
+    def in_words(self) -> str:
+        """Steps, and seconds of motion."""
+        motion = "" if self.time is None else f", {self.time:g} s of motion"
+        about = "about " if self.is_about else ""
+        guess = ", if fluid gets as fast as by a fall through the whole container" if self.is_about else ""
+        return f"{about}{counted(self.steps, 'step')}{motion}{guess}"
 
 
 def describe_scene(
@@ -193,6 +259,43 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
     return {"memory_bytes": forward + own, "gradient_memory_bytes": backward + own + checkpoints}
 
 
+def of_emitter(scene: Scene) -> dict[str, float | None]:
+    """When all of it is out, how fast, and the areas that its particles' cells and its opening have."""
+    emitter, spacing = scene.emitter, scene.discretisation.spacing
+    if emitter is None:
+        return {"emitter_runs_dry_at_s": None}
+    areas = {"emitter_area": emitter.area(spacing), "emitter_area_asked": emitter.asked_area()}
+    return {"emitter_runs_dry_at_s": emitter.dry_after(spacing), "emitter_speed_m_s": emitter.speed(spacing), **areas}
+
+
+def seconds_of_picture(simulation: Simulation) -> float | None:
+    """How long one takes of the first state, with all cores that a film has; None where nothing is seen of the fluid
+    then."""
+    scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
+    colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]
+    draws = painter(scene, positions, simulation.device)
+    try:
+        draws.image(positions, colours)  # compiles, and draws what does not change
+        begun = time.perf_counter()
+        draws.image(positions, colours)
+        return time.perf_counter() - begun
+    except ComputationError:
+        return None
+
+
+def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, float]:
+    """[bytes] of a forward run, and of one with its gradient and a checkpoint of every step."""
+    particles, walls, real = simulation.particles, len(simulation.walls), simulation.precision.bytes
+    solver = simulation.solver
+    assert isinstance(solver, ParticleSolver)
+    capacity = solver.search.capacity
+    forward = sum(simulation_parts(particles, walls, capacity, real).values())
+    counts = rollout.diagnostics.get("iterations")  # a solver of one's own may have none
+    iterations = 0 if counts is None else int(counts.max(initial=0))
+    checkpoints = rollout.steps * sum(array.capacity for array in rollout.initial.arrays())
+    return forward, forward + checkpoints + sum(gradient_parts(particles, iterations, real).values())
+
+
 def _drawn(simulation: Simulation, path: Path) -> Path:
     """The scene with its fluid where it is at the start, in the colours of its phases."""
     free = slice(simulation.free_particles)
@@ -235,6 +338,21 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     rows += [("search", " ".join(found["search"]))] if "search" in found else []
     rows += [("picture", found["picture"])] if "picture" in found else []
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
+
+
+def emitter_rows(found: dict[str, Any], length: RunLength) -> list[tuple[str, str]]:
+    """When all of it is out, whether that is before the end of the run, and how fast it comes."""
+    dry = found["emitter_runs_dry_at_s"]
+    if dry is None:
+        return []
+    given, asked = found["emitter_area"], found["emitter_area_asked"]
+    speed = f"fluid comes out at {found['emitter_speed_m_s']:.3g} m/s"
+    if abs(given - asked) > EXCESS * asked:
+        unit = "m" if found["dimension"] == 2 else "m2"
+        speed += f", through {given:.3g} {unit} of cells, where an opening of {asked:.3g} {unit} was asked for"
+    if length.time is None or dry >= length.time * (1.0 - SAME):
+        return [("emitter", f"has fluid for {dry:.4g} s; {speed}")]
+    return [("emitter", f"runs dry at {dry:.4g} s, before the end of the run at {length.time:g} s; {speed}")]
 
 
 def _size(found: dict[str, Any]) -> str:

@@ -7,10 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.commands.executor import HERE, Where
-from cortado.cli.commands.found import found_lines, found_rows, worst_in_words
-from cortado.cli.commands.optimise_report import asked, for_machines, sections
-from cortado.cli.commands.verdict import MOST_ERROR, Verdict, found_in_words, judge
+from cortado.cli.commands.optimise_report import (
+    MOST_ERROR,
+    Verdict,
+    asked,
+    for_machines,
+    found_in_words,
+    found_lines,
+    found_rows,
+    judge,
+    sections,
+    worst_in_words,
+)
+from cortado.cli.commands.options import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.interruption import keeping

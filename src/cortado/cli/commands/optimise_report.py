@@ -1,25 +1,171 @@
-"""What ``cortado optimise`` writes about a search: the report for people, and the results for programs."""
+"""What ``cortado optimise`` found: how near to what was asked, in sentences, in the report, and for programs."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cortado.cli.commands.found import Rows
-from cortado.cli.commands.verdict import Verdict
+from cortado.optimisation.inverse.figures import component_names
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.knots import KnotValues
 from cortado.optimisation.inverse.setup import Setup
+from cortado.optimisation.inverse.task import Task
 from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.result import Result
 from cortado.pictures.particle_view import scene_view
-from cortado.pictures.report import Section
+from cortado.pictures.report import MOST_NUMBERS, Section, written
 from cortado.scene.scene import scene_in_words
 
-MOST_NUMBERS = 1000
-"""Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
+Rows = list[tuple[object, ...]]
+
+MOST_ERROR = 0.3
+"""Of a parameter, relative, up to which it counts as found."""
+
+
+MOST_IN_RESULT = 1000
+"""Numbers of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
 VIEWED = 60
 """States of a run that the view in the report shows at most."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How near an optimisation came to what the task asks for."""
+
+    first: float
+    """Loss of the start."""
+    reduction: float
+    """Loss of the start / best loss; infinite where the best is 0."""
+    errors: dict[str, float]
+    """By parameter: distance (L2) of the estimate from the true value, relative to its size unless that is 0."""
+    psnr: float | None
+    """Of the last image [dB]; None where positions are compared."""
+    failures: list[str]
+    """Sentences about what was not reached."""
+
+
+def judge(
+    task: Task,
+    result: Result,
+    estimate: dict[str, np.ndarray] | None = None,
+    noise: float | None = None,
+    first: float | None = None,
+) -> Verdict:
+    """Hold a result against the task's [optimise.check].
+
+    ``estimate``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio that was
+    reached [dB]; ``first``: the loss of the start, where the history begins with another loss.
+    """
+    check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
+    first = result.history[0].loss if first is None else first
+    reduction = first / result.loss if result.loss > 0.0 else math.inf
+    true = task.true_parameters
+    errors = {name: distance(value, true[name]) for name, value in estimate.items() if name in true}
+    failures = []
+    if reduction < check.loss_reduction:
+        failures.append(f"The loss fell {reduction:.3g} times, but the task asks for {check.loss_reduction:g} times.")
+    if noise is not None and noise < check.psnr:
+        failures.append(f"The image is matched to {noise:.3g} dB, but the task asks for {check.psnr:g} dB.")
+    failures += [
+        f"The parameter {name} is {100 * error:.3g}% off, but the task asks for {100 * check.parameter_error:.3g}%."
+        for name, error in errors.items()
+        if error > check.parameter_error
+    ]
+    return Verdict(first, reduction, errors, noise, failures)
+
+
+def found_in_words(error: float) -> str:
+    """How well a parameter is found, by its distance from the true value relative to it."""
+    if error > MOST_ERROR:
+        why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
+        return f"not found, {100 * error:.3g}% off: {why}"
+    return f"found with an error of {100 * error:.2g}%"
+
+
+def distance(estimate: ArrayLike, true: ArrayLike) -> float:
+    """|estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
+    estimate, true = np.broadcast_arrays(estimate, true)
+    return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
+
+
+def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
+    """Which number of a few is farther off than twice the error of all of them together, and how far; empty where none
+    is, or where the true ones are not known or 0."""
+    true, names = made.true_parameter(name), component_names(made.task, name, estimate)
+    if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
+        return ""
+    errors = [distance(*pair) for pair in zip(np.ravel(estimate), np.ravel(true), strict=True)]
+    worst = int(np.argmax(errors))
+    return f" ({names[worst]}: {100 * errors[worst]:.2g}%)" if errors[worst] > 2.0 * error else ""
+
+
+def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues]) -> list[str]:
+    """One for each parameter, or for each of its knots; none for a parameter of very many numbers."""
+    lines = []
+    for name, value in estimate.items():
+        if name in knots:
+            own = knots[name]
+            trues = [None] * len(own.times) if own.true is None else own.true
+            found = zip((_at(name, time) for time in own.times), own.estimate, trues, strict=True)
+        elif np.size(value) <= MOST_NUMBERS:
+            found = zip([_words(name)], [value], [made.true_parameter(name)], strict=True)
+        else:
+            continue
+        for label, one, true in found:
+            unit = f" {made.task.known[name].unit}".rstrip()
+            hidden = "" if true is None else f"; true {written(true)}{unit}"
+            lines.append(f"  {label}: {written(one)}{unit}{hidden}")
+    return lines
+
+
+def found_rows(
+    made: Setup,
+    estimate: Mapping[str, np.ndarray],
+    knots: Mapping[str, KnotValues],
+    errors: Mapping[str, float],
+) -> Rows:
+    """(parameter, unit, first guess, found, hidden, error) of each number that was searched, of each knot, and of
+    parameters with very many numbers; ``errors`` by parameter."""
+    rows: Rows = []
+    start = made.search.parameters(made.start)
+    for name, value in estimate.items():
+        unit, true = made.task.known[name].unit, made.true_parameter(name)
+        if name in knots:
+            rows += _knot_rows(name, unit, knots[name])
+            continue
+        known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
+        error = f"{errors[name]:.3%}" if name in errors else ""
+        columns = np.broadcast_arrays(*known)
+        names = component_names(made.task, name, columns[0])
+        if len(names) != columns[0].size or len(names) > MOST_NUMBERS:
+            rows.append((_words(name), unit, *known[:2], "" if true is None else true, error))
+            continue
+        for k, label in enumerate(names):
+            numbers = [column.ravel()[k] for column in columns]
+            off = [""] if true is None else [f"{distance(*numbers[1:]):.3%}"]
+            rows.append((label, unit, *numbers, *([] if true is not None else [""]), *off))
+    return rows
+
+
+def _knot_rows(name: str, unit: str, knots: KnotValues) -> Rows:
+    rows: Rows = []
+    for k, time in enumerate(knots.times):
+        hidden, error = "", ""
+        if knots.true is not None:
+            hidden, error = written(knots.true[k]), f"{distance(knots.estimate[k], knots.true[k]):.3%}"
+        rows.append((_at(name, time), unit, knots.start[k], knots.estimate[k], hidden, error))
+    return rows
+
+
+def _at(name: str, time: float) -> str:
+    return f"{_words(name)} at {time:.4g} s"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def asked(made: Setup) -> Section:
@@ -94,7 +240,7 @@ def for_machines(
         "loss": result.loss,
         "loss_reduction": verdict.reduction,
         "parameter_error": verdict.errors,
-        "parameters": {name: value for name, value in estimate.items() if np.size(value) <= MOST_NUMBERS},
+        "parameters": {name: value for name, value in estimate.items() if np.size(value) <= MOST_IN_RESULT},
         "knots": {name: one.for_machines() for name, one in knots.items()},
         "converged": result.converged,
         "message": result.message,

@@ -1,4 +1,4 @@
-"""``cortado picture``: a shaded picture, or a film, of a run that is there."""
+"""``cortado picture`` and ``cortado export``: pictures, films and files of other programs, of runs."""
 
 import json
 import os
@@ -7,9 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cortado.cli.commands.named_runs import named_runs
+from cortado.cli.commands.options import named_runs
 from cortado.errors import InputError
 from cortado.files.interruption import keeping
+from cortado.pictures.exports.formats import export
 from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.run_pictures import device_of, run_page
@@ -102,3 +103,13 @@ def _names(folders: Sequence[RunFolder]) -> list[str]:
     """Of the folders, or numbers where some have one name."""
     found = [folder.path.name for folder in folders]
     return found if len(set(found)) == len(found) else [f"run {k}" for k in range(1, len(found) + 1)]
+
+
+def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
+    """Write every so many frames of a run that is there in a format; returns a sentence that says where they are."""
+    folder = RunFolder.open(run)
+    if not folder.trajectory.exists():
+        raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")
+    trajectory, scene = Trajectory.load(folder.trajectory)[::every], scene_of_run(folder, overrides)
+    found = export(trajectory, folder.path / to if out is None else out, to, scene, lambda: Simulation(scene))
+    return f"The run is in {found}."

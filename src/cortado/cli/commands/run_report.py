@@ -1,31 +1,227 @@
-"""The report of ``cortado run``, at first without shaded pictures, which take long, then with them."""
+"""What ``cortado run`` tells at its end: a summary in its last lines, and the report.
+
+The report is written at first without shaded pictures, which take long, then with them.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cortado.cli.commands.run_summary import simulated, sizes_in_words
+from cortado.discretise.room import TOLERANCE
 from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
+from cortado.particles.state import State
 from cortado.pictures.film import lacking
 from cortado.pictures.plots import images, particles
 from cortado.pictures.report import Figures, Section, write_report
 from cortado.pictures.run_pictures import run_pictures, trajectory_view
 from cortado.pictures.run_plots import density_errors, readings
-from cortado.pictures.shown_run import coloured_by
+from cortado.pictures.shown_run import coloured_by, is_out
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_file import common_rate
 from cortado.runs.pace import Pace
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.readings import Readings
+from cortado.runs.sensors.readings import Readings, summary
 from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.fluid_particles import FluidMasses
 from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation
+from cortado.solvers.particles import ParticleSolver
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Of all particles but those that wait in an emitter [J], in 2-D of a layer one metre thick."""
+
+    kinetic: float
+    potential: float
+    """In the gravity that acts then, from the lowest place of the container, or of the origin if there is none."""
+
+    @property
+    def total(self) -> float:
+        """[J]"""
+        return self.kinetic + self.potential
+
+    @classmethod
+    def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
+        """Of a state, in the gravity of a step, counted from 0."""
+        names, out = ("positions", "velocities", "reference_density"), _out(simulation, state)
+        fields = {name: array[out] for name, array in state.numpy(simulation.dimension, only=names).items()}
+        masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
+        positions, velocities = (fields[name].astype(np.float64) for name in ("positions", "velocities"))
+        gravity = rollout.parameters["gravity"].numpy()[0, step, : simulation.dimension].astype(np.float64)
+        ends = simulation.scene.container.extent()
+        corners = np.zeros((1, simulation.dimension)) if ends is None else list(product(*zip(*ends, strict=True)))
+        lowest = float((np.asarray(corners) @ gravity).max())
+        return cls(
+            kinetic=0.5 * float(masses @ (velocities**2).sum(axis=1)),
+            potential=float(masses @ (lowest - positions @ gravity)),
+        )
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """Of a run that has gone through all of its steps."""
+
+    steps: int
+    time: float
+    """That was simulated [s]."""
+    sizes: str
+    """How long steps were, in words."""
+    computed: int
+    """Of the steps, those that the present process took: the others were there already."""
+    seconds: float
+    """That these took, with what was recorded of them."""
+    first: Energy
+    last: Energy
+    turned: bool
+    """Whether gravity changed during the run, and potential energies are those of other gravities."""
+    densities: tuple[float, float] | None
+    """The least and the greatest at the end [kg/m3], of particles that do not wait in an emitter; None of a solver
+    without particles."""
+    spilt: int
+    """Particles beside or below an open cup at the end."""
+    particles: int
+    """That did not begin in an emitter."""
+    masses: FluidMasses
+    """Of the fluid at the start."""
+    readings: Mapping[str, Readings] = field(default_factory=dict)
+    """What sensors read, by their names."""
+
+    @classmethod
+    def of(
+        cls,
+        simulation: Simulation,
+        rollout: Rollout,
+        last: State,
+        seconds: float,
+        readings: Mapping[str, Readings] | None = None,
+    ) -> "RunSummary":
+        """``last``: the state at the end; ``readings`` of sensors."""
+        solver, taken, found = rollout.solver, rollout.taken, None
+        if isinstance(solver, ParticleSolver):
+            densities = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
+            found = float(densities.min()), float(densities.max())
+        return cls(
+            steps=taken,
+            computed=taken - rollout.progress.step,
+            time=simulated(rollout),
+            sizes=sizes_in_words(rollout),
+            seconds=seconds,
+            first=Energy.of(simulation, rollout, rollout.initial, 0),
+            last=Energy.of(simulation, rollout, last, taken - 1),
+            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0, :taken], axis=0).any()),
+            densities=found,
+            spilt=_spilt(simulation, last),
+            particles=simulation.free_particles,
+            masses=simulation.masses,
+            readings=readings or {},
+        )
+
+    @property
+    def milliseconds(self) -> float:
+        """That a step took."""
+        return 1e3 * self.seconds / max(self.computed, 1)
+
+    @property
+    def _computed_in_words(self) -> str:
+        return "all" if self.computed == self.steps else f"the last {self.computed}"
+
+    def for_machines(self) -> dict[str, Any]:
+        """What is the same in every run, by names."""
+        energies = {"first": vars(self.first), "last": vars(self.last)}
+        least, greatest = self.densities or (None, None)
+        sensors = {"sensors": summary(self.readings)} if self.readings else {}
+        masses = {"given": self.masses.given, "asked": self.masses.asked}
+        return {
+            "energy": energies,
+            "mass": masses,
+            "density": {"least": least, "greatest": greatest},
+            "spilt": self.spilt,
+            **sensors,
+        }
+
+    def rows(self) -> list[tuple[object, ...]]:
+        """(what, value, unit) of each row of a table."""
+        energies = [
+            (f"{kind} energy, {when}", f"{getattr(energy, kind):.4g}", "J")
+            for when, energy in (("at the start", self.first), ("at the end", self.last))
+            for kind in ("kinetic", "potential", "total")
+        ]
+        densities = zip(("least", "greatest"), self.densities or (), strict=False)
+        return [
+            ("steps", self.steps, ""),
+            ("simulated time", f"{self.time:.4g}", "s"),
+            ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
+            (f"time that {self._computed_in_words} steps took", f"{self.seconds:.3g}", "s"),
+            *energies,
+            *((f"fluid at the start: {words}", "", "") for words in self.masses.off.values()),
+            *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
+            *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
+            *(
+                (f"{name} {column}, {what}".replace("_", " "), f"{value:.4g}", self.readings[name].units[column])
+                for name, columns in summary(self.readings).items()
+                for column, found in columns.items()
+                for what, value in found.items()
+            ),
+        ]
+
+    def __str__(self) -> str:
+        last = self.last
+        last_ones = "" if self.computed == self.steps else f", {self._computed_in_words} of them"
+        took = f"{last_ones} in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step"
+        text = (
+            f"{self.steps} steps of {self.sizes}{took if self.computed else ', which were there already'}; "
+            f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
+            f"{self.first.total:.4g} J"
+        )
+        if self.turned:
+            text += " in the gravity of that time"
+        if self.densities is not None:
+            text += f"; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3"
+        if self.spilt:
+            text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
+        if self.masses.off:
+            text += f". The fluid began with {' and '.join(self.masses.off.values())}"
+        return f"{text}."
+
+
+def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
+    """(n,) whether each particle has left the emitter; one that waits may be within a wall, and is prescribed."""
+    emitted = state["emitted"].numpy() if simulation.scene.emitter else None
+    return is_out(simulation.scene, emitted, len(simulation.positions))
+
+
+def _spilt(simulation: Simulation, state: State) -> int:
+    """How many particles that did not begin in an emitter are outside of a cup without a lid."""
+    scene, container = simulation.scene, simulation.scene.container
+    if not np.isfinite(container.region(simulation.dimension).rim):
+        return 0
+    positions = state.numpy(simulation.dimension, only=["positions"])["positions"][: simulation.free_particles]
+    return int((~container.contains(positions, TOLERANCE * scene.discretisation.spacing)).sum())
+
+
+def simulated(rollout: Rollout) -> float:
+    """How long the fluid of a rollout was simulated in its last forward run [s]."""
+    clock, size = rollout.clocks[0], float(rollout.time_steps[0])
+    return clock.after(rollout.taken, size).time - clock.time
+
+
+def sizes_in_words(rollout: Rollout) -> str:
+    """How long the steps of the last forward run were."""
+    chosen = rollout.step_sizes.diagnostics(rollout.taken).get("time_steps")
+    if chosen is None or not len(chosen):
+        return f"{float(rollout.time_steps[0]):g} s"
+    return f"{chosen.min():.3g} to {chosen.max():.3g} s"
 
 
 def write_run_report(

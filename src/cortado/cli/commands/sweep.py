@@ -8,8 +8,8 @@ from typing import Any
 
 from cortado.arrays import check_steps
 from cortado.cli.arguments import ALL_FRAMES, STEPS, FrameOptions
-from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
+from cortado.cli.commands.options import HERE, Where
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, warn
 from cortado.files.interruption import Interrupted, keeping

@@ -1,19 +1,53 @@
-"""viser's server, with a door before it and with ears that hear only what a page may say."""
+"""viser's server, with a door before it, and with ears that hear only what a page may say.
+
+Who gets in is who has the address of the window, which ends in a random token. Every page that is open in a browser can
+ask this machine for pages and open websockets to it, with the browser's own ``Origin``, and can give itself a name that
+leads to this machine (DNS rebinding). So a request is refused if it has not the token, if it calls the machine by
+another name, or if it comes from another page than the window's own. A program that is no browser sends no ``Origin``,
+and needs the token alone.
+
+What may be said is where the camera is, and values that controls can have. viser takes any value of any attribute of a
+control, and does more that no window here has, such as a tunnel to the internet; all of that is left aside.
+"""
 
 import logging
+import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
+from http import HTTPStatus
 from io import StringIO
-from typing import Any
+from secrets import compare_digest, token_hex
+from typing import Annotated, Any
 
+import msgspec
 import viser
 import websockets.asyncio.server as sockets
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
-from cortado.cli.viewer.door import HOST, Door
-from cortado.cli.viewer.messages import LONGEST, Controls, judged
 from cortado.errors import InputError
 
+HOST = "127.0.0.1"
+NAMES = (HOST, "localhost")
+"""By which a browser on this machine may call it."""
+ADVICE = "This window has a token in its address: open the whole address that `cortado view` has printed.\n"
+HEADERS = {
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+}
+"""So that the token goes nowhere else, and no other page shows the window within its own."""
+Answer = Callable[[ServerConnection, Request], Response | None]
+"""What websockets calls ``process_request``: a page, or None for a websocket."""
+LARGEST_NUMBER = 1e9
+"""Of a number of the camera."""
+LONGEST_MESSAGE = 2**16
+"""Bytes of a message; those of viser's page have some hundreds."""
+Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+Direction = tuple[Number, Number, Number]
+Controls = Callable[[str], Any]
+"""A control by its id; None where there is none."""
 KNOWN = "1.1.1"
 """A version of viser that can be guarded."""
 FAREWELL = 0.3
@@ -21,6 +55,62 @@ FAREWELL = 0.3
 _silent = logging.getLogger(__name__)
 """Of connections that fail, which is the matter of those who made them."""
 _silent.disabled = True
+
+
+class Door:
+    """Of one window."""
+
+    def __init__(self) -> None:
+        self._token = token_hex(16)
+
+    def address(self, port: int) -> str:
+        """Where a browser finds the window."""
+        return f"http://{HOST}:{port}/{self._token}/"
+
+    def before(self, answer: Answer | None) -> Answer:
+        """An answer for those who are let in, which is given what stands behind the token; a refusal for others."""
+
+        def guarded(connection: ServerConnection, request: Request) -> Response | None:
+            token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
+            if not (self._is_own(token) and _is_from_here(request, connection.local_address[1])):
+                return connection.respond(HTTPStatus.FORBIDDEN, ADVICE)
+            response = answer(connection, Request(f"/{rest}", request.headers)) if answer else None
+            if response is not None:
+                response.headers.update(HEADERS)
+            return response
+
+        return guarded
+
+    def _is_own(self, token: str) -> bool:
+        return compare_digest(token.encode(errors="replace"), self._token.encode())
+
+
+def _is_from_here(request: Request, port: int) -> bool:
+    """Whether a request calls this machine by its own name, and comes from the page at that name or from none."""
+    hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    own = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
+    return len(hosts) == 1 and hosts[0] in own and origins in ([], [f"http://{hosts[0]}"])
+
+
+class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
+    """Where the camera of a page is; viser calls a page connected from the first one on."""
+
+    wxyz: tuple[Number, Number, Number, Number]
+    position: Direction
+    fov: Number
+    near: Number
+    far: Number
+    image_height: Number
+    image_width: Number
+    look_at: Direction
+    up_direction: Direction
+
+
+class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    """What a control is set to."""
+
+    uuid: str
+    updates: dict[str, Any]
 
 
 class Hearing(sockets.ServerConnection):
@@ -66,7 +156,7 @@ class GuardedServer:
         own = {
             "process_request": self._door.before(process_request),
             "create_connection": partial(Hearing, controls=self._control),
-            "max_size": LONGEST,
+            "max_size": LONGEST_MESSAGE,
             "close_timeout": FAREWELL,
             "logger": _silent,
         }
@@ -87,3 +177,41 @@ def _serving(serve: Callable[..., Any]) -> Iterator[None]:
         yield
     finally:
         sockets.serve = usual  # type: ignore[misc]
+
+
+_decoder = msgspec.msgpack.Decoder(CameraMessage | Update)
+_encoder = msgspec.msgpack.Encoder()
+
+
+def judged(message: bytes | str, controls: Controls) -> bytes | None:
+    """A message as viser may read it, written again so that both read the same; None for one to be left aside."""
+    with suppress(msgspec.MsgspecError, RecursionError, TypeError):
+        said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
+        if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
+            return _encoder.encode(said)
+    return None
+
+
+def _can_be(said: Update, controls: Controls) -> bool:
+    """Whether the page lets its user set a control to this value."""
+    control, value = controls(said.uuid), said.updates["value"]
+    if control is None or control.disabled or not control.visible:
+        return False
+    match control:
+        case viser.GuiButtonHandle():
+            return value is True
+        case viser.GuiCheckboxHandle():
+            return isinstance(value, bool)
+        case viser.GuiDropdownHandle():
+            return isinstance(value, str) and value in control.options
+        case viser.GuiSliderHandle():
+            return _is_between(control, value)
+    return False
+
+
+def _is_between(slider: Any, value: Any) -> bool:
+    """Whether a number is within a slider's ends, which the page rounds to the digits that it shows."""
+    if isinstance(value, bool) or not isinstance(value, type(slider.value) | int):
+        return False
+    slack = 0.5 * 10.0**-slider.precision if isinstance(slider.value, float) else 0
+    return math.isfinite(value) and slider.min - slack <= value <= slider.max + slack

@@ -1,0 +1,220 @@
+"""Commands of runs that are there, to compare and to show them, and of many runs: sweeps and data sets."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from cortado.cli.arguments import (
+    ALL_FRAMES,
+    Device,
+    Flag,
+    FrameOptions,
+    Json,
+    Overrides,
+    Precision,
+    Work,
+    as_text,
+    require_at_least,
+    text_overrides,
+)
+from cortado.errors import InputError
+from cortado.scene.toml import read_toml
+
+
+def compare(
+    first: Annotated[Positional[Path], arg(metavar="RUN")],
+    second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
+    json: Json = False,
+) -> Work:
+    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made. Or
+    compare the sensors of a run with measured data.
+
+    Args:
+        first: The folder of a run.
+        second: The folder of another, or a table of measured data with the columns of sensors.csv.
+    """
+    from cortado.cli.commands.compare import compare_runs, compare_with_data
+
+    return partial(compare_with_data if second.suffix.lower() == ".csv" else compare_runs, first, second, json)
+
+
+def sweep(
+    file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
+    sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
+    zips: Annotated[UseAppendAction[tuple[str, ...]], arg(name="zip", metavar="KEY=VALUE,VALUE")] = (),
+    steps: int | None = None,
+    time: float | None = None,
+    out: Path = Path("runs/sweep"),
+    device: str = "cpu",
+    precision: Precision = "float32",
+    frames: FrameOptions = ALL_FRAMES,
+    pictures: Flag = True,
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Work:
+    """Run a scene, or optimise a task, with every combination of some values, each in a folder of its own; folders that
+    are finished already are not repeated.
+
+    Args:
+        file: The scene file, or the task file.
+        sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
+        zips: What changes together: the first value of one with the first of the others; given again for each of them.
+        steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
+        time: Seconds that a scene is simulated, in the place of steps.
+        out: Folder of the sweep, with a folder for each combination and a table of them all.
+        pictures: Leave out the figures and the reports of runs of a scene, which take longer than short runs do.
+        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+    """
+    frames.check()
+    combinations, together = as_text(sets), as_text(zips)
+    read_toml(file)
+    from cortado.cli.commands.options import Where
+    from cortado.cli.commands.sweep import run_sweep
+
+    where = Where(scheduler, workers)
+    asked = (combinations, together, steps, time, out, device, precision, where, frames, pictures)
+    return partial(run_sweep, file, *asked)
+
+
+def convergence(
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
+    quantities: Annotated[UseAppendAction[tuple[str, ...]], arg(name="quantity", metavar="FILE.py:FUNCTION")] = (),
+    json: Json = False,
+) -> Work:
+    """Tell how fast a scene converges: of runs with different spacings or time steps the order, limit and error.
+
+    Args:
+        runs: Folders of at least three runs until the same time, or of a sweep of them.
+        quantities: A number of your own besides: a function of a cortado.Trajectory; may be given again.
+    """
+    from cortado.cli.commands.compare import convergence_table
+
+    return partial(convergence_table, runs, as_text(quantities), json)
+
+
+def dataset(
+    file: Annotated[Positional[Path], arg(metavar="SCENE.toml|TASK.toml")],
+    runs: int = 100,
+    out: Path = Path("runs/dataset"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: Precision = "float32",
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Work:
+    """Compute many runs of a scene with varied values, to train learned simulators on; the same command goes on with
+    those that are missing.
+
+    Args:
+        file: A file with the table [dataset], which says what varies.
+        runs: How many, those for validation and tests included.
+        out: Folder of the data set: train.h5, valid.h5, test.h5 and metadata.json, as LagrangeBench reads them.
+        overrides: Replace a value of the file, such as dataset.steps=200; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+    """
+    words = text_overrides(file, overrides)
+    from cortado.cli.commands.dataset import make_dataset
+    from cortado.cli.commands.options import Where
+
+    return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
+
+
+def picture(
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
+    frame: int | None = None,
+    film: Flag = False,
+    lines: int | None = None,
+    camera: str | None = None,
+    colour: str | None = None,
+    out: Path | None = None,
+    overrides: Overrides = (),
+    device: Device = "cpu",
+) -> Work:
+    """Draw a shaded picture, or a film, of a run that `cortado run` wrote, or of several side by side.
+
+    Args:
+        runs: Folders of up to nine runs, or of a sweep of them.
+        frame: Number of a recorded frame, counted from the end where it is negative; the last one if left out.
+        film: A film of all frames in its place; stopped by Ctrl-C, it goes on with the same command.
+        lines: Rows of pixels, such as 720, 1080 or 2160, with 16 columns for 9 of them.
+        camera: How the camera of a film moves: "orbit", "dolly", or "follow:NAME" for a solid of that name.
+        colour: What colours the fluid, such as speed, pressure, vorticity, age or phase.
+        out: Where to write it, a film as .mp4 or .webp; if left out into the run's figures, of several beside them.
+        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
+    """
+    words = as_text(overrides)
+    if film and frame is not None:
+        raise InputError("--frame is given, but must be left out, as --film has all frames.")
+    if lines is not None:
+        _refuse(words, ("width", "height"), "--lines says so already")
+    if colour is not None:
+        _refuse(words, ("colour",), "--colour says so already")
+    if not film:
+        _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
+    from cortado.cli.commands.picture import camera_override, draw_runs, picture_settings
+
+    replaced, settings = camera_override(camera) + words, picture_settings(lines, colour)
+    return partial(draw_runs, runs, -1 if frame is None else frame, film, out, replaced, device, settings)
+
+
+def export(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    to: Literal["usd", "glb", "ply", "obj", "vtp"],
+    out: Path | None = None,
+    every: int = 1,
+    overrides: Overrides = (),
+) -> Work:
+    """Write a run that `cortado run` wrote for other programs: its surface, its particles and its solids over time.
+
+    Args:
+        run: The folder of the run.
+        to: "usd" for Blender and Houdini, one file; or a series of files, "glb", "ply", "obj", or "vtp" for ParaView.
+        out: The folder to write, empty or missing; one of that name in the run's folder if left out.
+        every: Frames of the run from one that is written to the next.
+        overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
+    """
+    require_at_least(1, every, "--every")
+    words = as_text(overrides)
+    for word in words:
+        if word.partition("=")[0].strip() not in ("picture.colour", "picture.surface"):
+            raise InputError(
+                f"--set is {word}, but must replace picture.colour or picture.surface: others act in pictures."
+            )
+    from cortado.cli.commands.picture import export_run
+
+    return partial(export_run, run, to, out, every, words)
+
+
+def view(
+    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
+    overrides: Overrides = (),
+    device: Device = "cpu",
+    precision: str | None = None,
+    port: int = 8080,
+) -> Work:
+    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
+    a button for its next step; Ctrl-C ends it.
+
+    Args:
+        path: The folder of a run, a scene file, or a task file.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        precision: "float32" or "float64", of a scene or a task that runs; "float32" if left out.
+        port: Of the page on this machine; the next one that is free if it is taken.
+    """
+    from cortado.cli.viewer.views import view as show
+
+    return partial(show, path, as_text(overrides), device, precision, port)
+
+
+def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
+    """Raises `InputError` where --set replaces one of some keys of [picture]."""
+    for override in overrides:
+        name = override.partition("=")[0].strip()
+        if name.removeprefix("picture.") in keys:
+            raise InputError(f"--set {name} is given, but must be left out, as {why}.")
