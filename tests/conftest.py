@@ -41,12 +41,9 @@ VALIDATION = {
     "test_study_growth",
     "test_surface_tension",
     "test_validation",
+    "test_validation_flows",
     "test_validation_mixture",
-    "test_validation_projection",
     "test_validation_rayleigh_taylor",
-    "test_validation_rheology",
-    "test_validation_surface_tension",
-    "test_validation_viscosity",
 }
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
 

@@ -47,9 +47,9 @@ from cortado.cli.subcommands import CORTADO
 from cortado.optimisation.inverse.file_schema import file_schema
 from cortado.scene.parameters import Role
 from scenes import jet, plane, plane_of_three, scene, two_layers
+from test_examples import FILES
 from test_free_bodies import RAFT
 from test_free_bodies import plane as with_bodies
-from test_shipped_scenes import FILES
 
 DATA = Path(__file__).parent / "data" / "freeze.json"
 STEPS = 20

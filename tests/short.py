@@ -19,18 +19,22 @@ SLOW = 3.0
 """[s]"""
 KEPT = {
     "test_cli": {"test_run_writes_its_folder"},
-    "test_examples": {"test_an_example_ends_well[first_gradient.py]", "test_its_check_can_fail[first_gradient.py]"},
+    "test_examples": {
+        "test_an_example_ends_well[first_gradient.py]",
+        "test_its_check_can_fail[first_gradient.py]",
+        "test_all_cells_run[first_steps]",
+        "test_the_code_runs_as_printed",
+    },
     "test_first_commands": {"test_a_new_scene_runs_at_once[2-True]"},
     "test_free_bodies": {
         "test_a_body_and_fluid_in_free_space_keep_their_momentum[2]",
         "test_derivatives_of_bodies[plane]",
     },
     "test_freeze": {"test_texts_are_the_same"},
-    "test_held_water": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
+    "test_solids": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
     "test_image_loss": {"test_the_whole_chain_from_gravity_to_the_picture[True]"},
     "test_implicit_pressure": {"test_at_the_fixed_point_it_is_the_exact_gradient[three phases-1e-05]"},
-    "test_mean_stress": {"test_water_at_rest_has_the_pressure_of_its_depth"},
-    "test_notebooks": {"test_all_cells_run[first_steps]"},
+    "test_energy_budget": {"test_water_at_rest_has_the_pressure_of_its_depth"},
     "test_packages": {"test_they_are_there_in_processes_of_their_own"},
     "test_plants": {"test_plants_of_one_scene_are_found"},
     "test_projection": {
@@ -39,19 +43,18 @@ KEPT = {
         "test_reverse_mode_is_forward_mode_is_the_limit_of_differences[velocities follow]",
     },
     "test_ranges": {"test_any_number_of_ranges_gives_the_same_bits[the projection]"},
-    "test_readme": {"test_the_code_runs_as_printed"},
     "test_reference_projection": {
         "test_it_is_the_projection_of_the_warp_engine[plane]",
         "test_steps_are_those_of_the_twin[scene-wendland_c2]",
     },
     "test_solid_loads": {"test_loads_have_derivatives[projection]"},
-    "test_validation_projection": {
+    "test_validation_flows": {
+        "test_a_carreau_fluid_flows_between_plates_as_it_should",
         "test_a_dam_break_makes_no_energy_and_is_not_compressed[0.0025-1.00005]",
+        "test_a_drop_in_space",
         "test_a_jet_that_falls_is_drawn_out_and_keeps_together[0.0]",
         "test_vortices_decay_as_they_must[32-100.0-1.0-0.035]",
     },
-    "test_validation_rheology": {"test_a_carreau_fluid_flows_between_plates_as_it_should"},
-    "test_validation_surface_tension": {"test_a_drop_in_space"},
 }
 """Slow cases of files that `make test` runs, as nothing quicker guards the same."""
 Value = tuple[str, tuple[int, ...]]

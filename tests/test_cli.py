@@ -766,10 +766,8 @@ def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypa
 
 @pytest.mark.parametrize(
     ("text", "override"),
-    [
-        (PLANE_PICTURE, "problem.picture=rosetta"),
-        (TINY_LATTE, "optimise.knots=2"),
-    ],
+    [(PLANE_PICTURE, "problem.picture=rosetta"), (TINY_LATTE, "optimise.knots=2")],
+    ids=["plane", "cup"],
 )
 def test_another_image_is_not_resumed(cortado_command, text, override):
     Path("task.toml").write_text(text)

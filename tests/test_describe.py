@@ -29,6 +29,7 @@ def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cortado.cli.commands.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 4)  # and so do 100 steps that are timed
     return tmp_path
 
 
@@ -37,7 +38,8 @@ def described(capsys, *arguments):
     return json.loads(capsys.readouterr().out)
 
 
-def test_it_says_what_the_scene_has(capsys):
+def test_it_says_what_the_scene_has(capsys, monkeypatch):
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 12)
     found, scene = described(capsys, "scene.toml", "--steps", "30"), cortado.load_scene("scene.toml")
     simulation = cortado.Simulation(scene)
     assert found["particles"] == PARTICLES and found["wall_particles"] == len(simulation.walls)
@@ -59,7 +61,7 @@ def test_another_mass_than_was_asked_for_is_told(capsys):
         given, asked = found["mass_of_phase_kg"]["water"], found["mass_asked_of_phase_kg"]["water"]
         assert asked == pytest.approx(mass, rel=1e-3) and ("asked" in found["mass_in_words"][0]) == (upper is not whole)
         assert (given == pytest.approx(asked, rel=0.003)) == (upper is whole)
-    main(["run", "scene.toml", "--steps", "2", "--set", "fluid.0.upper=[0.33,0.33]"])
+    main(["run", "scene.toml", "--steps", "2", "--no-pictures", "--set", "fluid.0.upper=[0.33,0.33]"])
     assert "where 108.9 kg were asked for" in "".join(capsys.readouterr())
 
 
@@ -177,7 +179,8 @@ def test_the_first_state_is_drawn(capsys):
     assert picture.shape[2] == 3 and 0.01 < blue < 0.9
 
 
-def test_a_scene_that_does_not_bear_its_first_steps(capsys):
+def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 100)
     found = described(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
     assert "diverged in step" in found["diverged"] and "milliseconds_per_step" not in found
     main(["describe", "scene.toml", "--set", "fluid.0.velocity=[10,25]"])

@@ -1,15 +1,28 @@
-"""The code in the documents runs as printed, and what they link to is there."""
+"""The documents: their code runs as printed, their links lead somewhere, their pages and films are up to date."""
 
+import importlib.util
 import re
 import runpy
 import shlex
 import shutil
+import tomllib
 from pathlib import Path
 
+import mathml
 import matplotlib.pyplot
+import numpy as np
+import outer_pages
 import pytest
+import scene_page
+import task_page
+import trimesh
 
 from cortado.cli import main
+from cortado.optimisation.inverse.fit_tables import FitTables
+from cortado.optimisation.inverse.fit_task import load_fit
+from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.task import load_task
+from cortado.scene.scene import Scene, load_scene
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -106,3 +119,145 @@ def test_names_in_files_are_there():
 def test_there_is_code():
     assert CODE["runs.md"]
     assert len(TUTORIALS) == 8 and len(COMMANDS) > 15
+
+
+PAGE, FILMS = ROOT / "docs/gallery.md", ROOT / "docs/images/films"
+
+
+def entries():
+    spec = importlib.util.spec_from_file_location("gallery", ROOT / "docs/site/gallery.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.ENTRIES
+
+
+def test_every_scene_takes_its_values():
+    for entry in (one for one in entries().values() if one.values):
+        scene = load_scene(entry.scene, [*entry.values, f"discretisation.spacing={entry.spacing}"])
+        assert scene.discretisation.spacing == entry.spacing
+
+
+def test_what_is_on_the_page_can_be_made_and_is_there():
+    text = PAGE.read_text("utf-8")
+    named, shown = re.findall(r"gallery\.py --only (\w+)", text), re.findall(r"films/(\w+)\.webp", text)
+    assert named == shown and set(named) <= set(entries()) and len(named) >= 13
+    sizes = [(FILMS / f"{name}.webp").stat().st_size for name in named]
+    assert max(sizes) < 650_000 and sum(sizes) < 12_000_000
+    assert all((FILMS / f"{name}.jpg").exists() for name in named)
+
+
+PAGES = sorted(path for path in DOCS.rglob("*.md"))
+CODE_OF_A_PAGE = re.compile(r"^(```+|~~~+).*?^\1$|^(?: {4}.*\n)+|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+
+
+def prose(path: Path) -> str:
+    """A page without its code."""
+    return CODE_OF_A_PAGE.sub("", path.read_text(encoding="utf-8"))
+
+
+def pages_of(page: Path) -> list[Path]:
+    """The pages that the tables of contents of a page list."""
+    found = []
+    for body in re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        names = [line.strip() for line in body.splitlines() if line.strip() and not line.startswith(":")]
+        found += [path for name in names for path in page.parent.glob(f"{name}.md")]
+    return found
+
+
+def test_every_page_is_in_one_table_of_contents():
+    """A new page gets its line in docs/index.md."""
+    listed = [entry for page in PAGES for entry in pages_of(page)]
+    assert sorted([*listed, DOCS / "index.md"]) == PAGES
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS).as_posix())
+def test_a_page_has_one_title_links_and_pictures_that_are_there(page):
+    text = prose(page)
+    assert len(re.findall(r"^# .+", text, re.MULTILINE)) == 1
+    assert [alt for alt in re.findall(r"!\[(.*?)\]\(", text, re.DOTALL) if len(alt) < 10] == []
+    links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page, file", outer_pages.OUTER.items())
+def test_a_page_from_elsewhere_is_there_and_says_where(page, file):
+    assert (DOCS.parent / file).exists()
+    assert f"](../{file})" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+
+
+def test_bars_around_a_number_are_no_relations():
+    """Without a form, a bar inside of a formula has room on both sides, and its superscript hangs below it."""
+    left, right = (
+        f'<mo form="{form}" stretchy="false" lspace="0" rspace="0">&#x0007C;</mo>' for form in ("prefix", "postfix")
+    )
+    made = mathml.mathml(r"a \lvert c_i - c_j \rvert^2 + P(x | y) \lvert z \rvert", "inline")
+    assert re.findall(r"<mo[^>]*>&#x0007C;</mo>", made) == [
+        left,
+        right,
+        '<mo stretchy="false">&#x0007C;</mo>',
+        left,
+        right,
+    ]
+    assert f"<msup>{right}<mn>2</mn></msup>" in made
+
+
+def test_primes_are_as_large_as_their_letter():
+    made = mathml.mathml(r"\alpha f'' + f'(x) + g^2", "block")
+    assert made.count("<msup>") == 1 and 'display="block"' in made
+    for prime in ("2", "3"):
+        assert f'<mrow><mi>f</mi><mo lspace="0" rspace="0">&#x0203{prime};</mo></mrow>' in made
+
+
+@pytest.mark.parametrize("module", [scene_page, task_page])
+def test_a_page_is_up_to_date(module):
+    asked = f"run: python docs/site/{module.__name__}.py"
+    assert module.PAGE.read_text(encoding="utf-8") == module.page(), asked
+
+
+@pytest.mark.parametrize("module, models", [(scene_page, [Scene]), (task_page, [TaskTables, FitTables])])
+def test_every_table_has_an_example_and_every_key_is_explained(module, models):
+    tables = {name: table for model in models for name, table in model.model_json_schema()["$defs"].items()}
+    assert module.examples().keys() == tables.keys()
+    text = module.page()
+    for name, table in tables.items():
+        assert [key for key in table["properties"] if f"\n| `{key}` |" not in text] == [], name
+    assert not re.findall(r"\| \.? \|\n", text), "a key without a meaning"
+
+
+def parts(text: str) -> list[tuple[str, str]]:
+    """Of a file its tables, each with its name; what comes before the first has the name ""."""
+    found = re.split(r"^(?=\[)", text.strip() + "\n", flags=re.MULTILINE)
+    return [(re.match(r"\[*([\w.]*)", part)[1] if part.startswith("[") else "", part) for part in found if part]
+
+
+def replaced(whole: str, example: str) -> str:
+    """A file in which the tables of an example stand in the place of those with the same names."""
+    names = {name for name, _ in parts(example)}
+    kept = [(name, part) for name, part in parts(whole) if name not in names]
+    return "\n".join(part for _, part in sorted([*kept, *parts(example)], key=lambda named: named[0] != ""))
+
+
+@pytest.mark.parametrize("model, example", scene_page.examples().items())
+def test_an_example_of_a_scene_is_one(model, example, tmp_path):
+    np.save(tmp_path / "drop.npy", np.full((2, 3), 0.3) + [[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
+    block = trimesh.creation.box(extents=[200.0, 200.0, 200.0])
+    block.export(tmp_path / "block.stl")
+    file = tmp_path / "scene.toml"
+    file.write_text(replaced(scene_page.WHOLE, example))
+    scene = load_scene(file)
+    (table, given) = list(tomllib.loads(example).items())[-1]
+    assert getattr(scene, table) != getattr(load_scene_of_the_page(tmp_path), table) or given["shape"] == "none"
+
+
+def load_scene_of_the_page(folder: Path) -> Scene:
+    file = folder / "whole.toml"
+    file.write_text(scene_page.WHOLE)
+    return load_scene(file)
+
+
+@pytest.mark.parametrize("model, example", task_page.examples().items())
+def test_an_example_of_a_task_is_one(model, example, tmp_path):
+    file = tmp_path / "task.toml"
+    is_fit = example in [part[3] for part in task_page.FIT_PARTS]
+    file.write_text(scene_page.WHOLE + replaced(task_page.WHOLE_FIT if is_fit else task_page.WHOLE, example))
+    assert (load_fit if is_fit else load_task)(file) is not None

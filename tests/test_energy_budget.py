@@ -1,10 +1,4 @@
-"""The budget of pressure in one step: particles keep their momentum, and its work is that of compressing the fluid.
-
-    without walls:  sum_i F_i = 0,      for any displacements u:  sum_i F_i . u_i = -V sum_i q_i dn_i[u]
-
-F_i is the force on particle i [N], which is m_i V times its pressure acceleration, q_i is p_i / n_i^2, and dn_i[u]
-comes from the tangent of the density. The second line also holds for the walls' parts of F and dn alone.
-"""
+"""The pressure of the projection: the momentum that it carries, its work, its mean, and derivatives of that."""
 
 from functools import cache
 
@@ -12,10 +6,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import Simulation
+from cortado import Problem, Simulation
 from cortado.particles.neighbourhood import neighbourhood_type
 from cortado.particles.state import to_device
-from scenes import plane, plane_of_three, scene, two_layers
+from reference_projection import Projection
+from scenes import OIL, plane, plane_of_three, scene, two_layers
+from still_fluids import still_water
+from test_moving_solids import ROTOR
+from test_quantities import Weighted, cubic_spline
+from test_solid_parameters import SCENES, STEPS, check, point_of
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6}
 ROUND_OFF = {"float64": 1e-14, "float32": 1e-6}
@@ -130,3 +129,121 @@ def test_so_it_is_in_the_reference_engine(make, kernel):
     history = reference.Simulation(step.simulation.scene).run(1, step.point)
     forces = step.forces_behind(history.velocities.high[-1])
     assert step.gap(forces, step.compressions(step.whole)) < ROUND_OFF["float64"]
+
+
+PROJECTION = {"kind": "projection", "time_step": 0.002}
+C2 = {"discretisation": {"spacing": 0.05, "kernel": "wendland_c2", "support": 2.6}}
+BOTH = [scene().phase[0].model_dump(), OIL]
+HALVES = [
+    {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "water"},
+    {"shape": "box", "lower": [0.0, 0.2], "upper": [0.4, 0.4], "phase": "oil"},
+]
+ROOM = {"container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.6, 0.6, 0.6]}}
+FLOWS = {
+    "plane": lambda **own: plane(solver=PROJECTION, **own),
+    "plane, Wendland": lambda **own: plane(solver=PROJECTION, **own, **C2),
+    "space": lambda **own: scene(solver=PROJECTION, **own, **ROOM),
+    "two phases": lambda **own: plane(solver=PROJECTION, **own, phase=BOTH, fluid=HALVES),
+    "free": lambda **own: plane(solver=PROJECTION, **own, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
+}
+
+
+@pytest.mark.parametrize("make", FLOWS.values(), ids=FLOWS)
+def test_pressures_add_up_to_the_virial_of_their_forces(make):
+    """d sum p_i V_i = sum x_i . F_i in d dimensions, with V_i = s^d, to round-off, beside walls through the origin, as
+    they push along their normals: forces at their surfaces have no part in it. F_i is what the next state says."""
+    simulation = Simulation(make(), precision="float64")
+    turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
+    first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
+    forces = first["reference_density"][:, None] * second["pressure_kick"] / 0.002
+    pressures, x = simulation.quantity("pressure", first), first["positions"]
+    scale = np.abs(x * forces).sum()
+    assert simulation.dimension * pressures.sum() == pytest.approx((x * forces).sum(), abs=1e-12 * scale)
+    assert np.abs(pressures).sum() > 0.1 * scale
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_pressures_are_sums_over_all_pairs_and_walls(name):
+    """In NumPy, from the pressures' impulses and L of the solver, also beside a box that sticks out into the fluid, and
+    with images."""
+    d = FLOWS[name]().dimension
+    box = {"name": "box", "shape": "box", "lower": [0.1] * d, "upper": [0.2] * d}
+    simulation = Simulation(FLOWS[name](solid=[box]), precision="float64")
+    turning = {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)}
+    first, second = (simulation.run(steps, turning).last_state for steps in (6, 7))
+    found, solver = simulation.quantity("pressure", first), simulation.solver
+    x, volume = first["positions"], simulation.lattice.volume
+    L = np.empty((len(x), d, d))
+    L[solver.search.order.numpy()[: len(x)]] = solver.around["L"].numpy()[:, :d, :d]
+    T = (second["pressure_impulse"] / 0.002)[:, None, None] * L
+    (_, g), (_, wall_g) = cubic_spline(simulation, x)
+    apart = x[:, None] - x[None]
+    pairs = -0.5 * volume * np.einsum("ijk,ijkl,ijl->i", apart, T[:, None] + T[None], g)
+    weights, places, feet = (solver.search.walls[f"wall_{of}"].numpy() for of in ("weights", "positions", "feet"))
+    places, feet, wall_g = places[:, :d], feet[:, :d], volume * weights[:, None] * wall_g
+    units = feet / np.linalg.norm(feet, axis=1, keepdims=True)
+    along = (wall_g * units).sum(axis=2, keepdims=True) * units
+    normal, whole = along.sum(axis=1), wall_g.sum(axis=1)
+    square = (whole**2).sum(axis=1)
+    off = (square - (normal**2).sum(axis=1)) / (square + 0.01 * solver.constants.least_diagonal)
+    t = np.clip((off - 0.1) / 0.3, 0.0, 1.0)
+    edge = (t * t * (3.0 - 2.0 * t))[:, None, None]
+    from_surface = x[:, None] - (places + feet)[None]
+    twin, k = Projection.of(simulation), second["pressure_impulse"] / 0.002
+    h = twin.share(x)[0]
+    counted = along + edge * (wall_g - along) - h[:, None, None] * along * twin.container[:, None]
+    reach = (counted * from_surface).sum(axis=(1, 2))
+    for _, x_ij, _, image_g in twin.images(x):
+        pairs -= 0.5 * (((h * k)[:, None] + h * k) * (x_ij * image_g).sum(axis=2)).sum(axis=1)
+    wanted = (pairs - k * reach) / d
+    np.testing.assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
+    assert (edge > 0.5).any()
+
+
+def test_water_at_rest_has_the_pressure_of_its_depth():
+    """Within 2 %, where the impulses over dt that they are made of are 4 % off."""
+    found = still_water(20)
+    assert found.pressure.all < 0.02 < 0.03 < found.multiplier.all
+    assert found.pressure.inside < 0.02
+    assert found.pressure.near_walls < 0.03
+
+
+@pytest.mark.parametrize("name", ["projection", "space", "two phases", "two solids", "tension", "periodic"])
+def test_pressures_beside_moving_solids_have_derivatives(name):
+    """Reverse and forward mode to round-off, and differences, for gravity, viscosity, and what solids do."""
+    own = SCENES[name]()
+    simulation = Simulation(own, precision="float64")
+    weights = np.random.default_rng(2).uniform(size=simulation.particles)
+    point, along = point_of(own)
+    point |= {"gravity": np.array(own.forces.gravity) + 0.5, "time_step": np.array(0.001)}
+    along |= {"gravity": np.ones(own.dimension), "time_step": np.array(1e-4)}
+    check(Problem(simulation, STEPS, Weighted("pressure", weights)), point, along)
+
+
+def test_in_float32_pressures_and_their_gradient_are_near_those_of_float64():
+    found = {}
+    for precision in ("float32", "float64"):
+        simulation = Simulation(plane(solver=PROJECTION), precision=precision)
+        problem = Problem(simulation, STEPS, Weighted("pressure", np.ones(simulation.particles)))
+        found[precision] = problem.value_and_gradient({"gravity": np.array([0.3, -9.81])})
+    (loss, gradient), (wanted, exact) = found.values()
+    assert loss == pytest.approx(wanted, rel=1e-4)
+    assert np.linalg.norm(gradient["gravity"] - exact["gravity"]) < 1e-3 * np.linalg.norm(exact["gravity"])
+
+
+def test_pressures_of_a_batch_are_those_of_single_scenes():
+    simulation = Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
+    gravities = [[0.0, -9.81], [1.0, -5.0]]
+    found = simulation.batch_of(2).run(4, {"gravity": [[g] for g in gravities]}, record=["pressure"])
+    for gravity, own in zip(gravities, found, strict=True):
+        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
+        np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
+
+
+def test_loads_do_without_stresses():
+    """Their kernels are not even made: loads are read in every step."""
+    simulation = Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
+    simulation.quantity("rotor.load")
+    assert "mean_stress" not in vars(simulation.solver)
+    simulation.quantity("pressure")
+    assert "mean_stress" in vars(simulation.solver)

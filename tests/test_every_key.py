@@ -2,6 +2,7 @@
 
 import atexit
 import shutil
+import warnings
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -11,13 +12,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from cortado import CortadoError, Scene, Simulation
+from bad_scenes import assert_one_sentence
+from cortado import CortadoError, CortadoWarning, Scene, SceneError, Simulation
+from cortado.optimisation.datasets import DatasetTable
 from cortado.pictures.painter import colours_of, painter
 from cortado.runs.pace import Pace
 from cortado.scene.appearance import Moment, View
-from cortado.scene.model import SceneTables
+from cortado.scene.model import Bingham, SceneTables
 from every_key import given, key_at, keys_of, places, put, same, told
-from scenes import jet, plane, plane_of_three, scene
+from scenes import jet, plane, plane_of_three, scene, two_layers
 
 ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8], "slip": "no"}
 LAW = {"kind": "bingham", "yield_stress": 3.0, "regularisation": 0.2}
@@ -228,3 +231,77 @@ def test_a_key_changed_alone_acts_or_is_refused(base, path):
     except CortadoError:
         return
     assert acts
+
+
+BELT = {"name": "belt", "shape": "box", "lower": [0.2, 0.3], "upper": [0.4, 0.4]}
+TANK = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
+MUD_PHASE = {"name": "mud", "rest_density": 1000.0, "viscosity": 0.5}
+SHAKEN = {"gravity": {"times": [0.0, 1.0], "values": [[0.0, -9.81], [2.0, -9.81]]}}
+MUD = {"fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.2], "phase": "mud"}]}
+KEYFRAMES = {"kind": "keyframes", "times": [0.0, 1.0], "cameras": [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]}
+
+
+def path(**keys):
+    return plane(solid=[{**BELT, "motion": "path", **keys}], fluid=[], emitter=jet().emitter)
+
+
+REFUSED = {
+    "mixture.strength": lambda: two_layers(mixture={"strength": 2.0}),
+    "mixture.interface_width": lambda: two_layers(mixture={"interface_width": 0.1}),
+    "mixture.free_energy": lambda: two_layers(mixture={"free_energy": "miscible"}),
+    "mixture.mobility_form": lambda: two_layers(mixture={"mobility_form": "constant"}),
+    "forces.viscous_solve": lambda: plane(forces={"viscosity": "pairwise", "viscous_solve": "implicit"}),
+    "container.slip": lambda: plane(container={**TANK, "periodic": [True, True], "slip": "no"}),
+    "container.colour": lambda: plane(container={**TANK, "periodic": [True, True], "colour": [0.1, 0.2, 0.3]}),
+    "container.material": lambda: plane(container={**TANK, "material": "steel", "colour": [0.1, 0.2, 0.3]}),
+    "phase[0].material": lambda: plane(phase=[{**MUD_PHASE, "material": "milk", "colour": [0.1, 0.2, 0.3]}], **MUD),
+    "forces.gravity": lambda: plane(forces={"gravity": [0.0, -1.62]}, schedule=SHAKEN),
+    "picture.light": lambda: plane(picture={"light": "noon", "background": [0.5, 0.5, 0.5]}),
+    "picture.floor": lambda: plane(picture={"floor": False}),
+    "picture.field_of_view": lambda: plane(picture={"field_of_view": 40.0}),
+    "picture.surface": lambda: plane(picture={"surface": "spheres"}),
+    "picture.transparency": lambda: scene(picture={"surface": "spheres", "transparency": 0.5}),
+    "picture.film_speed": lambda: plane(picture={"film_frames": 0, "film_speed": 0.5}),
+    "picture.camera": lambda: scene(picture={"camera": [1.0, 1.0, 1.0], "camera_path": KEYFRAMES}),
+    "solid[0].positions": lambda: path(times=[0.0, 1.0]),
+    "tangent_frames": lambda: DatasetTable(steps=2, velocity_noise=0.1, tangent_frames="all"),
+}
+WARNED = {
+    "mixture.strength": lambda: two_layers(mixture={"strength": 2.0, "mobility": 0.0}),
+    "container.slip": lambda: plane(container={**TANK, "slip": "no"}, forces={"viscosity": "none"}),
+    "solver.iterations": lambda: plane(
+        solver={"kind": "projection", "time_step": 1e-3, "iterations": 5}, forces={"pressure": False}
+    ),
+    "emitter.length": lambda: jet(emitter={**jet().emitter.model_dump(), "length": 1.0, "duration": 0.05}),
+    "solid[0].centre": lambda: plane(
+        solid=[{"name": "ball", "shape": "sphere", "centre": [0.5, 0.6], "radius": 0.1, "position": [0.5, 0.7]}]
+    ),
+    "discretisation.jitter": lambda: jet(discretisation={"spacing": 0.05, "jitter": 0.1}, fluid=[]),
+    "phase[0].rheology.regularisation": lambda: plane(
+        phase=[{**MUD_PHASE, "rheology": Bingham(yield_stress=0.0, regularisation=0.3)}], **MUD
+    ),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_a_key_of_a_choice_that_was_not_made_is_refused(key):
+    with pytest.raises(SceneError) as caught:
+        REFUSED[key]()
+    assert str(caught.value).startswith(f"{key} is ")
+    assert_one_sentence(str(caught.value))
+
+
+def test_gravity_that_a_schedule_begins_with_is_said_twice():
+    first = {"times": [0.0, 1.0], "values": [[0.0, -1.62], [2.0, -1.62]]}
+    assert plane(forces={"gravity": [0.0, -1.62]}, schedule={"gravity": first}).schedule.gravity.times == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("key", WARNED)
+def test_a_key_that_a_zero_turns_off_is_warned_of(key):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CortadoWarning)
+        made = WARNED[key]()
+    assert any(str(one.message).startswith(f"{key} changes nothing, as ") for one in caught)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        assert Scene.from_json(made.to_json()) == made

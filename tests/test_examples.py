@@ -1,14 +1,33 @@
-"""The examples in Python run without a screen, end in a check, and the check can fail."""
+"""What is shipped to begin with runs: the README, the examples in Python, notebooks and scenes."""
 
+import json
 import os
+import re
+import shlex
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import matplotlib.pyplot
 import numpy as np
 import pytest
 
+import cortado.cli.commands.check
+import cortado.cli.commands.describe
+import cortado.cli.commands.new
+import cortado.cli.commands.optimise
+import cortado.cli.commands.run
+import cortado.cli.commands.sweep
+from compiling_notice import without_compiling
+from cortado.cli import main
+from cortado.cli.commands.new import new_scene, templates
+from cortado.errors import CortadoWarning
+from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
+from cortado.rollout.run_checks import unstable_sentence
+from cortado.scene.parameter_values import Tilt
+from cortado.scene.scene import load_scene
 
 FOLDER = Path(__file__).parents[1] / "examples"
 MISTAKES = {
@@ -69,3 +88,143 @@ def test_its_check_can_fail(name, tmp_path):
     (tmp_path / name).write_text(source.replace(right, wrong))
     done = run(tmp_path / name, tmp_path)
     assert done.returncode == 1 and f"AssertionError: {said}" in done.stderr
+
+
+BOOKS = {path.stem: path for path in sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))}
+
+
+def cells(name):
+    return json.loads(BOOKS[name].read_text(encoding="utf-8"))["cells"]
+
+
+@pytest.mark.parametrize("name", BOOKS)
+def test_a_notebook_is_kept_without_outputs(name):
+    code = [cell for cell in cells(name) if cell["cell_type"] == "code"]
+    assert code and not any(cell["outputs"] or cell["execution_count"] for cell in code)
+
+
+@pytest.mark.parametrize("name", BOOKS)
+def test_all_cells_run(name, monkeypatch, tmp_path):
+    """One behind the other, without a kernel."""
+    if name == "train_a_policy":
+        pytest.importorskip("optax", reason="optax is not installed")
+    monkeypatch.setenv("CORTADO_QUICK", "1")
+    monkeypatch.setattr(matplotlib.pyplot, "show", matplotlib.pyplot.close)
+    monkeypatch.chdir(tmp_path)
+    code = ["".join(cell["source"]) for cell in cells(name) if cell["cell_type"] == "code"]
+    exec(compile("\n".join(code), name, "exec"), {"__name__": "__main__"})
+    matplotlib.pyplot.close("all")
+
+
+def test_in_a_kernel_objects_are_shown(monkeypatch, tmp_path):
+    """The first steps, as Jupyter runs them: particles, a film, a picture and the result of a search."""
+    nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
+    client = pytest.importorskip("nbclient", reason="nbclient is not installed")
+    monkeypatch.setenv("CORTADO_QUICK", "1")
+    book = nbformat.read(BOOKS["first_steps"], as_version=4)
+    client.NotebookClient(book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in book.cells if cell.cell_type == "code" for output in cell.outputs]
+    shown = [kind for output in outputs for kind in output.get("data", {})]
+    assert shown.count("text/html") == 3 and shown.count("image/png") == 1
+    said = "".join(output.text for output in outputs if output.get("name") == "stderr")  # a line may come in parts
+    assert without_compiling(said) == ""
+
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+LOADERS = {"optimise": load_task, "sweep": load_task}
+COMMANDS = re.findall(r"^    cortado (.*)$", README, re.MULTILINE)
+
+
+@pytest.fixture(autouse=True)
+def root(monkeypatch):
+    """The working directory that the README assumes."""
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.mark.filterwarnings("error:.*limit of stability:cortado.errors.CortadoWarning")
+def test_the_code_runs_as_printed(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(code.splitlines()) <= 25
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
+    shape, ratio, _ = [line for line in capsys.readouterr().out.splitlines() if line[0] in "([0123456789"]
+    assert re.fullmatch(r"\(21, \d+, 3\)", shape)
+    assert float(ratio) == pytest.approx(1.0, abs=1e-9)
+    np.testing.assert_allclose(names["result"].parameters["tilt"], names["true_tilt"]["tilt"], atol=0.01)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_is_one(command, monkeypatch):
+    for module, function in (
+        (cortado.cli.commands.new, "new_scene"),
+        (cortado.cli.commands.describe, "describe_scene"),
+        (cortado.cli.commands.run, "run_scene"),
+        (cortado.cli.commands.optimise, "optimise_task"),
+        (cortado.cli.commands.check, "check_scene"),
+        (cortado.cli.commands.sweep, "run_sweep"),
+    ):
+        monkeypatch.setattr(module, function, lambda *arguments: "done")
+    words = shlex.split(command)
+    main(words)
+    load = next((LOADERS[word] for word in words if word in LOADERS), load_scene)
+    for word in words:
+        if word.endswith(".toml"):
+            assert load(word) is not None
+
+
+def test_there_are_commands():
+    wanted = {"new", "describe", "run", "optimise", "sweep", "gradients"}
+    assert {command.split()[0] for command in COMMANDS} == wanted
+
+
+def test_its_files_are_there():
+    linked = re.findall(r"\]\(([^):]+)\)", README)
+    named = re.findall(r"\b(?:docs|examples|tests|validation)/[\w/.]+\w", README)
+    assert len(linked) >= 3 and len(named) >= 8
+    assert [name for name in [*linked, *named] if not (ROOT / name).exists()] == []
+
+
+def test_its_targets_are_in_the_makefile():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = re.findall(r"^    make (\w+)$", README, re.MULTILINE)
+    assert targets == ["demo", "test"]
+    assert set(targets) <= set(re.search(r"^TASKS := (.*)$", makefile, re.MULTILINE)[1].split())
+
+
+def test_it_names_no_path_of_a_machine():
+    assert re.findall(r"(?<![\w.:/])/(?:home|root|work|tmp|Users|mnt)\b", README) == []
+
+
+FOLDERS = ("examples", "docs/figures", "experiments/scenes")
+FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.toml"))]
+TASKS = [path for path in FILES if "[optimise]" in path.read_text(encoding="utf-8")]
+
+
+def loaded(path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        load_scene(path)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_scene_is_warned_of(path):
+    loaded(path)
+
+
+@pytest.mark.parametrize(("template", "dimension"), [("dam", 2), ("dam", 3), *((one, None) for one in templates()[1:])])
+def test_no_new_scene_is_warned_of(tmp_path, template, dimension):
+    new_scene(tmp_path / "scene.toml", template, dimension)
+    loaded(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("path", TASKS, ids=lambda path: path.stem)
+def test_no_search_is_warned_of(path):
+    """At its start and at its target."""
+    task = load_task(path)
+    tilt = Tilt(task.scene.forces.gravity)
+    start = {name: value for name, value in task.start.items() if not isinstance(value, str)}
+    for values in (start, dict(task.true_parameters)):
+        if "tilt" in values:
+            values["gravity"] = tilt.gravity(np.atleast_2d(values.pop("tilt")))
+        assert not task.problem.steps or unstable_sentence(values, task.scene, set()) is None

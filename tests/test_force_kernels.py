@@ -10,15 +10,20 @@ import warp as wp
 
 import cortado
 import test_kernels
+from cortado import Simulation
 from cortado.forces import Body, Pair
-from cortado.particles.solid_shares import ALL_WALLS
-from cortado.particles.state import Layout
+from cortado.particles.solid_shares import ALL_WALLS, SolidShares
+from cortado.particles.state import Fields, Layout
+from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.curvature_kernels import curvature_adjoints, curvature_kernels, curvature_tangents, entries
 from cortado.sph.emitter import Nozzle, emitter_kernels, nozzle_type
+from cortado.sph.gravity import Gravity
+from cortado.sph.parts import Adjoints, Shares
 from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.surface_tension import normal_kernels
 from cortado.sph.vorticity import circulation_kernels
 from cortado.sph.walls import wall_slope_term
+from scenes import plane_of_three, splash
 from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros
 
 VECTORS = np.zeros((N, 3))
@@ -312,7 +317,7 @@ ELSEWHERE = {
     "strength_kernels": "the same",
     "repair_kernels": "of the projection again: whole steps in tests/test_projection.py",
     "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
-    "mean_stress_kernels": "of a quantity: tests/test_mean_stress.py",
+    "mean_stress_kernels": "of a quantity: tests/test_energy_budget.py",
     "stress_wall_kernels": "of loads, which are quantities: tests/test_solid_loads.py",
     "environment_kernels": "of rewards: tests/test_environments.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
@@ -340,3 +345,33 @@ def of_an_adjoint(function):
 
 OF_FORCES = {"body_kernels", "pair_kernels"}
 """Made by `OfOneFunction.force`; those of this name in the projection are checked in tests/test_free_bodies.py."""
+
+
+def test_gravity_adds_to_its_adjoint():
+    simulation = Simulation(splash(), precision="float64")
+    solver, n = simulation.solver, simulation.particles
+    bar = solver.new_parameters(2)
+    bar["gravity"].assign(np.full((1, 2, 3), 0.5))
+    fields = Fields.zeros(n, simulation.precision, simulation.device)
+    shares = Shares(["time_step"], solver.layout)
+    ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
+    solver.step_number.fill_(1)
+    gravity, solids = Gravity(solver.layout, taped=False), SolidShares(None, solver.layout)
+    for _ in range(2):
+        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares, solids))
+    np.testing.assert_array_equal(bar["gravity"].numpy(), [[[0.5] * 3, [0.5 + 2 * n] * 3]])
+
+
+@pytest.mark.parametrize("shares", ["drag", "gravity", "mass_fractions"])
+def test_what_cannot_be_shared_is_said(shares):
+    with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
+        Shares([shares], Layout(3, 1, FLOAT64, "cpu"))
+
+
+def test_what_parts_added_to_parameters_is_kept_to_the_end():
+    solver = Simulation(plane_of_three(), precision="float64").solver
+    adjoint = PcisphAdjoint(solver, steps=2)
+    for array in adjoint.bar.parameters.arrays():
+        array.fill_(0.5)
+    for array in adjoint.collect().arrays():
+        np.testing.assert_array_equal(array.numpy(), 0.5)

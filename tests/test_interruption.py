@@ -1,5 +1,7 @@
-"""Ctrl-C and SIGTERM at any moment: a sentence, and the exit code that shells expect."""
+"""What ends a command: signals, broken streams, and the end of memory, open files or threads."""
 
+import builtins
+import errno
 import os
 import signal
 import subprocess
@@ -7,6 +9,9 @@ import sys
 
 import pytest
 
+from bad_tasks import TINY_SCENE
+from cortado.cli.process import shortage
+from cortado.files.terminal import printable
 from signals import NEEDED, listen
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
@@ -111,3 +116,128 @@ def test_a_signal_that_is_ignored_stays_so():
     ignoring = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {START}"
     found = stopped(signal.SIGINT, "-c", f"{ignoring} print('here', flush=True); time.sleep(0.2); print('done')")
     assert found == (0, "done\n")
+
+
+MISTAKE = ("run", "absent.toml")
+SENTENCE = "absent.toml: the scene cannot be read: No such file or directory.\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain, with é and 流", "plain, with é and 流"),
+        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+        ("two\nlines\r\tand\x7f", "two\\nlines\\r\\tand\\x7f"),
+        ("\u202eevil \x9b2J", "\\u202eevil \\x9b2J"),
+        (os.fsdecode(b"b\xff\x80"), "b\\xff\\x80"),
+        ("\ud800", "\\ud800"),
+    ],
+)
+def test_what_steers_a_terminal_is_escaped(text, shown):
+    assert printable(text) == shown
+
+
+def in_shell(line: str, *arguments: str, **environment: str) -> tuple[int, str]:
+    """Exit code and output of a line of a shell in which $* is the command; what is broken is not in it."""
+    command = [sys.executable, "-m", "cortado", *arguments]
+    done = subprocess.run(
+        ["bash", "-c", line, "bash", *command], capture_output=True, env={**os.environ, **environment}, timeout=60
+    )
+    return done.returncode, (done.stdout + done.stderr).decode()
+
+
+@pytest.mark.parametrize(
+    ("line", "arguments", "code", "said"),
+    [
+        ('"$@"', MISTAKE, 2, SENTENCE),
+        ('"$@" 2>&-', MISTAKE, 2, ""),
+        ('"$@" <&- >&- 2>&-', MISTAKE, 2, ""),
+        ('"$@" 2>/dev/full', MISTAKE, 2, ""),
+        ('"$@" 2> >(exec 0<&-; sleep 1)', MISTAKE, 2, ""),
+        ('"$@" | true; exit ${PIPESTATUS[0]}', ["run", "--help"], 141, ""),
+        (
+            '"$@" >/dev/full',
+            ["--help"],
+            1,
+            "The result cannot be written to the standard output: No space left on device.\n",
+        ),
+        (
+            '"$@" >&-',
+            ["schema"],
+            1,
+            "The result cannot be written to the standard output: Bad file descriptor.\n",
+        ),
+    ],
+    ids=["whole", "no stderr", "no streams", "full stderr", "broken stderr", "broken stdout", "full stdout", "none"],
+)
+def test_broken_streams_leave_the_exit_code(line, arguments, code, said):
+    assert in_shell(line, *arguments) == (code, said)
+
+
+def test_names_that_cannot_be_shown_are_escaped():
+    name = os.fsdecode("é".encode() + b"\xff\x1b[31m")
+    for encoding, accent in (("ascii", "\\xe9"), ("utf-8", "é")):
+        found = in_shell('"$@"', "run", name, PYTHONIOENCODING=encoding)
+        assert found == (2, f"{accent}\\xff\\x1b[31m: the scene cannot be read: No such file or directory.\n")
+
+
+MAPPING = "libx.so: failed to map segment from shared object"
+
+
+def caused(error, cause):
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "begin"),
+    [
+        (MemoryError(), "Memory ran out; take a larger spacing"),
+        (MemoryError("Unable to allocate 64 GiB"), "Memory ran out (Unable to allocate 64 GiB); take"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "Memory ran out ([Errno 12]"),
+        (ImportError(MAPPING), f"Memory ran out ({MAPPING}); take"),
+        (caused(RuntimeError("Failed to load warp.so"), OSError(MAPPING)), f"Memory ran out ({MAPPING}); take"),
+        (OSError(errno.EMFILE, "Too many open files", "font.ttf"), "Too many files are open ([Errno 24] Too many"),
+        (RuntimeError("can't start new thread"), "No more threads can be started; allow"),
+    ],
+)
+def test_a_shortage_is_told(cortado_command, monkeypatch, tmp_path, error, begin):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+
+    def end(*_):
+        raise error
+
+    monkeypatch.setattr("cortado.cli.commands.run.write_run_report", end)
+    code, _, err = cortado_command("run", "scene.toml", "--steps", 2, "--out", "dam")
+    assert code == 1 and err.splitlines()[-1].startswith(begin)
+    assert (tmp_path / "dam" / "trajectory.vtkhdf").exists() and (tmp_path / "dam" / "result.json").exists()
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EACCES, "no"), RuntimeError("no"), ImportError("undefined symbol")])
+def test_other_errors_are_none(error):
+    assert shortage(error) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of bash, as Linux counts them")
+@pytest.mark.parametrize(("limit", "word"), [("-v 300000", "Memory ran out"), ("-n 6", "Too many files are open")])
+def test_limits_of_a_shell(tmp_path, limit, word):
+    (tmp_path / "empty.toml").touch()  # read before anything large is imported
+    line = f'ulimit {limit}; exec "{sys.executable}" -m cortado run empty.toml'
+    ended = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == 1 and ended.stderr.splitlines()[-1].startswith(word), ended.stderr
+
+
+def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
+    from cortado.files.image_encoding import pyav
+
+    real = builtins.__import__
+
+    def importing(name, *rest):
+        if name == "av":
+            raise ImportError(MAPPING)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", importing)
+    with pytest.raises(ImportError, match="failed to map"):
+        pyav()

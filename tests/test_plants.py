@@ -75,11 +75,11 @@ ELSEWHERE = {
     "environments.kernels": "of rewards, which are no losses of these scenes: tests/test_environments.py",
     "particles.pair_sums": "it notes adjoints and has none",
     "device.compiling": "it compiles adjoints and has none",
-    "particles.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
+    "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
     "sph.own_force": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
-    "solvers.projection.mean_stress": "of a quantity too: tests/test_mean_stress.py",
+    "solvers.projection.mean_stress": "of a quantity too: tests/test_energy_budget.py",
     "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
     "sph.stress_wall_kernels": "of loads too",
 }

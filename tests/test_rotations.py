@@ -1,4 +1,4 @@
-"""Rotations by rotation vectors, and how they change with these, against series of the matrix exponential."""
+"""Rotations by rotation vectors, and gravity that leans: sizes, derivatives, and problems that are told a tilt."""
 
 from math import factorial
 
@@ -7,8 +7,15 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+import cortado
+from cortado import InputError, Problem, Simulation, losses
 from cortado.device.precision import FLOAT64
+from cortado.optimisation.transforms import TimeInterpolation, Transformed
+from cortado.scene.parameter_values import SMALL as SMALL_TILT
+from cortado.scene.parameter_values import Tilt
 from cortado.sph.rotations import SMALL, rotations
+from finite_differences import both_modes, decades, distance, plateau
+from scenes import plane, scene, splash
 
 VECTOR, REAL = FLOAT64.vector, FLOAT64.real
 SPACE = rotations(FLOAT64, 3)
@@ -73,3 +80,164 @@ def test_the_series_is_that_of_a_rotation():
     w, change, h = random.normal(size=3), random.normal(size=3), 1e-5
     ahead, behind = (Rotation.from_rotvec(w + sign * h * change) for sign in (1.0, -1.0))
     np.testing.assert_allclose((ahead * behind.inv()).as_rotvec() / (2.0 * h), jacobian(w) @ change, atol=1e-9)
+
+
+RESTS = {
+    "down": (0.0, -9.81, 0.0),
+    "down in the plane": (0.0, -9.81),
+    "askew": (3.0, -9.0, 1.0),
+    "askew in the plane": (3.0, -9.0),
+    "along z": (0.0, 0.0, 1.6),
+    "along a diagonal": (1.0, 1.0, 1.0),
+}
+ANGLES = {
+    "at rest": 0.0,
+    "tiny": 1e-9,
+    "small": np.degrees(SMALL_TILT) / 3.0,
+    "great": 25.0,
+    "beyond a right angle": 130.0,
+}
+rests = pytest.mark.parametrize("rest", RESTS.values(), ids=RESTS)
+sizes = pytest.mark.parametrize("size", ANGLES.values(), ids=ANGLES)
+
+
+def random_angles(rest, size, *shape, seed=0):
+    """(..., d - 1) [degrees], each row of that size."""
+    a = np.random.default_rng(seed).standard_normal((*shape, len(rest) - 1))
+    return size * a / np.linalg.norm(a, axis=-1, keepdims=True)
+
+
+@rests
+@sizes
+def test_gravity_keeps_its_size_and_leans_by_the_angle(rest, size):
+    gravity = Tilt(rest).gravity(random_angles(rest, size, 50))
+    whole = np.linalg.norm(rest)
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), whole, rtol=1e-15)
+    lean = np.linalg.norm(gravity - np.array(rest), axis=1) / whole  # the chord
+    np.testing.assert_allclose(lean, 2.0 * np.sin(np.radians(size) / 2.0), rtol=1e-6, atol=1e-15)
+
+
+def test_angles_are_towards_the_other_axes():
+    tilt, sine, cosine = Tilt((0.0, -2.0, 0.0)), np.sin(np.pi / 6), np.cos(np.pi / 6)
+    np.testing.assert_allclose(tilt.gravity(np.array([30.0, 0.0])), [2.0 * sine, -2.0 * cosine, 0.0], atol=1e-15)
+    np.testing.assert_allclose(tilt.gravity(np.array([0.0, -30.0])), [0.0, -2.0 * cosine, -2.0 * sine], atol=1e-15)
+    np.testing.assert_allclose(Tilt((0.0, -2.0)).gravity(np.array([30.0])), [2.0 * sine, -2.0 * cosine], atol=1e-15)
+    assert (tilt.towards, Tilt((0.0, -2.0)).towards, Tilt((0.0, 0.1, 9.0)).towards) == ("xz", "x", "xy")
+    np.testing.assert_array_equal(tilt.gravity(np.zeros(2)), [0.0, -2.0, 0.0])
+
+
+@rests
+@sizes
+def test_the_tangent_is_the_limit_of_differences(rest, size):
+    tilt, angles = Tilt(rest), random_angles(rest, size, 20)
+    along = random_angles(rest, 1.0, 20, seed=1)
+    wanted = tilt.tangent(angles, along)
+    errors = []
+    for h in decades(0.0, 4.5, apart=0.25):
+        ahead, behind = (tilt.gravity(angles + sign * h * along) for sign in (1.0, -1.0))
+        errors.append(np.linalg.norm((ahead - behind) / (2.0 * h) - wanted) / np.linalg.norm(wanted))
+    assert plateau(errors) < 1e-10
+    assert errors[4] < 1.1e-2 * errors[0] and errors[8] < 1.1e-2 * errors[4]  # of second order
+
+
+@rests
+@sizes
+def test_the_adjoint_is_the_transpose_of_the_tangent(rest, size):
+    tilt, angles = Tilt(rest), random_angles(rest, size, 20)
+    along, bar = random_angles(rest, 1.0, 20, seed=1), np.random.default_rng(2).standard_normal((20, len(rest)))
+    forward = (bar * tilt.tangent(angles, along)).sum(axis=1)
+    backward = (along * tilt.adjoint(angles, bar)).sum(axis=1)
+    np.testing.assert_allclose(backward, forward, rtol=1e-12, atol=1e-15)
+
+
+def test_the_series_joins_the_formula():
+    """To 1e-12 of |a|^2, where they take turns."""
+    below, above = (
+        Tilt._factors(np.array([[SMALL_TILT * factor, 0.0]]))[1][0, 0] for factor in (1.0 - 1e-9, 1.0 + 1e-9)
+    )
+    assert below == pytest.approx(above, rel=1e-11)
+
+
+# ---- problems ----------------------------------------------------------------------------------------------------
+
+STEPS = 12
+
+
+def problem_of(made):
+    simulation = Simulation(made, precision="float64")
+    target = simulation.positions + 0.1 * np.random.default_rng(3).random(simulation.positions.shape)
+    return Problem(simulation, STEPS, losses.FinalPositions(target))
+
+
+@pytest.mark.parametrize("made", [splash, plane], ids=["3-D", "2-D"])
+@pytest.mark.parametrize("rows", [(), (STEPS,)], ids=["constant", "over time"])
+def test_a_problem_takes_a_tilt_in_the_place_of_gravity(made, rows):
+    problem = problem_of(made())
+    rest = problem.simulation.scene.forces.gravity
+    angles = random_angles(rest, 20.0, *rows)
+    point, gravity = {"tilt": angles, "viscosity": 0.1}, {"gravity": Tilt(rest).gravity(angles), "viscosity": 0.1}
+    loss, gradient = problem.value_and_gradient(point)
+    wanted, by_gravity = problem.value_and_gradient(gravity)
+    assert loss == problem.value(point) == wanted
+    assert gradient["tilt"].shape == angles.shape and gradient["viscosity"] == by_gravity["viscosity"]
+    frames = problem.simulation.run(STEPS, point).positions
+    np.testing.assert_array_equal(frames, problem.simulation.run(STEPS, gravity).positions)
+
+    along = {"tilt": random_angles(rest, 1.0, *rows, seed=1)}
+    _, slope = both_modes(problem, point, along, 1e-11)
+    assert distance(problem.value, point, along, slope, decades(1.0, 4.0), enough=1e-8) < 1e-8
+
+
+def test_one_tilt_may_vary_where_there_is_a_row_for_each_step():
+    problem = problem_of(splash())
+    angles, along = random_angles((0, -1, 0), 20.0, STEPS), {"tilt": np.array([1.0, -0.5])}
+    gradient = problem.value_and_gradient({"tilt": angles})[1]["tilt"]
+    assert problem.tangent({"tilt": angles}, along) == pytest.approx((gradient @ along["tilt"]).sum(), rel=1e-11)
+    at_rest = problem.value_and_gradient({"tilt": np.zeros(2)})[1]["tilt"] @ along["tilt"]
+    assert problem.tangent({"viscosity": 0.05}, along) == pytest.approx(at_rest, rel=1e-11)
+
+
+def test_it_is_searched_between_knots():
+    problem = problem_of(plane())
+    knots = TimeInterpolation(STEPS, 3)
+    search = Transformed(problem, {"tilt": knots})
+    truth = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
+    target = problem.end(search.parameters(truth)).positions
+    search = Transformed(Problem(problem.simulation, STEPS, losses.FinalPositions(target)), {"tilt": knots})
+    found = cortado.optimise(search, {"tilt": np.zeros((3, 1))}, cortado.optimisers.LBFGS(scale=5.0), 25)
+    np.testing.assert_allclose(found.parameters["tilt"], truth["tilt"], atol=0.1)
+
+
+def test_gradients_with_respect_to_it_are_certified():
+    found = cortado.certify(problem_of(plane()), {"tilt": [10.0]})
+    assert found.right and found.loss_changes["tilt"] > 0.0 and "gravity" not in found.loss_changes
+    assert found.horizon == STEPS
+
+
+NOTHING_PULLS = {"forces": {"gravity": [0.0, 0.0, 0.0]}}
+
+
+@pytest.mark.parametrize(
+    ("made", "values", "words"),
+    [
+        (
+            splash,
+            {"tilt": [0.0, 0.0], "gravity": [0.0, -9.81, 0.0]},
+            "gravity is given, but must be left out, as tilt is",
+        ),
+        (splash, {"tilt": [0.0, 0.0, 0.0]}, r"tilt has shape \(3,\), but must be \(2,\) or \(12, 2\) in °"),
+        (plane, {"tilt": 0.0}, r"tilt has shape \(\), but must be \(1,\) or \(12, 1\) in °"),
+        (splash, {"tilt": [np.nan, 0.0]}, "tilt has a value that is not finite"),
+        (lambda: scene(**NOTHING_PULLS), {"tilt": [1.0, 0.0]}, "tilt is given, .* as the scene has no gravity to lean"),
+    ],
+)
+def test_a_wrong_tilt_is_a_sentence(made, values, words):
+    with pytest.raises(InputError, match=words):
+        problem_of(made()).value(values)
+
+
+def test_a_tilt_does_not_vary_where_gravity_is_given():
+    with pytest.raises(InputError, match="direction tilt is given, but must be left out, as gravity is given"):
+        problem_of(splash()).tangent({"gravity": [0.0, -9.0, 0.0]}, {"tilt": [1.0, 0.0]})
+    with pytest.raises(InputError, match="direction gravity is given, but must be left out, as tilt is given"):
+        problem_of(splash()).tangent({"tilt": [1.0, 0.0]}, {"gravity": [0.0, -1.0, 0.0]})

@@ -1,4 +1,4 @@
-"""From scenes to particles: where they are, how many, and that none is there twice."""
+"""From scenes to particles: where they are and how fast, how many, and that none is there twice."""
 
 import pickle
 import warnings
@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado import CortadoWarning, Simulation
-from cortado.errors import InputError, SceneError, unwarned
+from cortado import CortadoWarning, Scene, SceneError, Simulation
+from cortado.errors import InputError, unwarned
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.fluid_particles import fluid_particles, period
-from cortado.scene.scene import Scene
+from cortado.scene.stability import stability_limits
 from test_packing import densities
 
 SPACING = 0.05
@@ -294,3 +294,108 @@ def test_a_first_lattice_can_be_jittered(tmp_path):
     assert stirred.computed_json() != even.computed_json() and "jitter" not in even.computed_json()
     with pytest.raises(SceneError, match=r"discretisation.jitter is 0\.4, but must be at least 0 and at most 0"):
         even.replaced("discretisation.jitter=0.4")
+
+
+def boxes_of_fluid(dimension, *boxes, lower=0.0, upper=2.0):
+    """Boxes of fluid, each from a lower to an upper corner."""
+    fluid = [{"shape": "box", "lower": low, "upper": high, "phase": "water"} for low, high in boxes]
+    return Scene(
+        name="boxes",
+        dimension=dimension,
+        discretisation={"spacing": SPACING},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.01}],
+        fluid=fluid,
+        container={"shape": "box", "lower": [lower] * dimension, "upper": [upper] * dimension},
+        solver={"kind": "pcisph", "time_step": 0.001},
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("offset", np.arange(5) / 5.0 + 0.1)
+def test_a_box_within_another_is_refused(dimension, offset):
+    """At any place of its particles between those of the other, and in either order."""
+    low = 0.4 + offset * SPACING
+    large, small = ([0.0] * dimension, [1.0] * dimension), ([low] * dimension, [low + 0.1] * dimension)
+    for boxes in ((large, small), (small, large)):
+        with pytest.raises(SceneError, match=r"fluid\[1\] is overlapping fluid\[0\] at"):
+            boxes_of_fluid(dimension, *boxes)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_box_half_in_another_is_refused(dimension):
+    half = 0.5 * SPACING
+    with pytest.raises(SceneError, match="overlapping"):
+        boxes_of_fluid(
+            dimension, ([0.0] * dimension, [0.5] * dimension), ([0.3 + half] * dimension, [0.8 + half] * dimension)
+        )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("gap", [0.0, -0.4, 0.3])
+def test_a_box_may_stand_in_a_corner_of_others(dimension, gap):
+    """Nearer than a lattice by some of a spacing, or further away; the floor and the walls are boxes of fluid."""
+    side, at = 0.5, 0.5 + gap * SPACING
+    floor = ([0.0] * dimension, [1.0, side, 1.0][:dimension])
+    wall = ([0.0, side, 0.0][:dimension], [side, 1.0, 1.0][:dimension])
+    boxes = [floor, wall]
+    if dimension == 3:
+        boxes.append(([side, side, 0.0], [1.0, 1.0, side]))
+    boxes_of_fluid(dimension, *boxes, ([at] * dimension, [at + 0.3] * dimension))
+
+
+WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.0}
+
+
+def spinning_bodies(dimension, *fluid, **more):
+    forces = {"gravity": [0.0] * dimension, "viscosity": "none"}
+    tables = {
+        "solver": {"kind": "pcisph", "time_step": 0.001},
+        "discretisation": {"spacing": 0.1},
+        "phase": [WATER],
+        "forces": forces,
+        "container": {"shape": "none"},
+    }
+    return Scene(dimension=dimension, fluid=[{"phase": "water", **one} for one in fluid], **tables, **more)
+
+
+def test_a_rectangle_spins_counterclockwise_besides_its_velocity():
+    box = {"shape": "box", "lower": [1.0, 0.0], "upper": [2.0, 0.6], "velocity": [0.3, 0.0], "angular_velocity": 2.0}
+    rest = {"shape": "box", "lower": [3.0, 0.0], "upper": [3.4, 0.4]}
+    simulation = Simulation(spinning_bodies(2, box, rest), precision="float64")
+    arms = simulation.positions[:60] - [1.5, 0.3]
+    wanted = np.stack([0.3 - 2.0 * arms[:, 1], 2.0 * arms[:, 0]], axis=1)
+    np.testing.assert_allclose(simulation.velocities[:60], wanted, atol=1e-12)
+    assert not simulation.velocities[60:].any()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_sphere_spins_where_its_particles_were_packed(axis):
+    spin = 3.0 * np.eye(3)[axis]
+    ball = {"shape": "sphere", "centre": [1.0, 2.0, 3.0], "radius": 0.3, "angular_velocity": spin.tolist()}
+    simulation = Simulation(spinning_bodies(3, ball), precision="float64")
+    arms = simulation.positions - simulation.positions.mean(axis=0)
+    np.testing.assert_allclose(simulation.velocities, np.cross(spin, arms), atol=1e-12)
+    momentum = np.cross(arms, simulation.velocities).sum(axis=0)
+    assert momentum[axis] > 0.0 and np.abs(simulation.velocities.mean(axis=0)).max() < 1e-12
+
+
+def test_the_time_step_knows_how_fast_the_fastest_particle_is():
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
+    still, spinning = (stability_limits(spinning_bodies(2, {**box, "angular_velocity": w})) for w in (0.0, 50.0))
+    greatest = np.linalg.norm(
+        Simulation(spinning_bodies(2, {**box, "angular_velocity": 50.0})).velocities, axis=1
+    ).max()
+    assert spinning["speed"] < still["speed"]
+    assert (
+        spinning_bodies(2, {**box, "angular_velocity": 50.0}).fluid[0].greatest_speed(0.1) >= (1.0 - 1e-12) * greatest
+    )
+
+
+@pytest.mark.parametrize(
+    ("dimension", "spin", "words"),
+    [(2, [1.0, 0.0, 0.0], "one number in 2-D"), (3, 1.0, "a list of 3 components"), (2, "fast", "angular_velocity")],
+)
+def test_wrong_spins_are_sentences(dimension, spin, words):
+    lower, upper = [0.0] * dimension, [1.0] * dimension
+    with pytest.raises(SceneError, match=words):
+        spinning_bodies(dimension, {"shape": "box", "lower": lower, "upper": upper, "angular_velocity": spin})

@@ -1,12 +1,18 @@
-"""What Warp says of itself, and what is said instead: processes of their own, as Warp starts once in each."""
+"""What Warp says of itself and of CUDA drivers, and what is said instead: processes of their own."""
 
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 
+import cortado.device.warp_start
+from bad_scenes import assert_one_sentence
+from bad_tasks import TINY_SCENE
 from compiling_notice import COMPILING, UNOPTIMISED
+from cortado import InputError, Simulation
+from cortado.device.warp_start import installed_driver, start_warp, why_no_gpu
 
 FIRST = f"""{UNOPTIMISED}
 BEFORE
@@ -75,3 +81,68 @@ def test_the_command_line_says_the_same(compiled, tmp_path):
         assert done.returncode == 0, done.stderr
         errors.append(done.stderr)
     assert COMPILING.fullmatch(errors[0]) and errors[1] == ""
+
+
+DRIVER = """
+#include <string.h>
+static int zero() { return 0; }
+int cuInit(unsigned flags) { return 0; }
+int cuDriverGetVersion(int *version) { *version = VERSION; return 0; }
+int cuGetProcAddress(const char *name, void **found, int version, unsigned long long flags) {
+  *found = strcmp(name, "cuDriverGetVersion") ? (void *)zero : (void *)cuDriverGetVersion;
+  return 0;
+}
+int cuGetProcAddress_v2(const char *name, void **found, int version, unsigned long long flags, int *status) {
+  if (status) *status = 0;
+  return cuGetProcAddress(name, found, version, flags);
+}
+"""
+"""As much of a driver as Warp asks for its version, of CUDA 11.2 or 12.0."""
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or shutil.which("cc") is None or installed_driver() is not None,
+    reason="needs Linux, a C compiler and no driver",
+)
+@pytest.mark.parametrize("version", [11020, 12000])
+def test_an_old_driver_is_told(tmp_path, version):
+    (tmp_path / "driver.c").write_text(DRIVER)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    build = ["cc", "-shared", "-fPIC", f"-DVERSION={version}", "driver.c", "-o", "libcuda.so.1"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    command = [sys.executable, "-m", "cortado", "run", "scene.toml", "--device", "cuda:0"]
+    environment = {**os.environ, "LD_LIBRARY_PATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert_one_sentence(done.stderr.removesuffix("\n"))
+    too_old = f"the CUDA driver is too old, as it supports CUDA {version // 1000}."
+    said = f"device is 'cuda:0', but must be one of: cpu; {too_old}"
+    assert done.stderr.startswith(said) and "and Warp needs 1" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("found", "needed", "words"),
+    [
+        (None, (13, 0), "no GPU with a CUDA driver is found"),
+        ((12, 9), (13, 0), "supports CUDA 12.9 and Warp needs 13.0: install a newer driver"),
+        ((13, 0), (13, 0), "no GPU with a CUDA driver is found"),
+        ((12, 9), None, "no GPU with a CUDA driver is found"),
+    ],
+)
+def test_what_is_said_of_versions(monkeypatch, found, needed, words):
+    monkeypatch.setattr(cortado.device.warp_start, "installed_driver", lambda: found)
+    monkeypatch.setattr(cortado.device.warp_start, "_needed", lambda: needed)
+    assert words in why_no_gpu()
+
+
+def test_warp_says_what_it_needs():
+    start_warp()
+    assert (cortado.device.warp_start._needed() or (99, 0)) >= (11, 4)
+
+
+def test_python_is_told_too(monkeypatch, tmp_path):
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    monkeypatch.setattr(cortado.device.warp_start, "installed_driver", lambda: (11, 0))
+    monkeypatch.setattr("warp.get_cuda_device_count", lambda: 0)
+    with pytest.raises(InputError, match=r"the CUDA driver is too old, as it supports CUDA 11\.0"):
+        Simulation(str(tmp_path / "scene.toml"), device="cuda")

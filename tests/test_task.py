@@ -1,4 +1,4 @@
-"""Tasks: good ones load, bad ones end in one sentence, and a result is judged as its task asks."""
+"""Tasks: good ones load, bad ones end in one sentence, a result is judged as its task asks; and motions of solids."""
 
 import math
 from pathlib import Path
@@ -8,9 +8,10 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
-from cortado import gradients
+from cortado import SceneError, gradients, optimise
 from cortado.cli.commands.optimise import found_in_words, judge
-from cortado.errors import SceneError
+from cortado.optimisation.inverse.knots import knot_values
+from cortado.optimisation.inverse.setup import setup
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
@@ -276,3 +277,68 @@ def test_only_parameters_of_the_scene_are_offered(task_file, override):
         load_task(task_file, [override])
     said = str(caught.value)
     assert "viscosity" in said and not any(word in said for word in ("flow_rate", "surface", "mass_fractions", "width"))
+
+
+TASK = """
+dimension = 2
+discretisation.spacing = 0.05
+container = {shape = "box", lower = [0.0, 0.0], upper = [1.0, 1.0], slip = "no"}
+solver = {kind = "projection", time_step = 0.001}
+
+[[phase]]
+name = "water"
+rest_density = 1000.0
+viscosity = 1.0
+
+[[fluid]]
+shape = "box"
+lower = [0.0, 0.0]
+upper = [0.6, 0.4]
+phase = "water"
+
+[[solid]]
+name = "rotor"
+shape = "box"
+lower = [0.2, 0.15]
+upper = [0.4, 0.25]
+motion = "path"
+velocity = [0.0, 0.0]
+slip = "no"
+
+[problem]
+steps = 10
+target.rotor.displacement = [[0.0, 0.0], [0.004, 0.001], [0.002, 0.0]]
+target.rotor.turn = [0.0, 0.05]
+target.rotor.scale = 1.05
+
+[optimise]
+start.rotor.displacement = [[0.0, 0.0], [0.0, 0.0]]
+start.rotor.turn = [0.0, 0.0]
+start.rotor.scale = 1.0
+bounds.rotor.turn = [-0.1, 0.1]
+knots = 3
+optimiser = "lbfgs"
+learning_rate = 0.001
+iterations = 20
+"""
+
+
+def test_a_task_searches_a_path_by_its_knots(tmp_path):
+    """Also one of numbers, and a knot is where the solid is at the end of its step; and how large the solid is."""
+    file = tmp_path / "task.toml"
+    file.write_text(TASK)
+    made = setup(load_task(file), "cpu", "float64")
+    assert made.start["rotor.displacement"].shape == (3, 2) and made.start["rotor.turn"].shape == (3,)
+    assert made.start["rotor.scale"] == 1.0
+    found = optimise(made.search, made.start, optimiser="lbfgs", iterations=8, bounds=made.bounds)
+    assert found.loss < 0.5 * made.search.value(made.start)
+    knots = knot_values(made, found.parameters, made.search.parameters(found.parameters))
+    np.testing.assert_allclose(knots["rotor.turn"].times, [0.001, 0.0055, 0.01], rtol=1e-12)
+    np.testing.assert_allclose(knots["rotor.turn"].true, [0.0, 0.025, 0.05], atol=1e-12)
+
+
+def test_a_task_offers_what_its_solids_have(tmp_path):
+    file = tmp_path / "task.toml"
+    file.write_text(TASK.replace("rotor.turn", "rotor.turning"))
+    with pytest.raises(SceneError, match=r"'rotor\.turning' is unknown, but must be one of .*, rotor\.turn, "):
+        load_task(file)

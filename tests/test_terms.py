@@ -1,15 +1,20 @@
-"""What a term of a pair cannot be is said where it is made a sum or a derivative of."""
+"""Kernels that are made: of a term of a pair, of a function of one particle; and derivatives written by hand."""
 
+import ast
 import re
 
+import numpy as np
 import pytest
 import warp as wp
 
-from cortado.device.precision import FLOAT64
+from benchmarks.by_hand import ROOT, noting_factories, pairs, without_walls
+from cortado.device.modules import kernel_module
+from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.particles.made_derivatives import made_adjoint, made_tangent
-from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.made_derivatives import made_adjoint, made_tangent, pointwise_kernels
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import fluid_sum, pair_sum, wall_sum
+from test_kernels import array, cloud
 
 D = Discretisation(CUBIC_SPLINE, FLOAT64)
 real, vector = FLOAT64.real, FLOAT64.vector
@@ -73,3 +78,132 @@ def vector_walls(x_ij: vector) -> vector:
 def test_what_a_term_cannot_be_is_said(make, term, message):
     with pytest.raises(TypeError, match=re.escape(message)):
         make(term)
+
+
+MEMBERS, PARTICLES = 2, 5
+
+
+def made(precision, replaced=None):
+    real, vector, matrix = precision.real, precision.vector, wp.types.matrix((3, 3), precision.real)
+
+    def make(module):
+        def turn(spacing: real, time_step: real, x_i: vector, A_i: matrix, m_i: real) -> tuple[vector, real]:
+            moved = A_i * (time_step * x_i) / m_i
+            return moved / spacing, wp.dot(moved, x_i) * spacing
+
+        return turn
+
+    modules = [kernel_module(f"pointwise_{kind}_{precision.name}") for kind in "abc"]
+    return pointwise_kernels(precision, modules, make, ["moved", "work"], replaced, numbers=["spacing"])
+
+
+def wanted(spacing, time_step, x, A, m):
+    moved = np.einsum("nij,nj->ni", A, np.repeat(time_step, PARTICLES)[:, None] * x) / m[:, None]
+    return moved / spacing, (moved * x).sum(1) * spacing
+
+
+@pytest.mark.parametrize("precision", [FLOAT32, FLOAT64])
+def test_values_and_derivatives(precision):
+    rng, n = np.random.default_rng(7), MEMBERS * PARTICLES
+    given = [rng.uniform(0.5, 1.5, size) for size in (MEMBERS, (n, 3), (n, 3, 3), n)]
+    ways = [rng.normal(size=value.shape) for value in given]
+    bars = [rng.normal(size=(n, 3)), rng.normal(size=n)]
+    kinds = [precision.real, precision.vector, wp.types.matrix((3, 3), precision.real), precision.real]
+    names, kernels = ["time_step", "x", "A", "m"], made(precision)
+
+    def on_device(values, kinds, suffix=""):
+        arrays = (wp.array(value, dtype=kind) for value, kind in zip(values, kinds, strict=True))
+        return {f"{name}{suffix}": array for name, array in zip(names, arrays, strict=False)}
+
+    def launched(kernel, **arrays):
+        values = {"particles": PARTICLES, "spacing": 0.3, **on_device(given, kinds), **arrays}
+        inputs = []
+        for argument in kernel.adj.args:
+            if argument.label in ("dot", "bar"):
+                struct = argument.type()
+                for name in names:
+                    setattr(struct, name, arrays[f"{name}_{argument.label}"])
+                inputs.append(struct)
+            else:
+                inputs.append(values[argument.label])
+        wp.launch(kernel, dim=n, inputs=inputs)
+
+    def results():
+        return wp.zeros(n, dtype=precision.vector), wp.zeros(n, dtype=precision.real)
+
+    tolerance, found, change = (1e-5 if precision is FLOAT32 else 1e-8), results(), results()
+    launched(kernels.forward, moved=found[0], work=found[1])
+    launched(kernels.tangent, **on_device(ways, kinds, "_dot"), moved_dot=change[0], work_dot=change[1])
+    back = on_device([np.zeros((n, *value.shape[1:])) for value in given], kinds, "_bar")
+    launched(
+        kernels.adjoint,
+        **back,
+        moved_bar=wp.array(bars[0], dtype=precision.vector),
+        work_bar=wp.array(bars[1], dtype=precision.real),
+    )
+    step = 1e-6
+    ahead, behind = (wanted(0.3, *(v + sign * step * w for v, w in zip(given, ways, strict=True))) for sign in (1, -1))
+    for value, by_tangent, right, a, b in zip(found, change, wanted(0.3, *given), ahead, behind, strict=True):
+        np.testing.assert_allclose(value.numpy(), right, rtol=tolerance)
+        np.testing.assert_allclose(by_tangent.numpy(), (a - b) / (2 * step), rtol=100 * tolerance, atol=tolerance)
+    forward = sum((bar * tangent.numpy()).sum() for bar, tangent in zip(bars, change, strict=True))
+    ways[0] = np.repeat(ways[0], PARTICLES)  # shares of a scene's parameter stand at its particles
+    backward = sum((back[f"{name}_bar"].numpy() * way).sum() for name, way in zip(names, ways, strict=True))
+    assert backward == pytest.approx(forward, rel=tolerance)
+
+
+def test_an_adjoint_may_stand_where_that_of_a_result_stood():
+    kernel = made(FLOAT64, {"moved": "x"}).adjoint
+    assert "moved_bar" not in {argument.label for argument in kernel.adj.args}
+    assert "bar.x[i] = _by_x" in kernel.adj.source and "bar.m[i] = bar.m[i] + _by_m" in kernel.adj.source
+
+
+ALL = {precision: pairs(Discretisation(CUBIC_SPLINE, precision, periodic=True)) for precision in (FLOAT64, FLOAT32)}
+CASES = [(precision, pair) for precision, found in ALL.items() for pair in found]
+NAMES = [f"{pair.name.split('.')[-1]} {precision.name}" for precision, pair in CASES]
+"""Without the modules that they are in, as tests/seconds.csv knows cases by their names."""
+for _, pair in CASES:
+    for called in (pair.by_hand, pair.made):  # for a few particles, LLVM's work takes longer than it saves
+        called.module.options["optimization_level"] = 0
+
+
+@pytest.mark.parametrize(("precision", "pair"), CASES, ids=NAMES)
+@pytest.mark.parametrize("name", ["3-D", "periodic"])
+def test_a_derivative_by_hand_is_the_made_one(precision, pair, name):
+    around, tolerance = cloud(name), 1e-11 if precision is FLOAT64 else 2e-4
+    s, x = in_precision(without_walls(around.neighbourhood), precision), array(around.x, precision.vector)
+    values, results = pair.values(x, seed=5), []
+    for called in (pair.by_hand, pair.made):
+        outputs = called.outputs(x)
+        called(s, values, outputs)
+        results.append([output.numpy() for output in outputs[: pair.compared]])
+    for found, wanted in zip(*results, strict=True):
+        assert np.abs(wanted).max() > 1e-3
+        np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=0.1 * tolerance * np.abs(wanted).max())
+
+
+def in_precision(neighbourhood, precision):
+    """A neighbourhood in float64 in another precision."""
+    s = neighbourhood_type(precision)()
+    for name, kind in s._cls.vars.items():
+        value = getattr(neighbourhood, name)
+        if isinstance(value, wp.array) and value.dtype is not wp.int32:
+            value = wp.array(value.numpy(), dtype=kind.type.dtype, device=value.device)
+        elif kind.type is precision.vector:
+            value = precision.vector(*map(float, value))
+        setattr(s, name, value)
+    return s
+
+
+def test_every_derivative_by_hand_is_noted():
+    """A term whose name says that it is a derivative has a note."""
+    texts = {path: path.read_text() for path in ROOT.rglob("*.py")}
+    notes = sum(text.count("@tangent_of(") + text.count("@adjoint_of(") for text in texts.values())
+    assert sum(count for _, count in noting_factories()) == notes > 0
+    for text in texts.values():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef) and {"tangent", "adjoint"} & {*node.name.split("_")}:
+                decorators = [ast.unparse(one) for one in node.decorator_list]
+                if any(one.startswith(("pair_sum(", "fluid_sum(", "summed(")) for one in decorators):
+                    noted = any(one.startswith(("tangent_of(", "adjoint_of(")) for one in decorators)
+                    assert noted, node.name

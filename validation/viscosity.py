@@ -1,5 +1,5 @@
 """How viscous is a fluid? ``python validation/viscosity.py OUT`` writes figures as PNGs: waves of shear, bodies,
-layers and channels, which `tests/test_validation_viscosity.py` compares."""
+layers and channels, which `tests/test_validation_flows.py` compares."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import test_validation_viscosity as validation
+import test_validation_flows as validation
 from cortado.errors import CortadoWarning
 from viscous_flows import Channel, turning
 from viscous_layers import by_engine, by_hand, exact, profile, two_layers

@@ -1,7 +1,7 @@
 """The page that lists the tables of a scene file: ``python docs/site/scene_page.py`` writes docs/scene_file.md.
 
 Its tables come from the models in `cortado.scene`, so that they say what is checked. Each table has an example, which
-together with `WHOLE` is a valid scene; `tests/test_reference_pages.py` loads them.
+together with `WHOLE` is a valid scene; `tests/test_docs.py` loads them.
 """
 
 from pathlib import Path

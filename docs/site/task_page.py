@@ -1,7 +1,7 @@
 """The page that lists the tables of a task: ``python docs/site/task_page.py`` writes docs/task_file.md.
 
 Its tables come from the models in `cortado.optimisation.inverse.tables`, so that they say what is checked. Each table
-has an example, which below the scene of `scene_page` is a valid task; `tests/test_reference_pages.py` loads them.
+has an example, which below the scene of `scene_page` is a valid task; `tests/test_docs.py` loads them.
 """
 
 from pathlib import Path
