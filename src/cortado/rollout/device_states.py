@@ -20,7 +20,7 @@ from cortado.particles.fields import Entry
 from cortado.particles.state import Parameters, State, components
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.run_checks import one_for_each
+from cortado.rollout.run_checks import one_for_each, shapes_of_fields
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Role
@@ -96,7 +96,7 @@ class HostStates:
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         """Write derivatives of a state's fields, 0 for those that are left out, and return that of its time; raises
         `InputError`."""
-        fields, shapes = require_fields(what, given, to), self.shapes()
+        fields, shapes = require_fields(what, given, to), shapes_of_fields(self._simulation, to.batch)
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
             if array.shape != shapes[name]:
@@ -119,13 +119,6 @@ class HostStates:
         """Derivatives of a state's fields, by name."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the fields of a state, by name; of a batch with a first axis for the scenes."""
-        simulation = self._simulation
-        sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
-        members = () if simulation.batch is None else (simulation.batch,)
-        return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cortado.errors import DivergedError
 from cortado.rollout.rollout import Rollout
 from cortado.scene.scene import Scene
 from cortado.sph.implicit_viscosity import Solve
@@ -31,27 +30,23 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
     if missed := np.count_nonzero(solves >= Solve.most):
         found = f"the viscosity did not converge in {missed} of {solves.size} steps, in which it took {Solve.most}"
         yield f"{found} iterations: try a smaller time step."
-    if early := early_sentence(rollout):
-        yield early
+    last, end = rollout.clocks[0].after(rollout.taken, 0.0), rollout.step_sizes.end
+    if not rollout.lost and last.time < end < np.inf:
+        found = f"the run ended at {last.time:.4g} s, before the time that was asked for, as steps became as short as"
+        yield f"{found} {last.time_step:.2g} s: go on from its last state, or try a larger spacing."
     if scene.solver.chooses and (dry := dry_sentence(scene, rollout)):
         yield dry
     if rollout.lost:
-        yield lost_sentence(rollout.lost, rollout.solver.layout.members)
-
-
-def early_sentence(rollout: Rollout) -> str | None:
-    """What to say of a run that has not reached its time; None where it has, or where it has a number of steps."""
-    last, end = rollout.clocks[0].after(rollout.taken, 0.0), rollout.step_sizes.end
-    if rollout.lost or not np.isfinite(end) or last.time >= end:
-        return None
-    found = f"the run ended at {last.time:.4g} s, before the time that was asked for, as steps became as short as"
-    return f"{found} {last.time_step:.2g} s: go on from its last state, or try a larger spacing."
+        lost, batch = rollout.lost, rollout.solver.layout.members
+        first = min(lost, key=lambda b: lost[b].step)
+        yield f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
     """What to say of steps that ended above the tolerance."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
-    if _waits_in_a_wall(scene):
+    spacing, emitter = scene.discretisation.spacing, scene.emitter
+    if emitter is not None and not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
         advice = (
             "the column that waits in the emitter is not all inside the container, whose walls press on it. Shorten "
             "emitter.length, or make the container larger."
@@ -72,21 +67,6 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
         f"{np.count_nonzero(torn > TORN)} of {torn.size} steps: try a smaller time step, more solver.iterations or a "
         "solver.tolerance."
     )
-
-
-def _waits_in_a_wall(scene: Scene) -> bool:
-    """Whether particles of the emitter start in a wall of the container, or outside of it."""
-    spacing = scene.discretisation.spacing
-    return bool(
-        scene.emitter is not None
-        and not scene.container.contains(scene.emitter.particles(spacing), -0.25 * spacing).all()
-    )
-
-
-def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
-    """What to say of the scenes of a batch that lost a particle."""
-    first = min(lost, key=lambda b: lost[b].step)
-    return f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:

@@ -26,7 +26,7 @@ from cortado.rollout.step_bounds import ROOM, begin_choosing, counted_steps, exp
 from cortado.rollout.step_sizes import ChosenSteps
 from cortado.scene.parameter_values import Arrays, Values, check_known, checked_value, entry, scene_values, stacked
 from cortado.scene.parameters import Role
-from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.restart import Clock, RestartState
 from cortado.scene.scene_warnings import parameter_sentence
 from cortado.scene.stability import divergence_advice
 
@@ -61,18 +61,18 @@ class ParameterSpace:
             if view in values and name in values:
                 raise InputError(f"{what} {name} is given, but must be left out, as {view} is given in its place.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
-        if what != "direction" and not self._is_judged(found):
+        last = self._judged
+        is_judged = (
+            last is not None
+            and last.keys() == found.keys()
+            and all(np.array_equal(value, last[name]) for name, value in found.items())
+        )
+        if what != "direction" and not is_judged:
             check_sizes(found, self._simulation.precision, self._known)
             for number, own in enumerate(self._different(found)):
                 self._check(own, number)
             self._judged = {name: value.copy() for name, value in found.items()}
         return found
-
-    def _is_judged(self, values: Arrays) -> bool:
-        last = self._judged
-        if last is None or last.keys() != values.keys():
-            return False
-        return all(np.array_equal(value, last[name]) for name, value in values.items())
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
         """Names of parameters that the scene has; raises `InputError` for anything else."""
@@ -143,7 +143,7 @@ class ParameterSpace:
         courses = self._one.courses(members[0])
         self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0], courses))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
-        origins = [self._origin(one["rest_density"]) for one in chosen]
+        origins = [origin_of(simulation, one["rest_density"]) for one in chosen]
         shared = {one: one for one in origins}  # one object where they are equal: a batch has hundreds
         rollout.origins = [shared[one] for one in origins] * (len(rollout.clocks) // len(origins))
         each = members * (len(rollout.clocks) // len(members))
@@ -179,15 +179,9 @@ class ParameterSpace:
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
-        sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
-        shapes = {field.name: field.shape(*sizes) for field in simulation.initial.fields}
         for state, own in zip(states, self.members(values), strict=False):
-            origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
-            check_state(state, shapes, origin, simulation)
-
-    def _origin(self, rest_density: np.ndarray) -> Origin:
-        """Of the particles of a run with these rest densities (phases,)."""
-        return origin_of(self._simulation, rest_density)
+            origin = origin_of(simulation, np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
+            check_state(state, origin, simulation)
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:

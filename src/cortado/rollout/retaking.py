@@ -88,7 +88,7 @@ class Compressions:
 
     def __init__(self, solver: ProjectionSteps, steps: int):
         layout, device = solver.layout, solver.device
-        self._solver, self._kernels = solver, compression_kernels(layout.precision)
+        self._solver, (self._compare, self._record) = solver, compression_kernels(layout.precision)
         self._each = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
         self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
@@ -98,7 +98,7 @@ class Compressions:
         solver = self._solver
         repaired = solver.repaired[0]
         solver.launch(
-            self._kernels.compare,
+            self._compare,
             particles=solver.layout.particles,
             first_waiting=solver.system.waiting,
             order=solver.search.order,
@@ -109,7 +109,7 @@ class Compressions:
             added=self._each,
         )
         solver.launch(
-            self._kernels.record,
+            self._record,
             greatest=self._greatest(self._each),
             step=solver.step_number,
             added=self._added,
@@ -121,19 +121,10 @@ class Compressions:
         return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class CompressionKernels:
-    """They have no derivatives: a chosen step is held constant."""
-
-    compare: Any
-    """What a step adds to each particle's compression."""
-    record: Any
-    """The greatest of it in each scene."""
-
-
 @cache
-def compression_kernels(precision: Precision) -> CompressionKernels:
-    """The kernels for a precision."""
+def compression_kernels(precision: Precision) -> tuple[Any, Any]:
+    """Kernels: what a step adds to each particle's compression, and the greatest of it in each scene. They have no
+    derivatives: a chosen step is held constant."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"compressions_{precision.name}")
 
@@ -172,4 +163,4 @@ def compression_kernels(precision: Precision) -> CompressionKernels:
         b = wp.tid()
         added[step[b] - 1, b] = greatest[b][1]
 
-    return CompressionKernels(compare, record)
+    return compare, record

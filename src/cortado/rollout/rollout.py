@@ -8,7 +8,7 @@ of steps, or a step back or along, is a captured graph on a GPU, and on a CPU wh
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
-from typing import Any, Protocol
+from typing import Protocol
 from weakref import WeakSet
 
 import numpy as np
@@ -23,7 +23,7 @@ from cortado.errors import DivergedError, InputError
 from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
-from cortado.rollout.step_sizes import FixedSteps, StepSizes
+from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.containment import Lost
 from cortado.solvers.narrows import shut_in
@@ -106,7 +106,7 @@ class Rollout(Staying):
         """The scenes of a batch that lost a particle in the last forward run, by number: what follows means nothing."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
-        self.step_sizes: StepSizes = FixedSteps()
+        self.step_sizes = StepSizes()
         """How long the steps are; in a scene that chooses them others, which a `ParameterSpace` makes."""
         self.progress = Progress()
         """Where forward runs of the present evaluation begin; at its first state unless it is set."""
@@ -118,7 +118,8 @@ class Rollout(Staying):
         self._spare: list[StateSeries] = []
         """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
-        length = chunk_length(steps, solver.layout.all_particles, self._device)
+        filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // max(solver.layout.all_particles, 1)
+        length = max(min(CHUNK, filled, steps), 1)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
@@ -223,8 +224,11 @@ class Rollout(Staying):
         if is_new := length not in self._chunks:
             self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
         self._chunks[length]()
-        if is_new:
-            require_counted(self.solver, last)
+        if is_new and (self.solver.step_number.numpy() != last).any():  # then no lost particle would be noticed
+            name = type(self.solver).__name__
+            raise InputError(
+                f"solver {name} has not counted its steps, but must: its step is to end with self.end_step."
+            )
         return self._chunk[:length]
 
     def _take(self, length: int) -> None:
@@ -400,20 +404,6 @@ class Residual:
             self.rollout.begin_evaluation()
             write_back()
             self.rollout.pending.add(self)
-
-
-def chunk_length(steps: int, particles: int, device: Any) -> int:
-    """Of so many steps of so many particles, at least one."""
-    filled = FILLED["cpu" if device.is_cpu else "cuda"] // max(particles, 1)
-    return max(min(CHUNK, filled, steps), 1)
-
-
-def require_counted(solver: Solver, step: int) -> None:
-    """A solver that has taken its steps up to this one has counted each: otherwise it would take the first row of a
-    parameter over time in all of them, and notice no lost particle. Raises `InputError`."""
-    if (solver.step_number.numpy() != step).any():
-        name = type(solver).__name__
-        raise InputError(f"solver {name} has not counted its steps, but must: its step is to end with self.end_step.")
 
 
 AROUND = 6.0

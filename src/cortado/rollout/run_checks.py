@@ -1,7 +1,8 @@
 """Whether what a run is given makes sense for its scene: parameters, first positions, paths of solids, and states to go
 on from."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,13 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             raise InputError(
                 f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
             )
-        _check_room(positions[:free], spacing)
+        room = np.prod(np.ptp(positions[:free], axis=0) + spacing) if free else np.inf
+        if room < CROWDED * (needed := free * spacing**scene.dimension):
+            unit = "m2" if scene.dimension == 2 else "m3"
+            raise InputError(
+                f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about "
+                f"the {needed:.3g} {unit} that their fluid fills."
+            )
     if scene.solver.chooses and np.ndim(values.get("nozzle_path", 0.0)) == 2:
         raise InputError(
             "parameter nozzle_path has a row for each step, but must be one place where time steps are chosen: move "
@@ -82,18 +89,6 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
     name, limit = broken[0]
     found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s"
     return f"{found}, which comes from {name}."
-
-
-def _check_room(positions: np.ndarray, spacing: float) -> None:
-    """Positions (n, d) [m] are not crowded into a small part of the room that their fluid needs."""
-    room = np.prod(np.ptp(positions, axis=0) + spacing) if len(positions) else np.inf
-    needed = len(positions) * spacing ** positions.shape[-1]
-    if room < CROWDED * needed:
-        unit = "m2" if positions.shape[-1] == 2 else "m3"
-        raise InputError(
-            f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about the "
-            f"{needed:.3g} {unit} that their fluid fills."
-        )
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
@@ -159,32 +154,30 @@ SCALES = (0.6, 1.5)
 def path_sentence(
     scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
 ) -> str | None:
-    """One of those below, with the parameters that were given, all that steps take, and what changes by the time; None
-    if there is none."""
-    leap = leap_sentence(scene, values, courses) if scene.solver.chooses else None
-    return stretch_sentence(scene, values) or leap or jump_sentence(scene, first, run, courses)
+    """What to say of the first path that is wrong, with the parameters that were given, all that steps take, and what
+    changes by the time; None if there is none."""
+    leaps = _leaps(scene, values, courses) if scene.solver.chooses else ()
+    return next(chain(_stretches(scene, values), leaps, _jumps(scene, first, run, courses)), None)
 
 
-def leap_sentence(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> str | None:
-    """Of the first path that goes further than a spacing in the shortest step that is chosen for it; None if there is
-    none."""
+def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
+    """Of paths that go further than a spacing in the shortest step that is chosen for them."""
     spacing = scene.discretisation.spacing
     for what, moved in moved_by(scene, values, courses).items():
         travel = Travel.of(scene, values, [moved])
         sizes = travel.at(travel.times + travel.least) - travel.lengths
-        if sizes.max() > FURTHEST * spacing * (1.0 + 1e-6):
-            time, size = travel.times[sizes.argmax()], sizes.max()
-            return (
-                f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at {time:g} s, which "
-                f"is further than a spacing, {spacing:g} m: fluid is left behind in it. Give it more time."
+        if (size := sizes.max()) > FURTHEST * spacing * (1.0 + 1e-6):
+            yield (
+                f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at "
+                f"{travel.times[sizes.argmax()]:g} s, which is further than a spacing, {spacing:g} m: fluid is left "
+                "behind in it. Give it more time."
             )
-    return None
 
 
-def jump_sentence(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> str | None:
-    """Of the first solid that goes further than a spacing in a step, from where a first state has it, of a batch in its
-    first scene, with the parameters of a run; None if there is none. Where steps are still to be chosen, those count
-    that are told step by step, and have no course."""
+def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
+    """Of solids that go further than a spacing in a step, from where a first state has them, of a batch in its first
+    scene, with the parameters of a run. Where steps are still to be chosen, those count that are told step by step, and
+    have no course."""
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
@@ -193,19 +186,17 @@ def jump_sentence(scene: Scene, first: State, run: Arrays, courses: Mapping[str,
         begun = first.numpy(scene.dimension, only=[position])[position].reshape(-1, scene.dimension)[:1]
         places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        if len(steps) and steps.max() > FURTHEST * spacing * (1.0 + 1e-6):
-            number, size = int(steps.argmax()) + 1, steps.max()
-            return (
-                f"the solid {table.name!r} goes {size:.3g} m in step {number} of this run, which is further than a "
-                f"spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and a run that "
-                f"goes on from a state is given {position} as the first one was."
+        if (size := steps.max(initial=0.0)) > FURTHEST * spacing * (1.0 + 1e-6):
+            yield (
+                f"the solid {table.name!r} goes {size:.3g} m in step {steps.argmax() + 1} of this run, which is "
+                f"further than a spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and "
+                f"a run that goes on from a state is given {position} as the first one was."
             )
-    return None
 
 
-def stretch_sentence(scene: Scene, values: Arrays) -> str | None:
-    """Of the first solid whose scale, among the parameters of a run, is too far from 1 for its walls, makes it reach
-    over fluid that the scene puts beside it, or lets it fill a period no more; None if there is none."""
+def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
+    """Of solids whose scale, among the parameters of a run, is too far from 1 for their walls, makes them reach over
+    fluid that the scene puts beside them, or lets them fill a period no more."""
     spacing, periods = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
@@ -214,15 +205,14 @@ def stretch_sentence(scene: Scene, values: Arrays) -> str | None:
         start = f"the solid {table.name!r} is {scale:.4g} times as large as in the scene"
         least, most = SCALES
         if not least <= scale <= most:
-            return f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
+            yield f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
         size = float(np.ptp(table.shape_about()[0].extent(), axis=0).max())
         grown = 0.5 * size * (1.0 - scale if table.side == "inside" else scale - 1.0)
         if grown > FURTHEST * spacing and "initial_positions" not in values:
-            return f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
+            yield f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
         lower, upper = table.solid().extent()
         if ((periods > 0.0) & (upper - lower > periods * (1.0 - WHOLE))).any():
-            return f"{start}, so that it does not fill a period of the container, as it does there."
-    return None
+            yield f"{start}, so that it does not fill a period of the container, as it does there."
 
 
 SAME = 1e-6
@@ -272,23 +262,35 @@ def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) ->
         raise InputError(f"direction {given[0]} is given, {wanted}.")
 
 
-def check_state(
-    state: RestartState, shapes: Mapping[str, tuple[int, ...]], origin: Origin, simulation: Simulated
-) -> None:
-    """A state to go on from is one of the simulation, whose fields have these shapes, and of these particles; raises
-    `InputError`. One that was judged before can only be of other rest densities, and that of a scene of a batch that
-    was lost has no numbers to judge."""
+def shapes_of_fields(simulation: Simulated, batch: int | None = None) -> dict[str, tuple[int, ...]]:
+    """Of the fields of a state of one scene, by name; of a ``batch`` with a first axis for the scenes."""
+    sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
+    members = () if batch is None else (batch,)
+    return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
+
+
+def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> None:
+    """A state to go on from is one of the simulation, and of these particles; raises `InputError`. One that was judged
+    before can only be of other rest densities, and that of a scene of a batch that was lost has no numbers to judge."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
+    shapes = shapes_of_fields(simulation)
     if state.fields.keys() != shapes.keys():
         raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
-    fields = {name: _shaped(name, state[name], wanted) for name, wanted in shapes.items()}
+    fields = {name: as_precise_numbers(f"state {name}", state[name]) for name in shapes}
+    for name, array in fields.items():
+        if array.shape != shapes[name]:
+            raise InputError(f"state {name} has shape {array.shape}, but must be {shapes[name]}.")
     check_clock(state.clock)
     if simulation.batch is not None and all(np.isnan(array).all() for array in fields.values()):
         return
     for name, array in fields.items():
-        _check_numbers(name, array, simulation.precision)
+        if not np.isfinite(array).all():
+            raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
+        if (size := np.abs(array).max(initial=0.0)) > simulation.precision.greatest:
+            wanted = f"at most {simulation.precision.greatest:g} in {simulation.precision.name}"
+            raise InputError(f"state {name} has a value of size {size:g}, but must be {wanted}.")
     scene, positions = simulation.scene, fields["positions"]
     if state.origin is None:
         _check_spacing(positions[: simulation.free_particles], simulation)
@@ -305,21 +307,6 @@ def check_state(
         )
     if scene.forces.pressure:
         check_apart("state positions", positions, origin.spacing, scene.container.periods(scene.dimension))
-
-
-def _shaped(name: str, value: object, shape: tuple[int, ...]) -> NDArray:
-    array = as_precise_numbers(f"state {name}", value)
-    if array.shape != shape:
-        raise InputError(f"state {name} has shape {array.shape}, but must be {shape}.")
-    return array
-
-
-def _check_numbers(name: str, array: NDArray, precision: Precision) -> None:
-    if not np.isfinite(array).all():
-        raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
-    if (size := np.abs(array).max(initial=0.0)) > precision.greatest:
-        wanted = f"at most {precision.greatest:g} in {precision.name}"
-        raise InputError(f"state {name} has a value of size {size:g}, but must be {wanted}.")
 
 
 def check_clock(clock: Clock) -> None:

@@ -218,12 +218,7 @@ def counted_steps(time: float, steps: float) -> int:
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
     """How many frames a run has, with one for every so many steps."""
-    return 2 + expected_of(rollout) // record_every
-
-
-def expected_of(rollout: Rollout) -> int:
-    """How many steps of a rollout are to be expected: all of them, unless it ends at a time."""
-    return rollout.steps // ROOM if ends_at_a_time(rollout) else rollout.steps
+    return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 
 def ends_at_a_time(rollout: Rollout) -> bool:

@@ -46,12 +46,12 @@ class RecordedSizes:
     """(steps + 1, members) of each state [s]."""
 
 
-class StepSizes(Protocol):
-    """How long the steps of a rollout are."""
+class StepSizes:
+    """How long the steps of a rollout are: here all as long as a parameter of the scene says."""
 
-    longest_chunk: int
+    longest_chunk = 2**31
     """Steps that may be taken before the host looks."""
-    end: float
+    end = inf
     """When the run is to end at the latest [s]; infinite where it has all of its steps."""
 
     def begin_at(self, state: State) -> None:
@@ -60,6 +60,7 @@ class StepSizes(Protocol):
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
         """Have the steps before a state as an earlier process chose them, (step,) [s], and choose the one after it.
         Returns whether the run ends with the state."""
+        return False
 
     def choose(self, state: State) -> None:
         """The length of the step after a state that a step has led to, whose number the solver has counted: launches
@@ -71,72 +72,33 @@ class StepSizes(Protocol):
     def read(self, first: int, last: int) -> tuple[int, bool]:
         """Read the steps behind the first of these states, up to the one after the last. Returns the last state that
         belongs to the run, and whether the run ends with it."""
+        return last, False
 
     def again(self, first: int, last: int) -> bool:
         """Whether the steps between these states, which were taken, are to be taken again, as some are shorter now."""
+        return False
 
     def is_end(self, step: int) -> bool:
         """Whether the run ends with the state after so many steps, which was read."""
+        return False
 
     def of_step(self, step: int) -> NDArray | None:
         """(members,) the length of a step, once the state before it was read [s]; None where it is a parameter."""
+        return None
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
         """(steps,) by name, in a batch (steps, batch), of the first steps of the last run."""
+        return {}
 
     def recorded(self) -> RecordedSizes | None:
         """What the next evaluation overwrites."""
+        return None
 
     def assign(self, recorded: RecordedSizes | None) -> None:
         """Hold what another evaluation has recorded."""
 
 
-class FixedSteps:
-    """All steps of a scene are as long as its parameter says."""
-
-    longest_chunk = 2**31
-    end = inf
-
-    def begin_at(self, state: State) -> None:
-        """See `StepSizes`."""
-
-    def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """See `StepSizes`."""
-        return False
-
-    def choose(self, state: State) -> None:
-        """See `StepSizes`."""
-
-    def seek(self, step: int) -> None:
-        """See `StepSizes`."""
-
-    def read(self, first: int, last: int) -> tuple[int, bool]:
-        """See `StepSizes`."""
-        return last, False
-
-    def again(self, first: int, last: int) -> bool:
-        """See `StepSizes`."""
-        return False
-
-    def is_end(self, step: int) -> bool:
-        """See `StepSizes`."""
-        return False
-
-    def of_step(self, step: int) -> None:
-        """See `StepSizes`."""
-
-    def diagnostics(self, steps: int) -> dict[str, NDArray]:
-        """See `StepSizes`."""
-        return {}
-
-    def recorded(self) -> None:
-        """See `StepSizes`."""
-
-    def assign(self, recorded: RecordedSizes | None) -> None:
-        """See `StepSizes`."""
-
-
-class ChosenSteps:
+class ChosenSteps(StepSizes):
     """Each step is as long as the state before it allows, scene by scene: see `choose` of `step_size_kernels`.
 
     The greatest speed is a maximum, so that the same bits come whatever the order; nothing else is read of a state, and
@@ -148,7 +110,7 @@ class ChosenSteps:
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
         self._solver, self._parameters, self._length = solver, parameters, length
-        self._kernels = step_size_kernels(layout.precision)
+        self._speeds, self._choice = step_size_kernels(layout.precision)
         self._squares = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
         self._sizes, self._longest = (wp.zeros(shape, dtype=real, device=device) for _ in range(2))
@@ -160,7 +122,7 @@ class ChosenSteps:
         self._compressions = Compressions(solver, steps) if isinstance(solver, ProjectionSteps) else None
         self._retaken = Retaken()
         self.end = inf
-        self.longest_chunk = FixedSteps.longest_chunk
+        self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
         """Before a run: ``bounds`` (steps, members) of its steps [s]; where something is ``scheduled`` the host has to
@@ -169,19 +131,18 @@ class ChosenSteps:
         self._first.assign([clock.time_step for clock in clocks])
         self._times[0].assign([clock.time for clock in clocks])
         self._scheduled, self._retaken, self.end = scheduled, Retaken(), inf
-        self.longest_chunk = FixedSteps.longest_chunk if scheduled is None else 1
+        self.longest_chunk = StepSizes.longest_chunk if scheduled is None else 1
         found = self._read = RecordedSizes(np.zeros(self._sizes.shape), np.zeros(self._times.shape))
         own = zip(clocks, found.times.T, found.sizes.T, strict=True)
         return [RecordedClock(c.steps, c.time, c.time_step, times, sizes) for c, times, sizes in own]
 
     def begin_at(self, state: State) -> None:
-        """See `StepSizes`."""
         self._solver.step_number.fill_(0)
         self._choose(state)
         self._look(0, 0)
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """See `StepSizes`. Times are added up as the device does, one step after the other in float64."""
+        """Times are added up as the device does, one step after the other in float64."""
         assert sizes is not None
         times = np.cumsum([self._read.times[0, 0], *sizes[: step - 1].astype(np.float64)])
         self._sizes[:step].assign(sizes[:step, None])
@@ -197,16 +158,15 @@ class ChosenSteps:
         self.end = float(self._read.times[0, 0]) + duration
 
     def choose(self, state: State) -> None:
-        """See `StepSizes`."""
         if self._compressions is not None:
             self._compressions.measure(state)
         self._choose(state)
 
     def _choose(self, state: State) -> None:
-        launch, kernels = self._solver.launch, self._kernels
-        launch(kernels.speeds, v=state.velocities, squares=self._squares)
+        launch = self._solver.launch
+        launch(self._speeds, v=state.velocities, squares=self._squares)
         launch(
-            kernels.choose,
+            self._choice,
             length=self._length,
             least=LEAST,
             growth=GROWTH,
@@ -222,17 +182,14 @@ class ChosenSteps:
         )
 
     def seek(self, step: int) -> None:
-        """See `StepSizes`."""
         wp.copy(self._parameters["time_step"], self._sizes[step])
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """See `StepSizes`."""
         self._look(first + 1, last)
         past = np.flatnonzero(self._read.times[first + 1 : last + 1, 0] >= self.end)
         return (first + 1 + int(past[0]), True) if len(past) else (last, False)
 
     def again(self, first: int, last: int) -> bool:
-        """See `StepSizes`."""
         if self._compressions is None:
             return False
         taken, longest = (array[first:last].numpy() for array in (self._sizes, self._longest))
@@ -249,7 +206,6 @@ class ChosenSteps:
         return True
 
     def is_end(self, step: int) -> bool:
-        """See `StepSizes`."""
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
@@ -270,45 +226,32 @@ class ChosenSteps:
             self._scheduled.fill(last, times, sizes)
 
     def of_step(self, step: int) -> NDArray:
-        """See `StepSizes`."""
         return self._read.sizes[step].copy()
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
-        """See `StepSizes`."""
         found = self._read.sizes[:steps]
         return {"time_steps": found[:, 0] if self._solver.layout.batch is None else found}
 
     def recorded(self) -> RecordedSizes:
-        """See `StepSizes`."""
         return self._read
 
     def assign(self, recorded: RecordedSizes | None) -> None:
-        """See `StepSizes`."""
         assert recorded is not None
         self._read = recorded
         self._sizes.assign(recorded.sizes)
         self._times.assign(recorded.times)
 
 
-@dataclass(frozen=True)
-class StepSizeKernels:
-    """The kernels that choose a time step. They have no derivatives: a chosen step is held constant."""
-
-    speeds: Any
-    """The square of each particle's speed."""
-    choose: Any
-    """The next time step of each scene."""
-
-
 @cache
-def step_size_kernels(precision: Precision) -> StepSizeKernels:
-    """The kernels for a precision."""
+def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
+    """Kernels that choose a time step, ``speeds`` and ``choose``. They have no derivatives: a chosen step is held
+    constant."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def speeds(v: wp.array(dtype=vector), squares: wp.array(dtype=pair)):
-        """As pairs, for a sum, which nobody reads, and a maximum."""
+        """The square of each particle's speed, as pairs, for a sum, which nobody reads, and a maximum."""
         i = wp.tid()
         squares[i] = pair(real(0.0), wp.length_sq(v[i]))
 
@@ -351,4 +294,4 @@ def step_size_kernels(precision: Precision) -> StepSizeKernels:
         sizes[n, b] = dt
         time_step[b] = dt
 
-    return StepSizeKernels(speeds, choose)
+    return speeds, choose

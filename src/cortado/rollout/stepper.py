@@ -156,10 +156,12 @@ class Stepper:
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         times = place.write("state_bar", state_bar, self._bar)
-        values = self._brought_back(residual)
+        values = residual.values
+        residual.evaluation.bring_back()
         first = rollout.backward(self._adjoint, {rollout.steps: self._bar})
         found = self._adjoint.parameters()
-        before = self._shaped(space.time_adjoints(rollout, values, found)) + times
+        earlier = space.time_adjoints(rollout, values, found)
+        before = (earlier[0] if self._simulation.batch is None else earlier) + times
         gradient = space.gradient(rollout, values, first, found, elsewhere=residual.rows)
         if "time_step" in gradient:  # a longer step ends later
             gradient["time_step"] = gradient["time_step"] + rollout.steps * times
@@ -178,7 +180,8 @@ class Stepper:
         check_directions(along, self._simulation.known.state)
         dot, parameters_dot = self._dots
         times = place.write("state_dot", state_dot, dot)
-        values = self._brought_back(residual)
+        values = residual.values
+        residual.evaluation.bring_back()
         if "mobility" in along and not rollout.substeps:
             raise InputError(
                 "direction mobility is given, but must be named where the step is taken, as nothing diffuses where the "
@@ -192,19 +195,10 @@ class Stepper:
         later = times + rollout.steps * np.broadcast_to(sizes, times.shape)
         return {**place.read(dot, lost), **without_lost(lost, {STATE_TIME: later})}
 
-    def _shaped(self, times: np.ndarray) -> np.ndarray:
-        """A number of each scene, (members,), as a state of this simulation has it, () or (batch,)."""
-        return times[0] if self._simulation.batch is None else times
-
     def _place_of(self, residual: StepResidual) -> HostStates:
         if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self.rollout:
             raise InputError(f"residual is {shown(residual)}, but must be one that this stepper's step returned.")
         return residual.place
-
-    def _brought_back(self, residual: StepResidual) -> Arrays:
-        """The parameters of a step, which is the rollout's present one again."""
-        residual.evaluation.bring_back()
-        return residual.values
 
     @cached_property
     def _bar(self) -> State:

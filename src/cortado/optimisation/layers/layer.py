@@ -20,7 +20,7 @@ from cortado.particles.fields import Entry
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates, Given
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.run_checks import check_clock, origin_of
+from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
@@ -242,7 +242,7 @@ class NamedStates:
         simulation = self._simulation
         members = () if simulation.batch is None else (simulation.batch,)
         last = {LAST_STEP: members} if simulation.scene.solver.chooses else {}
-        return {**self._place.shapes(), STATE_TIME: members, **last}
+        return {**shapes_of_fields(simulation, simulation.batch), STATE_TIME: members, **last}
 
     @property
     def fields(self) -> tuple[str, ...]:
