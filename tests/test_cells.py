@@ -10,7 +10,7 @@ from cortado.device.cells import CellSort, cell_kernels
 from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.discretise.pairs import pairs_within
+from cortado.discretise.shapes import pairs_within
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
 CPU = wp.get_device("cpu")
@@ -138,7 +138,7 @@ def test_pairs_are_those_of_all_pairs(monkeypatch, lengths):
     some, others = random.uniform(0.0, 1.0, (300, 3)), random.uniform(-0.2, 1.4, (200, 3))
     apart = (some[:, None] - others) - np.array(lengths) * np.round(some[:, None] - others)
     distances = np.linalg.norm(apart, axis=-1)
-    monkeypatch.setattr("cortado.discretise.pairs.CHUNK", 70)
+    monkeypatch.setattr("cortado.discretise.shapes.CHUNK", 70)
     first, second, found = pairs_within(some, others, 0.3, np.full(3, 0.1), lengths)
     assert len(first) == np.count_nonzero(distances <= 0.3) > 1000
     np.testing.assert_allclose(found, distances[first, second], atol=1e-12)

@@ -14,7 +14,7 @@ from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_files import mesh_in_file, read_mesh, read_triangles, thickness_of
 from cortado.discretise.primitives import Box, Round, points_inside
 from cortado.discretise.solid import Hollow, Mass, Placed
-from cortado.discretise.surface_points import surface_feet, surface_points
+from cortado.discretise.solid_walls import surface_feet, surface_points
 from cortado.errors import CortadoWarning, InputError
 from cortado.scene.solid_shapes import MeshSolid, PolygonSolid
 

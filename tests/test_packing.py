@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 import cortado
 from cortado import Scene, SceneError, Simulation
 from cortado.discretise.packing import Linearised, PointsAround, Relaxation
-from cortado.discretise.pairs import apart, pairs_among, pairs_within
 from cortado.discretise.room import Region
+from cortado.discretise.shapes import apart, pairs_among, pairs_within
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise

@@ -5,7 +5,7 @@ import pytest
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.calibration import rest_volume
-from cortado.discretise.pairs import pairs_within
+from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.cpu_launches import launch_on_cpu, shared
-from cortado.discretise.shapes import Numbers, Points, Which, grid
+from cortado.discretise.shapes import Numbers, Points, Which, grid, launch_on_cpu, shared
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments
 
 LEAF = 8

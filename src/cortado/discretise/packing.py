@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.calibration import SLACK, lattice_offsets, rest_volume
-from cortado.discretise.cpu_launches import launch_on_cpu, shared
-from cortado.discretise.pairs import pairs_within
-from cortado.discretise.shapes import Numbers, Points, Which
+from cortado.discretise.shapes import Numbers, Points, Which, launch_on_cpu, pairs_within, shared
 from cortado.discretise.walls import RestLattice
 from cortado.files.terminal import timed_note
 

@@ -8,8 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from cortado.discretise.pairs import apart, wrapped
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, apart, wrapped
 from cortado.discretise.solid import Placed, Solid
 
 TOLERANCE = 0.5

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cortado.discretise.calibration import lattice_offsets
-from cortado.discretise.pairs import apart, pairs_within
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points, Rows, disc, grid
+from cortado.discretise.shapes import Points, Rows, apart, disc, grid, pairs_within
 from cortado.discretise.smoothing import SmoothingKernel
 
 if TYPE_CHECKING:

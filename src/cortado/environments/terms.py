@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cortado.device.launching import launch
 from cortado.device.reduction import add, sum_of
 from cortado.device.threads import WARP
-from cortado.discretise.pairs import apart
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
+from cortado.discretise.shapes import apart
 from cortado.environments.kernels import EnvironmentKernels, environment_kernels
 from cortado.losses.loss import Snapshot, SnapshotBatch, precision_of
 from cortado.particles.state import State, padded, to_device

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from cortado.discretise.pairs import wrapped
+from cortado.discretise.shapes import wrapped
 from cortado.errors import ComputationError
 from cortado.files.output_files import sentences, unfinished, write_atomically
 from cortado.losses import FinalPositions

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.threads import usable_cores
-from cortado.discretise.pairs import wrapped
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, wrapped
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids
 from cortado.pictures.stage import fluid_extent, thinned
 from cortado.pictures.tracing.space import State

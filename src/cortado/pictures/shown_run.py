@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.calibration import circulation_factor, rest_volume
-from cortado.discretise.pairs import pairs_among
+from cortado.discretise.shapes import pairs_among
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import InputError
 from cortado.pictures.film import FilmedRun, Panel

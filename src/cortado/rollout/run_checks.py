@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cortado.arrays import as_one_number, as_precise_numbers, is_whole
 from cortado.device.precision import Precision
-from cortado.discretise.pairs import check_apart, check_crowding, nearest
 from cortado.discretise.room import TOLERANCE, Room
+from cortado.discretise.shapes import check_apart, check_crowding, nearest
 from cortado.errors import InputError, OutOfRangeError, shown
 from cortado.particles.state import State
 from cortado.rollout.scene_parameters import DENSITY, Simulated

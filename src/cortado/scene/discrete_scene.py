@@ -18,9 +18,8 @@ from cortado.discretise.calibration import (
     wall_response,
 )
 from cortado.discretise.packing import Packing
-from cortado.discretise.pairs import check_crowding
 from cortado.discretise.room import Domain, Region, Room
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, check_crowding
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places

@@ -12,9 +12,8 @@ from typing import Self, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.pairs import apart, pairs_within
 from cortado.discretise.room import Region, Room
-from cortado.discretise.shapes import EXCESS, Points, grid
+from cortado.discretise.shapes import EXCESS, Points, apart, grid, pairs_within
 from cortado.errors import InputError
 from cortado.scene.emitter import EmitterSample
 from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid

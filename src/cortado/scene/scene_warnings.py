@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.room import Room
-from cortado.discretise.surface_points import surface_feet
+from cortado.discretise.solid_walls import surface_feet
 from cortado.scene.appearance import Keyframes, Picture
 from cortado.scene.containers import BoxContainer
 from cortado.scene.fields import FieldPath, field_error

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
 from cortado.device.threads import WARP
-from cortado.discretise.pairs import wrapped
+from cortado.discretise.shapes import wrapped
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.losses import Snapshot
