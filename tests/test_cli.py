@@ -25,8 +25,8 @@ from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.output_files import locked
+from cortado.optimisation.inverse.solved_task import TaskFigures
 from cortado.optimisation.inverse.task import load_task
-from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.runs.run_folder import FIGURES

@@ -18,9 +18,8 @@ import task_page
 import trimesh
 
 from cortado.cli import main
-from cortado.optimisation.inverse.fit_tables import FitTables
 from cortado.optimisation.inverse.fit_task import load_fit
-from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.tables import FitTables, TaskTables
 from cortado.optimisation.inverse.task import load_task
 from cortado.scene.scene import Scene, load_scene
 

@@ -12,8 +12,7 @@ from cortado import optimise
 from cortado.cli import main
 from cortado.errors import SceneError
 from cortado.losses.image_losses import psnr
-from cortado.optimisation.inverse.setup import setup
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task import load_task, setup
 from cortado.optimisation.optimisers import Adam
 
 STAGED = "optimise.extinction_schedule=[0.25, 1.0]"

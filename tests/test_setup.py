@@ -7,8 +7,7 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import InputError, optimise
 from cortado.losses.image_losses import Pyramid, SquaredDifference
-from cortado.optimisation.inverse.setup import setup
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task import load_task, setup
 from cortado.optimisation.optimisers import LBFGS, Adam
 from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture

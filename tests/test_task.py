@@ -10,9 +10,8 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
 from cortado import SceneError, gradients, optimise
 from cortado.cli.commands.optimise import found_in_words, judge
-from cortado.optimisation.inverse.knots import knot_values
-from cortado.optimisation.inverse.setup import setup
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.solved_task import knot_values
+from cortado.optimisation.inverse.task import load_task, setup
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from rows import rows, toml
 
-from cortado.optimisation.inverse.fit_tables import FitTables
-from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.tables import FitTables, TaskTables
 
 PAGE = Path(__file__).parents[1] / "task_file.md"
 

@@ -249,7 +249,7 @@ command(app)(dataset)
 @command(app, answers=True)
 def schema() -> Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
-    from cortado.optimisation.inverse.file_schema import file_schema_text
+    from cortado.optimisation.inverse.tables import file_schema_text
 
     return lambda: file_schema_text().rstrip("\n")
 

@@ -17,8 +17,7 @@ from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.files.output_files import sentences
 from cortado.files.terminal import timed_note
-from cortado.optimisation.inverse.in_words import task_in_words
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task import load_task, task_in_words
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of, painter, plan
 from cortado.rollout.checkpoints import MEMORY_BUDGET

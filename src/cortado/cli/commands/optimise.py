@@ -26,12 +26,14 @@ from cortado.files.interruption import keeping
 from cortado.files.output_files import locked
 from cortado.files.terminal import announce, say, track
 from cortado.losses.image_losses import psnr
-from cortado.optimisation.inverse.figures import task_figures
-from cortado.optimisation.inverse.knots import knot_values
-from cortado.optimisation.inverse.setup import Setup, setup
-from cortado.optimisation.inverse.shaded import begin_shaded, shaded_figures
-from cortado.optimisation.inverse.task import Task, load_task
-from cortado.optimisation.inverse.task_figures import TaskFigures
+from cortado.optimisation.inverse.solved_task import (
+    TaskFigures,
+    begin_shaded,
+    knot_values,
+    shaded_figures,
+    task_figures,
+)
+from cortado.optimisation.inverse.task import Setup, Task, load_task, setup
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
 from cortado.pictures.report import Section, write_report

@@ -8,12 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.optimisation.inverse.figures import component_names
-from cortado.optimisation.inverse.in_words import task_in_words
-from cortado.optimisation.inverse.knots import KnotValues
-from cortado.optimisation.inverse.setup import Setup
-from cortado.optimisation.inverse.task import Task
-from cortado.optimisation.inverse.task_figures import TaskFigures
+from cortado.optimisation.inverse.solved_task import KnotValues, TaskFigures, component_names
+from cortado.optimisation.inverse.task import Setup, Task, task_in_words
 from cortado.optimisation.result import Result
 from cortado.pictures.particle_view import scene_view
 from cortado.pictures.report import MOST_NUMBERS, Section, written

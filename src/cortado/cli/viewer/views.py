@@ -30,9 +30,8 @@ from cortado.errors import CortadoError, CortadoWarning, InputError
 from cortado.files.image_encoding import to_srgb
 from cortado.files.interruption import keeping
 from cortado.files.terminal import say
-from cortado.optimisation.inverse.figures import component_names
-from cortado.optimisation.inverse.setup import Setup, setup
-from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.solved_task import component_names
+from cortado.optimisation.inverse.task import Setup, load_task, setup
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.particles.state import State

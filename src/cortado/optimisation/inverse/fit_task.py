@@ -1,23 +1,38 @@
-"""What ``cortado fit`` reads: a scene with the tables [problem], of measured data, and [fit]."""
+"""What ``cortado fit`` reads: a scene with the tables [problem], of measured data, and [fit]; and that data."""
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
-from cortado.errors import InputError, SceneError, Words
+import numpy as np
+
+from cortado.errors import InputError, SceneError
+from cortado.files.input_files import read_columns
 from cortado.optimisation.fitting.experiment import Experiment
-from cortado.optimisation.inverse.fit_tables import FitTable, FitTables
-from cortado.optimisation.inverse.measured_data import observation
-from cortado.optimisation.inverse.tables import ProblemTable
+from cortado.optimisation.fitting.observations import Observation, SensorSeries, Tracks, Video
+from cortado.optimisation.inverse.tables import (
+    FitTable,
+    FitTables,
+    MeasuredTable,
+    ProblemTable,
+    SensorSeriesTable,
+    TracksTable,
+    VideoTable,
+)
+from cortado.optimisation.inverse.task import GIVEN, read_tables
+from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping
+from cortado.runs.sensors.placement import sensors_of
 from cortado.scene.fields import MISSING
-from cortado.scene.parameters import Role, offered
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import Table, sentences
+from cortado.scene.tables import Table
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
-from cortado.solvers.makers import known_in
+
+LIGHT = 0.5
+"""Pixels of a mask that are brighter count."""
 
 
 class ExperimentTables(Table):
@@ -67,7 +82,7 @@ def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Fit
     if "fit" not in data:
         raise SceneError(file, "fit", MISSING, "a table; a task with [optimise] is solved by cortado optimise")
     if "optimise" in data:
-        raise SceneError(file, "optimise", Words("given"), "left out of a fit, whose search [fit] describes")
+        raise SceneError(file, "optimise", GIVEN, "left out of a fit, whose search [fit] describes")
     first, tables = _read(data, file, FitTables)
     others = [_also(Path(file).parent / name) for name in first.problem.also]
     return FitTask((first, *others), tables.fit)
@@ -85,15 +100,97 @@ def _also(path: Path) -> MeasuredScene:
 
 def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[MeasuredScene, Any]:
     scene = scene_from_dict(data, file)
-    try:
-        names = (*offered(scene), *(p.name for p in known_in(scene).own if p.role is not Role.CLOCK))
-        with sentences(model):
-            given = {key: data[key] for key in model.model_fields if key in data}
-            tables: Any = model.model_validate(given, context={"names": names})
-        if not tables.problem.measured:
-            raise SceneError(None, "problem.measured", MISSING, "a list of tables, each written [[problem.measured]]")
-    except SceneError as error:
-        raise error.in_file(file) from None
-    except InputError as error:
-        raise SceneError(file, "", sentence=f"cannot be a task: {error}") from None
+    _, tables = read_tables(data, scene, file, model)
+    if not tables.problem.measured:
+        raise SceneError(file, "problem.measured", MISSING, "a list of tables, each written [[problem.measured]]")
     return MeasuredScene(file, scene.lasting(steps=tables.problem.steps), tables.problem), tables
+
+
+@singledispatch
+def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    """What a table describes, up to the ``last`` time of the run [s]; its files are in a folder. Raises
+    `InputError`."""
+    raise NotImplementedError(type(table))
+
+
+@observation.register
+def _(table: VideoTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    renderer = simulation.renderer()
+    rows, columns, _ = renderer.shape
+    times, frames = read_frames(folder / table.file, (columns, rows), table.crop, table.frame_rate, table.every)
+    chosen = _within(times + table.start, last)
+    mask = None
+    if table.mask is not None:
+        picture = open_picture(folder / table.mask)
+        cropped = picture if table.crop is None else picture.crop(table.crop)
+        warn_of_cropping(f"The mask {folder / table.mask} has", cropped.size, (columns, rows))
+        mask = resized(cropped, (columns, rows)).mean(axis=2) > LIGHT
+    return Video(renderer, times[chosen], frames[chosen], mask, table.noise, table.calibrate, table.start)
+
+
+@observation.register
+def _(table: SensorSeriesTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    sensors = sensors_of(simulation.scene)
+    if table.sensor not in sensors:
+        raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
+    sensor, path = sensors[table.sensor], folder / table.file
+    data = _with(read_columns(path), ("time",), path)
+    falls = np.flatnonzero(np.diff(data["time"]) <= 0.0)
+    if len(falls):
+        before, after = data["time"][falls[0] : falls[0] + 2]
+        raise InputError(f"{path} has the time {after:g} s after {before:g} s, but times must rise from line to line.")
+    known = sensor.columns(simulation.dimension)
+    names = [name for name in data if name != "time"]
+    for name in names:
+        if name not in known:
+            raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
+    times = data["time"]
+    chosen = _within(times + table.start, last)
+    values = np.stack([data[name] for name in names], axis=1) if names else np.zeros((len(times), 0))
+    clock = table.calibrate, table.start
+    return SensorSeries(sensor, times[chosen], values[chosen], simulation.dimension, names, table.noise, *clock)
+
+
+@observation.register
+def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> Observation:
+    path, axes = folder / table.file, ["x", "y", "z"][: simulation.dimension]
+    data = _with(read_columns(path), ("time", "tracer", *axes), path)
+    times, when = _instants(data["time"] + table.start, 1e-9 * max(last, 1e-300))
+    tracers, who = np.unique(data["tracer"], return_inverse=True)
+    once, often = np.unique(np.stack([when, who]), axis=1, return_counts=True)
+    if (often > 1).any():
+        k, tracer = once[:, int(np.argmax(often > 1))]
+        found = f"{often.max()} lines for tracer {tracers[tracer]:g} at {times[k] - table.start:g} s"
+        raise InputError(f"{path} has {found}, but must have one: number the tracers each for itself.")
+    places = np.full((len(times), len(tracers), len(axes)), np.nan)
+    places[when, who] = np.stack([data[axis] for axis in axes], axis=1)
+    begin = int(np.argmin(np.abs(times)))
+    missing = tracers[np.isnan(places[begin]).any(axis=1)]
+    if abs(times[begin]) > 1e-9 * max(last, 1e-300) or len(missing):
+        lacking = f" of tracer {missing[0]:g}" if len(missing) else ""
+        raise InputError(f"{path} lacks the place{lacking} at the start of the run, time {-table.start:g} s.")
+    chosen = _within(times, last) & (times > 0.0)
+    clock = table.calibrate, table.start
+    return Tracks(simulation, places[begin], times[chosen] - table.start, places[chosen], table.noise, *clock)
+
+
+def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """The times that are further apart than that, in order, and of each time which of them it is."""
+    each, which = np.unique(times, return_inverse=True)
+    begins = np.diff(each, prepend=-np.inf) > apart
+    return each[begins], np.cumsum(begins)[which] - 1
+
+
+def _within(times: np.ndarray, last: float) -> np.ndarray:
+    """Which of some times are within the run; the others are left out."""
+    return (times >= -1e-12) & (times <= last * (1.0 + 1e-9))
+
+
+def _with(data: dict[str, np.ndarray], wanted: tuple[str, ...], path: Path) -> dict[str, np.ndarray]:
+    for name in wanted:
+        if name not in data:
+            raise InputError(f"{path} has the columns {', '.join(data)}, but must have {name}.")
+        if name in ("time", "tracer") and not np.isfinite(data[name]).all():
+            line = int(np.argmin(np.isfinite(data[name]))) + 2
+            raise InputError(f"{path}: line {line} has the {name} {data[name][line - 2]:g}, but must have a number.")
+    return data

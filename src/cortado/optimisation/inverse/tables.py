@@ -1,14 +1,21 @@
-"""The tables [problem] and [optimise] of a task."""
+"""The tables of a task, [problem] with what was measured, [optimise] and [fit], and the JSON schema of all files."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import (
+    BeforeValidator,
+    Field,
     ValidationError,
+    ValidationInfo,
     ValidatorFunctionWrapHandler,
+    WithJsonSchema,
     WrapValidator,
     model_validator,
 )
@@ -24,13 +31,20 @@ from cortado.gradients import (
     ImplicitPressure,
 )
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
-from cortado.optimisation.inverse.measured_tables import AnyMeasured
-from cortado.optimisation.inverse.named_values import VALUES, ParameterName, Start, Values
+from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
-from cortado.scene.fields import MISSING, OneOf, Several, Text, count, field_error, quantity
+from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, components, count, field_error, quantity
+from cortado.scene.parameter_values import NAMES, UNITS
+from cortado.scene.scene import Scene
 from cortado.scene.tables import Table, wanted
 
+RANDOM = "random"
+CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
+Pixel = Annotated[int, count(0, 100_000)]
+Seconds = Annotated[float, quantity("s")]
+Clock = tuple[Literal["start"], ...]
+_NUMBERS: list[Any] = [{"type": "number"}, {"type": "array"}]
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "adam": Adam,
     "gradient_descent": GradientDescent,
@@ -45,6 +59,144 @@ ESTIMATORS: dict[str, AdjointEstimator] = {
     "adjoint_viscosity": AdjointViscosity(),
     "implicit_pressure": ImplicitPressure(),
 }
+
+
+def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
+    if not isinstance(values, Mapping) or not values:
+        raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
+    found = {}
+    names = _names(info)
+    for name, value in _flat(values, names).items():
+        if name not in names:
+            raise field_error((name,), Words("unknown"), _offered(info))
+        is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
+        found[name] = value if is_word else _array(name, value)
+    return found
+
+
+def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Values by name, where ``drag.k = 2.0`` is a table in a table."""
+    found = {}
+    for name, value in values.items():
+        deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
+        found.update({f"{name}.{key}": entry for key, entry in value.items()} if deeper else {name: value})
+    return found
+
+
+def _names(info: ValidationInfo) -> Collection[str]:
+    """Of all parameters, those of parts of packages among them where whoever reads the tables says which."""
+    return (*NAMES, *(info.context or {}).get("names", ()))
+
+
+def _offered(info: ValidationInfo) -> str:
+    """Which names are right: of parameters that the scene has, where whoever reads the tables says which."""
+    return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
+
+
+def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+    """The name of a parameter; raises a `field_error` where whoever reads the tables says which names are right."""
+    if info.context and name not in _names(info):
+        raise field_error((), name, _offered(info))
+    return name if info.context else check(name)
+
+
+def _array(name: str, value: Any) -> Any:
+    with suppress(ValueError):
+        if _is_numeric(value):
+            return np.array(value, dtype=np.float64)
+    finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
+    raise field_error((name,), value, finite)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether there is a finite number, or nothing else in a list that is not empty."""
+    if isinstance(value, list):
+        return bool(value) and all(map(_is_numeric, value))
+    return as_number(value) is not None
+
+
+def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The JSON schema of values by name; parameters that can be random may be one of the words too."""
+    allowed = [{"enum": list(words)}] if words else []
+    properties = {
+        name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
+        for name, unit in UNITS.items()
+    }
+    dotted = {r"\.": {"anyOf": _NUMBERS, "unit": "-"}}  # of parts of packages, also written as tables
+    others = {"patternProperties": dotted, "additionalProperties": {"type": "object"}}
+    return {"type": "object", "minProperties": 1, "properties": properties, **others}
+
+
+VALUES = _schema()
+"""The JSON schema of `Values`."""
+Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(VALUES)]
+"""Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
+Start = Annotated[
+    dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
+]
+"""Values, of which some may be the word "random"."""
+ParameterName = Annotated[str, OneOf(NAMES), WrapValidator(_known)]
+"""Of a parameter of Cortado, or of a part of a package where whoever reads the tables knows it."""
+
+
+class MeasuredTable(Table):
+    """Something that was measured."""
+
+    name: Text
+    """What it is called in results; its camera's parameters begin with it, as "camera.rotation"."""
+    file: Text
+    """Beside the task's own file: where the numbers are."""
+    start: Seconds = 0.0
+    """What the clock of the run shows where that of the file shows 0."""
+
+
+class VideoTable(MeasuredTable):
+    """Frames of a video, beside pictures of the simulation, whose camera [render] describes."""
+
+    kind: Literal["video"]
+    """Frames, compared with pictures."""
+    frame_rate: Annotated[float, quantity("1/s", gt=0.0)] | None = None
+    """Frames in a second; needed for a folder of pictures, what the video itself says if left out."""
+    every: Annotated[int, count(1, 1_000_000)] = 1
+    """Take only every so many frames."""
+    crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
+    """The part of each frame that counts, in its pixels; all of it if left out."""
+    mask: Text | None = None
+    """A picture of the frames' size, beside the task's own file, black where pixels do not count."""
+    calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
+    """What of the camera, the fluid's extinction, and the clock is searched beside the parameters; "start" is the key
+    start."""
+    noise: Annotated[float, quantity(gt=0.0)] | None = None
+    """Standard deviation of the linear light of a pixel; the residuals tell if left out."""
+
+
+class SensorSeriesTable(MeasuredTable):
+    """What a sensor measured: a CSV file with a column "time" [s], and columns by the names of the sensor's numbers."""
+
+    kind: Literal["sensor"]
+    """A series, compared with a [[sensor]] of the scene; heights of a surface are those of a "wave_gauge"."""
+    sensor: Text
+    """The name of the [[sensor]]."""
+    calibrate: Clock = ()
+    """["start"] to search the key start beside the parameters."""
+    noise: Annotated[float, quantity(gt=0.0)] | None = None
+    """Standard deviation of a number, in its unit; the residuals tell if left out."""
+
+
+class TracksTable(MeasuredTable):
+    """Paths of tracers: a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Each
+    tracer needs a line for the start of the run."""
+
+    kind: Literal["tracks"]
+    """Tracers, which swim with the fluid around them."""
+    calibrate: Clock = ()
+    """["start"] to search the key start beside the parameters."""
+    noise: Annotated[float, quantity("m", gt=0.0)] | None = None
+    """Standard deviation of a coordinate [m]; the residuals tell if left out."""
+
+
+AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(discriminator="kind")]
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
@@ -101,20 +253,19 @@ class ProblemTable(Table):
     def _check_target(self) -> Self:
         if self.measured:
             return self
-        if self.picture is None and self.target is None:
+        has_picture, most = self.picture is not None, max(self.steps, 1)
+        if not has_picture and self.target is None:
             raise field_error(("target",), MISSING, f"{wanted(VALUES)}, as there is no picture")
-        if self.picture is not None and self.target is not None:
-            raise field_error(("picture",), self.picture, "left out, as there is a target")
-        if self.picture is not None and self.loss != "image":
-            raise field_error(("loss",), self.loss, '"image", as there is a picture')
-        if self.picture is not None and self.frames > 1:
-            raise field_error(("frames",), self.frames, "1, as there is a picture, which is one")
-        if self.loss != "image" and "distance" in self.model_fields_set:
-            raise field_error(("distance",), self.distance, "left out, as positions are compared")
-        if self.frames > max(self.steps, 1):
-            raise field_error(
-                ("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps"
-            )
+        has_idle_distance = self.loss != "image" and "distance" in self.model_fields_set
+        for is_wrong, name, words in (
+            (has_picture and self.target is not None, "picture", "left out, as there is a target"),
+            (has_picture and self.loss != "image", "loss", '"image", as there is a picture'),
+            (has_picture and self.frames > 1, "frames", "1, as there is a picture, which is one"),
+            (has_idle_distance, "distance", "left out, as positions are compared"),
+            (self.frames > most, "frames", f"at most {most}, as there are {self.steps} steps"),
+        ):
+            if is_wrong:
+                raise field_error((name,), getattr(self, name), words)
         return self
 
     @property
@@ -236,3 +387,48 @@ class TaskTables(Table):
 
     problem: ProblemTable
     optimise: OptimiseTable
+
+
+class FitTable(Table):
+    """[fit]: the parameters that are fitted to measured data, and how long."""
+
+    start: Values
+    """By name the parameters that are fitted, as the fit starts; positive ones are searched by their logarithm."""
+    bounds: Values | None = None
+    """By the name of a parameter the lower and the upper bound; a number whose bounds are the same is not fitted."""
+    iterations: Annotated[int, count(1, 10_000)] = 50
+    """Trial points at most, of each of the two fits."""
+    starts: Annotated[int, count(1, 100)] | None = None
+    """From how many starts the fit searches; if left out, from the one that is given, and from three others where that
+    ends in doubt. Others lie within the bounds, or within two decades of a positive number."""
+    profiles: Annotated[int, count(0, 100)] = 7
+    """Points of the profile of each number, each with a fit of all others; 0 for no profiles."""
+
+
+class FitTables(Table):
+    """The two tables of a task whose target was measured."""
+
+    problem: ProblemTable
+    fit: FitTable
+
+
+def file_schema() -> dict[str, Any]:
+    """Of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what must fit together."""
+    models = (Scene, TaskTables, FitTables, DatasetTables)
+    scene, task, fit, data_set = (model.model_json_schema() for model in models)
+    tables = {**scene["$defs"], **task["$defs"], **fit["$defs"], **data_set["$defs"]}
+    for table in tables.values():
+        if "shape" in table.get("properties", {}):  # it has a default in Python, but has to be named in a file
+            table["required"] = ["shape", *table.get("required", [])]
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **{key: value for key, value in scene.items() if key != "$defs"},
+        "title": "A scene of Cortado, a task, or a data set",
+        "properties": {**scene["properties"], **task["properties"], **fit["properties"], **data_set["properties"]},
+        "$defs": tables,
+    }
+
+
+def file_schema_text() -> str:
+    """The schema as it is shipped."""
+    return json.dumps(file_schema(), indent=1, ensure_ascii=False) + "\n"

@@ -1,4 +1,4 @@
-"""What ``cortado optimise`` reads: a scene with the tables [problem] and [optimise]."""
+"""A task: what ``cortado optimise`` reads, a scene with the tables [problem] and [optimise]; in words; on a device."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -8,17 +8,35 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError, SceneError, Words
-from cortado.optimisation.inverse.tables import OptimiseTable, ProblemTable, TaskTables
-from cortado.optimisation.transforms import TimeInterpolation
+from cortado.errors import DivergedError, InputError, SceneError, Words
+from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
+from cortado.optimisation.inverse.tables import DISTANCES, RANDOM, OptimiseTable, ProblemTable, TaskTables
+from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
+from cortado.pictures.image_files import heart, read_picture, rosetta
+from cortado.problem import Problem
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
+from cortado.scene.containers import CylinderContainer
 from cortado.scene.fields import MISSING
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.parameter_values import SUM_TOLERANCE, Arrays, Known, is_too_small
 from cortado.scene.parameters import Axis, Parameter, Range, Role, offered
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import sentences
+from cortado.scene.tables import Table, sentences
 from cortado.scene.toml import read_toml
+from cortado.simulation import Simulation
 from cortado.solvers.makers import known_in
+from cortado.words import counted
+
+_ALGORITHMS = {
+    "adam": "Adam",
+    "gradient_descent": "gradient descent",
+    "lbfgs": "L-BFGS",
+    "line_search": "a line search",
+}
+DRAWN = {"heart": heart, "rosetta": rosetta}
+GIVEN = Words("given")
+"""What a sentence says of a key that should be left out."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +65,15 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
     if "fit" in data:
         others = "solved by cortado fit, as its target was measured"
-        raise SceneError(file, "fit", Words("given"), others if "optimise" not in data else "left out of a search")
+        raise SceneError(file, "fit", GIVEN, others if "optimise" not in data else "left out of a search")
     if scene.solver.chooses:
         wanted = "a number of seconds in a task, whose runs are compared step by step"
         raise SceneError(file, "solver.time_step", "auto", wanted)
-    known = _known(scene, file)
-    names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
+    known, tables = read_tables(data, scene, file, TaskTables)
+    problem, optimise = tables.problem, tables.optimise
     try:
-        with sentences(TaskTables):
-            given = {key: data[key] for key in TaskTables.model_fields if key in data}
-            tables = TaskTables.model_validate(given, context={"names": names})
-        problem, optimise = tables.problem, tables.optimise
         if problem.measured:
-            raise SceneError(
-                None, "problem.measured", Words("given"), "left out: measured data is fitted by cortado fit"
-            )
+            raise SceneError(None, "problem.measured", GIVEN, "left out: measured data is fitted by cortado fit")
         true, steps = problem.target or {}, problem.steps
         scene = scene.lasting(steps=steps)
         for name in optimise.start:
@@ -77,10 +89,16 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     return Task(scene, problem, optimise, true, start, known, Path(file).parent)
 
 
-def _known(scene: Scene, file: str) -> Known:
-    """The parameters of a scene; raises `SceneError`."""
+def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
+    """The parameters of a scene, and the tables of a model, which name such parameters; raises `SceneError`."""
     try:
-        return known_in(scene)
+        known = known_in(scene)
+        names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
+        with sentences(model):
+            given = {key: data[key] for key in model.model_fields if key in data}
+            return known, model.model_validate(given, context={"names": names})
+    except SceneError as error:
+        raise error.in_file(file) from None
     except InputError as error:
         raise SceneError(file, "", sentence=f"cannot be a task: {error}") from None
 
@@ -89,17 +107,16 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, k
     """Values with a row for each step where they change over time; raises `SceneError` for one that does not fit."""
     found = {}
     for name, array in values.items():
-        field = f"{table}.{name}"
-        parameter = known[name]
+        field, parameter = f"{table}.{name}", known[name]
         if not parameter.present(scene):
-            raise SceneError(None, field, Words("given"), f"left out, as the scene {parameter.absent}")
+            raise SceneError(None, field, GIVEN, f"left out, as the scene {parameter.absent}")
         for view, other in known.views.items():
             if name == other and view in values:
-                raise SceneError(None, field, Words("given"), f"left out, as {view} is given in its place")
+                raise SceneError(None, field, GIVEN, f"left out, as {view} is given in its place")
         if isinstance(array, str):
             found[name] = array
             continue
-        shapes = _shapes(known[name], scene, steps)
+        shapes = _shapes(parameter, scene, steps)
         if known.has_rows(name, array) and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
             array = TimeInterpolation(steps, len(array)).parameter(array)
         if array.shape not in shapes:
@@ -141,20 +158,21 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
             raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
     spread = optimise.gradient.spread
     for name in sorted(set(start) ^ set(spread or start)):
-        wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Words("given"))
+        wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", GIVEN)
         raise SceneError(None, f"optimise.gradient.spread.{name}", found, wanted)
-    given = optimise.check.model_fields_set
-    for table, values in (("problem.target", problem.target or {}), ("optimise.start", start)):
-        if problem.loss != "image" and "colours" in values:
-            raise SceneError(None, f"{table}.colours", Words("given"), "left out, as positions are compared")
-    if problem.loss != "image" and len(optimise.extinction_schedule) > 1:
-        wanted = "left out, as positions are compared"
-        raise SceneError(None, "optimise.extinction_schedule", list(optimise.extinction_schedule), wanted)
-    if problem.loss != "image" and "psnr" in given:
-        raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
-    if problem.picture is not None and "parameter_error" in given:
+    check, factors = optimise.check, list(optimise.extinction_schedule)
+    of_images: dict[str, tuple[bool, Any]] = {
+        "problem.target.colours": ("colours" in (problem.target or {}), GIVEN),
+        "optimise.start.colours": ("colours" in start, GIVEN),
+        "optimise.extinction_schedule": (len(factors) > 1, factors),
+        "optimise.check.psnr": ("psnr" in check.model_fields_set, check.psnr),
+    }
+    for field, (is_given, value) in of_images.items():
+        if problem.loss != "image" and is_given:
+            raise SceneError(None, field, value, "left out, as positions are compared")
+    if problem.picture is not None and "parameter_error" in check.model_fields_set:
         wanted = "left out, as the target is a picture, not a run with true parameters"
-        raise SceneError(None, "optimise.check.parameter_error", optimise.check.parameter_error, wanted)
+        raise SceneError(None, "optimise.check.parameter_error", check.parameter_error, wanted)
 
 
 def _check_bounds(
@@ -163,9 +181,9 @@ def _check_bounds(
     """Raises `SceneError` for bounds that do not fit the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
-        raise SceneError(None, field, Words("given"), "left out, as optimise.start lacks it")
+        raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
     if name == "mass_fractions":
-        raise SceneError(None, field, Words("given"), "left out, as fractions stay from 0 to 1 by themselves")
+        raise SceneError(None, field, GIVEN, "left out, as fractions stay from 0 to 1 by themselves")
     value = start[name]
     if pair.ndim == 0 or len(pair) != 2:
         wanted = "two entries, the lower and the upper bound"
@@ -198,3 +216,181 @@ def _shapes(parameter: Parameter, scene: Scene, steps: int) -> list[tuple[int, .
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
     return f"of shape {' or '.join(map(str, shapes))}" if all(shapes) else "a number"
+
+
+def task_in_words(task: Task) -> list[str]:
+    """What is searched and what it shall reach, and how; a paragraph each."""
+    problem, settings = task.problem, task.optimise
+    seconds = problem.steps * task.scene.solver.time_step
+    compared = "images" if problem.loss == "image" else "positions of all particles"
+    frames = "at the end" if problem.frames == 1 else f"at {problem.frames} times, the end among them,"
+    if problem.picture is not None:
+        wanted = f"look like the picture “{problem.picture}” {frames}"
+    else:
+        wanted = f"come to the same {compared} {frames} as a run whose {_listed(task.true_parameters)} the search "
+        wanted += "does not see"
+    length = f"{counted(problem.steps, 'step')} ({seconds:.4g} s)" if problem.steps else "no steps"
+    question = f"Which {_listed(task.start)} makes the fluid {wanted}? A run has {length}."
+    knots = f", by {settings.knots} knots in time" if settings.knots else ""
+    algorithm = _ALGORITHMS.get(settings.optimiser, settings.optimiser)
+    how = (
+        f"The search goes by {algorithm} with a learning rate of {settings.learning_rate:g}, "
+        f"for {counted(settings.iterations, 'iteration')} at most{knots}."
+    )
+    return [question, f"{how}{_asked(task)}"]
+
+
+def _listed(names: object) -> str:
+    words = [name.replace("_", " ") for name in names]  # type: ignore[attr-defined]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _asked(task: Task) -> str:
+    """What the check of the task asks for; empty where it asks for nothing."""
+    check = task.optimise.check
+    words = {
+        "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
+        "parameter_error": f"parameters within {100 * check.parameter_error:g}% of the hidden ones",
+        "psnr": f"an image within {check.psnr:g} dB of the target",
+    }
+    asked = [sentence for name, sentence in words.items() if name in check.model_fields_set]
+    return f" It is asked for {', '.join(asked[:-1])}{' and ' * (len(asked) > 1)}{asked[-1]}." if asked else ""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The arguments for `cortado.optimise`, and the target that its result is compared with."""
+
+    task: Task
+    problem: Problem
+    searches: tuple[Transformed, ...]
+    """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
+    start: Arrays
+    """Coordinates with which the search starts."""
+    bounds: dict[str, tuple[Any, Any]]
+    """Lower and upper bounds of coordinates."""
+    renderer: Renderer | None
+    """None where positions are compared."""
+    targets: dict[int, np.ndarray]
+    """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
+
+    @property
+    def search(self) -> Transformed:
+        """The last of the searches, that of the task itself."""
+        return self.searches[-1]
+
+    def image(self, end: Snapshot) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        assert self.renderer is not None
+        return _image(self.renderer, end)
+
+    def true_parameter(self, name: str) -> np.ndarray | None:
+        """The parameter's value in the run that made the target; None where a picture is the target."""
+        return self.task.true_parameters.get(name)
+
+
+def setup(task: Task, device: str, precision: str) -> Setup:
+    """The task on a device; raises `InputError` for a picture that cannot be read."""
+    simulation = Simulation(task.scene, device, precision)
+    start = {name: _start(name, value, simulation) for name, value in task.start.items()}
+    found = _coordinates(task, start)
+    searches = []
+    for factor in task.optimise.extinction_schedule:
+        renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
+        targets = _targets(task, simulation, renderer)
+        problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
+        searches.append(Transformed(problem, found))
+    bounds = _bounds(task)
+    coordinates = searches[-1].coordinate(start)
+    for name, (lower, upper) in bounds.items():
+        coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
+    return Setup(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
+
+
+def _frames(task: Task, targets: dict[int, np.ndarray], renderer: Renderer | None) -> Frames:
+    def loss(target: np.ndarray) -> Loss:
+        return Image(renderer, target, DISTANCES[task.problem.distance]) if renderer else FinalPositions(target)
+
+    return Frames({step: loss(target) for step, target in targets.items()})
+
+
+def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
+    steps = task.problem.compared
+    if task.problem.picture is not None:
+        assert renderer is not None
+        return {steps[-1]: _picture(task, renderer)}
+    nothing = FinalPositions(simulation.positions)
+    try:
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
+    except DivergedError as error:
+        run = "this is the run that makes the target, with the parameters of problem.target"
+        raise error.with_advice(f"{run}; {error.advice}, or change those") from None
+    except InputError as error:
+        raise InputError(f"problem.target: {error}") from None
+    if renderer is None:
+        return {step: end.positions for step, end in ends.items()}
+    return {step: _image(renderer, end) for step, end in ends.items()}
+
+
+def _image(renderer: Renderer, end: Snapshot) -> np.ndarray:
+    """The picture (rows, columns, 3) of a state."""
+    return renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+
+def _picture(task: Task, renderer: Renderer) -> np.ndarray:
+    """The picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, the last phase on the
+    first."""
+    name, scene = task.problem.picture, task.scene
+    assert name is not None
+    rows, columns, _ = renderer.shape
+    if name not in DRAWN:
+        return read_picture(task.folder / name, (columns, rows))
+    colours = [phase.colour for phase in scene.phase]
+    background = scene.render.background if scene.render else (1.0, 1.0, 1.0)
+    under = colours[0] if len(colours) > 1 else background
+    cup = 1.0 if isinstance(scene.container, CylinderContainer) else None
+    options: dict[str, Any] = {"milk": colours[-1], "coffee": under, "background": background}
+    return DRAWN[name]((columns, rows), cup=cup, **options)
+
+
+def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
+    if not isinstance(value, str) or value != RANDOM:
+        return np.asarray(value)
+    random = np.random.default_rng(0)
+    if name == "mass_fractions":
+        return random.dirichlet(np.ones(len(simulation.scene.phase)), simulation.particles)
+    container = simulation.scene.container
+    extent = container.extent()
+    if extent is None:
+        raise InputError('optimise.start.initial_positions is "random", but the scene has no container to fill.')
+    half = 0.5 * simulation.scene.discretisation.spacing
+    lower, upper = extent[0] + half, extent[1] - half
+    x = random.uniform(lower, upper, simulation.positions.shape)
+    while (outside := ~container.contains(x, 0.0)).any():  # in the corners around a cylinder
+        x[outside] = random.uniform(lower, upper, x[outside].shape)
+    return x
+
+
+def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
+    found: dict[str, Bijector] = {name: Logarithm() for name in task.optimise.logarithmic}
+    for name, value in start.items():
+        if name == "mass_fractions":
+            found[name] = Softmax()
+        elif task.known.has_rows(name, value) and task.optimise.knots is not None:
+            found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
+    return found
+
+
+def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
+    """Bounds of coordinates, by name.
+
+    Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
+    logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.
+    """
+    with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
+    free = [name for name in with_zero if name not in task.optimise.logarithmic]
+    found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
+    for name, (lower, upper) in (task.optimise.bounds or {}).items():
+        is_log = name in task.optimise.logarithmic
+        found[name] = (np.log(lower), np.log(upper)) if is_log else (lower, upper)
+    return found
