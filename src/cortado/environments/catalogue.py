@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.environments.task import Actuator, Position, Task, Velocity
+from cortado.environments.task import Position, Task, Velocity
 from cortado.environments.terms import Distance, Missed, OneBox, Pose, Reward, Share, Spread
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.scene.scene import Scene
@@ -47,6 +47,11 @@ class Carry(Task):
     """Height of what spilt water falls on: deeper than a corner of the cup ever is [m]."""
     fastest, turning = 0.6, 1.0
     """[m/s], [rad/s]"""
+    actuators = (
+        Velocity("cup.displacement", (0.0, 0.0), (0,), (fastest,)),
+        Velocity("cup.turn", (0.0,), (0,), (turning,), is_number=True),
+    )
+    goals = np.array([0.5 * width + 0.3]), np.array([0.5 * width + 0.5])
 
     @property
     def scene(self) -> Scene:
@@ -59,16 +64,6 @@ class Carry(Task):
             fluid=[box([0.0, 0.0], [self.width, self.depth], phase="water")],
             solid=[{**cup, **LED}],
         )
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        along = Velocity("cup.displacement", (0.0, 0.0), (0,), (self.fastest,))
-        return along, Velocity("cup.turn", (0.0,), (0,), (self.turning,), is_number=True)
-
-    @property
-    def goals(self) -> tuple[NDArray, NDArray]:
-        start = 0.5 * self.width
-        return np.array([start + 0.3]), np.array([start + 0.5])
 
     def reward(self, simulation: Simulation) -> Reward:
         middle = simulation.scene.solid[0].middle()
@@ -95,6 +90,7 @@ class Latte(Task):
     """Of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
     """How far the nozzle can be sent [m], how it follows [s], and for how many steps of the environment it pours."""
+    actuators = (Position("nozzle_path", (0.0, height), (0,), (reach,), lag=lag),)
 
     @property
     def scene(self) -> Scene:
@@ -110,10 +106,6 @@ class Latte(Task):
     def speed(self) -> float:
         """Of the milk in the nozzle [m/s]."""
         return self.column / (self.pouring * self.repeats * self.coarse_step)
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        return (Position("nozzle_path", (0.0, self.height), (0,), (self.reach,), lag=self.lag),)
 
     def reward(self, simulation: Simulation) -> Reward:
         targets, weights = _hidden(self, simulation.device.alias, simulation.precision.name)
@@ -161,6 +153,10 @@ class Pour(Task):
     """Corners of the inside of the glass, and the thickness of walls [m]."""
     fastest, turning = 0.1, 4.0
     """[m/s], [rad/s]"""
+    actuators = (
+        Velocity("jug.displacement", (0.0, 0.0), (0,), (fastest,)),
+        Velocity("jug.turn", (0.0,), (0,), (turning,), is_number=True),
+    )
 
     @property
     def scene(self) -> Scene:
@@ -175,11 +171,6 @@ class Pour(Task):
             fluid=[box([0.0, 0.0], [0.15, 0.125], phase="syrup")],
             solid=[{**cup, **jug, "motion": "path", "angular_velocity": 0.0}, {**cup, **glass}],
         )
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        along = Velocity("jug.displacement", (0.0, 0.0), (0,), (self.fastest,))
-        return along, Velocity("jug.turn", (0.0,), (0,), (self.turning,), is_number=True)
 
     def reward(self, simulation: Simulation) -> Reward:
         return Reward(((1.0, Share(OneBox(self.lower, self.upper), 2.0 * self.coarse_spacing)),))
@@ -202,6 +193,8 @@ class Raft(Task):
     """Of the raft [m]."""
     reach, lag = 0.05, 0.1
     """How far the paddle can be sent [m], and how it follows [s]."""
+    actuators = (Position("paddle.displacement", (0.0, 0.0), (0,), (reach,), lag=lag),)
+    goals = np.array([0.45]), np.array([0.6])
 
     @property
     def scene(self) -> Scene:
@@ -215,14 +208,6 @@ class Raft(Task):
                 box([0.36, 0.15], [0.36 + self.length, 0.25], **raft),
             ],
         )
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        return (Position("paddle.displacement", (0.0, 0.0), (0,), (self.reach,), lag=self.lag),)
-
-    @property
-    def goals(self) -> tuple[NDArray, NDArray]:
-        return np.array([0.45]), np.array([0.6])
 
     def reward(self, simulation: Simulation) -> Reward:
         return Reward(((-1.0, Pose("raft", self.length)),))
@@ -246,6 +231,8 @@ class Splash(Task):
     goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
     gravity, strength, lag = 9.81, 12.0, 0.05
     """What the box is shaken with at most, besides gravity [m/s2], and how it follows [s]."""
+    actuators = (Position("gravity", (0.0, -gravity), (0, 1), (-strength, -strength), lag=lag),)
+    goals = np.array([0.0]), np.array([1.5 * half])
 
     @property
     def scene(self) -> Scene:
@@ -255,14 +242,6 @@ class Splash(Task):
             fluid=[box([0.0, 0.0], [self.half, self.half], phase="water")],
             forces={"gravity": [0.0, -self.gravity]},
         )
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        return (Position("gravity", (0.0, -self.gravity), (0, 1), (-self.strength, -self.strength), lag=self.lag),)
-
-    @property
-    def goals(self) -> tuple[NDArray, NDArray]:
-        return np.array([0.0]), np.array([1.5 * self.half])
 
     def reward(self, simulation: Simulation) -> Reward:
         return Reward(((1.0, Share(Letter(self.half), self.coarse_spacing)),))
@@ -299,6 +278,7 @@ class Stir(Task):
     """Of the cup, of what is in it, and of the part whose left half is milk [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
     """Where the spoon begins, its radius, how far it can be sent [m], and how it follows [s]."""
+    actuators = (Position("spoon.displacement", (0.0, 0.0), (0, 1), reach, lag=lag),)
 
     @property
     def scene(self) -> Scene:
@@ -314,10 +294,6 @@ class Stir(Task):
             ],
             solid=[{**spoon, **LED}],
         )
-
-    @property
-    def actuators(self) -> tuple[Actuator, ...]:
-        return (Position("spoon.displacement", (0.0, 0.0), (0, 1), self.reach, lag=self.lag),)
 
     def reward(self, simulation: Simulation) -> Reward:
         milk, x, n = np.flatnonzero(simulation.mass_fractions[:, 1]), simulation.positions, simulation.particles

@@ -1,7 +1,7 @@
 """Kernels of observations and of rewards, each with its derivative: particle by particle, for all scenes of a batch."""
 
-from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -12,29 +12,11 @@ from cortado.device.precision import Precision
 FAR = wp.constant(1.0e30)
 
 
-@dataclass(frozen=True)
-class EnvironmentKernels:
-    """``per`` is the number of particles of a scene, ``factor`` (scenes,) what a derivative is multiplied by; the
-    ``period`` begins at ``origin`` [m], and is 0 along axes without one, as its ``frequency`` [1/m]."""
-
-    sample: Any
-    """Positions and velocities of some particles."""
-    share: Any
-    """1 / (1 + e^2 / w^2), where e is the distance of a particle to the nearest of some boxes, which may be fixed to a
-    solid in the plane."""
-    share_adjoint: Any
-    apart: Any
-    """For each of some particles, its distances to the nearest images of all of them, component by component, added
-    up."""
-    apart_adjoint: Any
-    missed: Any
-    """Squared distance of a particle to a target of its own, times a weight; targets change from step to step."""
-    missed_adjoint: Any
-
-
 @cache
-def environment_kernels(precision: Precision) -> EnvironmentKernels:
-    """In one precision; values to be added up are in float64."""
+def environment_kernels(precision: Precision) -> Any:
+    """In one precision, by name; values to be added up are in float64. ``per`` is the number of particles of a scene,
+    ``factor`` (scenes,) what a derivative is multiplied by; the ``period`` begins at ``origin`` [m], and is 0 along
+    axes without one, as its ``frequency`` [1/m]."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"environments_{precision.name}")
 
@@ -59,6 +41,7 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         # out
         seen: wp.array(dtype=wp.float32, ndim=4),
     ):
+        """Positions and velocities of some particles."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
         lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
@@ -108,6 +91,8 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         # out
         value: wp.array(dtype=wp.float64),
     ):
+        """1 / (1 + e^2 / w^2), where e is the distance of a particle to the nearest of some boxes, which may be fixed
+        to a solid in the plane."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -150,6 +135,8 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         # out
         value: wp.array2d(dtype=wp.float64),
     ):
+        """For each of some particles, its distances to the nearest images of all of them, component by component, added
+        up."""
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
@@ -190,6 +177,7 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         # out
         value: wp.array(dtype=wp.float64),
     ):
+        """Squared distance of a particle to a target of its own, times a weight; targets change from step to step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]
@@ -210,4 +198,6 @@ def environment_kernels(precision: Precision) -> EnvironmentKernels:
         k, p = step[i // per], i % per
         x_bar[i] += real(2.0) * factor[i // per] * weight[k, p] * (x[i] - target[k, p])
 
-    return EnvironmentKernels(sample, share, share_adjoint, apart, apart_adjoint, missed, missed_adjoint)
+    forward = {"sample": sample, "share": share, "apart": apart, "missed": missed}
+    back = {"share_adjoint": share_adjoint, "apart_adjoint": apart_adjoint, "missed_adjoint": missed_adjoint}
+    return SimpleNamespace(**forward, **back)

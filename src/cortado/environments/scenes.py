@@ -16,7 +16,6 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState
-from cortado.rollout.rollout import Rollout
 from cortado.rollout.stepper import Stepper
 from cortado.runs.quantities.moment import Moment, row_of
 from cortado.runs.sensors.placement import warn_of_places
@@ -179,12 +178,20 @@ class Scenes:
         return seen.numpy()
 
     def _read(self, state: State) -> dict[str, NDArray]:
-        """(scenes, k) of each sensor."""
-        if self._sensors and self._lost:  # so that all are numbers
+        """(scenes, k) of each sensor. Parameters are those of the last step, but for those that actions drive."""
+        if not self._sensors:
+            return {}
+        if self._lost:  # so that all are numbers
             state = state.copy()
             for b in self._lost:
                 state.member(b).assign(self._first.arrays.member(b))
-        return readings(self._sensors, self.simulation, self._stepper.rollout, state, self._driven)
+        simulation, rollout = self.simulation, self._stepper.rollout
+        row = rollout.steps - 1
+        parameters = {**row_of(rollout, rollout.parameters.written, row), **self._driven}
+        moment = Moment(state, parameters, rollout.substeps, row, simulation.evaluator)
+        colours = np.zeros((len(self), len(simulation.scene.phase), 3))
+        end = SnapshotBatch(state, simulation.dimension, colours, moment)
+        return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}
 
     def _free(self, state: State, name: str) -> NDArray:
         """(scenes, 7) of a free body the place, the cosine and the sine of its turn, the velocity and the rate."""
@@ -207,18 +214,3 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
                 f"sensors has the name {shown(name)}, but must have texts other than {', '.join(sorted(taken))}."
             )
     return {name: checked_sensor(sensor) for name, sensor in given.items()}
-
-
-def readings(
-    sensors: Mapping[str, Sensor], simulation: Simulation, rollout: Rollout, state: State, driven: Mapping[str, NDArray]
-) -> dict[str, NDArray]:
-    """(scenes, k) by name, of states of all scenes. Parameters are those of the last step of the rollout, but for those
-    that are ``driven`` (scenes, 1, ...)."""
-    if not sensors:
-        return {}
-    row = rollout.steps - 1
-    parameters = {**row_of(rollout, rollout.parameters.written, row), **driven}
-    moment = Moment(state, parameters, rollout.substeps, row, simulation.evaluator)
-    scenes = simulation.batch or 1
-    end = SnapshotBatch(state, simulation.dimension, np.zeros((scenes, len(simulation.scene.phase), 3)), moment)
-    return {name: np.array([value_of(sensor, end[b]) for b in range(scenes)]) for name, sensor in sensors.items()}

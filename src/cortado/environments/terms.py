@@ -15,7 +15,7 @@ from cortado.device.reduction import add, sum_of
 from cortado.device.threads import WARP
 from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import apart
-from cortado.environments.kernels import EnvironmentKernels, environment_kernels
+from cortado.environments.kernels import environment_kernels
 from cortado.losses.loss import Snapshot, SnapshotBatch, precision_of
 from cortado.particles.state import State, padded, to_device
 from cortado.scene.motions import AXES, position_name, turn_name
@@ -80,7 +80,9 @@ class OneBox:
 
 
 class OverParticles:
-    """A term that is a sum over particles."""
+    """A term that is a sum over particles, of a kernel whose derivative has its name and ``_adjoint``."""
+
+    kernel: str
 
     def __init__(self, *given: Any):
         """``given``: what it is made from."""
@@ -92,6 +94,35 @@ class OverParticles:
         """Pickled and copied as what it is made from."""
         return type(self), self._given
 
+    def values(self, at: StepEnd) -> NDArray:
+        value = wp.empty(self._threads(at), dtype=wp.float64, device=at.state.positions.device)
+        self._launch(self.kernel, at, value=value)
+        count = value.size // at.scenes
+        total = self._kept(count, at, lambda: sum_of(wp.float64, count, value.device, at.scenes))
+        return total(value.flatten()).numpy() / self._over(at)
+
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
+        """``others``: what the kernel of the derivative writes besides ``x_bar``."""
+        scaled = _reals(at, factor / self._over(at))
+        self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
+
+    def _launch(self, name: str, at: StepEnd, **arguments: Any) -> None:
+        x, kernels = at.state.positions, environment_kernels(precision_of(at.state))
+        own = {"per": at.per, "x": x, **self._arguments(at)}
+        launch(getattr(kernels, name), self._threads(at), x.device, **own, **arguments)
+
+    def _threads(self, at: StepEnd) -> tuple[int, ...]:
+        """One for each particle, unless said otherwise."""
+        return (at.scenes * at.per,)
+
+    def _over(self, at: StepEnd) -> float:
+        """What the sum is divided by."""
+        return 1.0
+
+    def _arguments(self, at: StepEnd) -> dict[str, Any]:
+        """Those of both kernels."""
+        raise NotImplementedError
+
     def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
         """What is made once for a device, a precision and a number of scenes."""
         key = key, str(at.state.positions.device), at.state.positions.dtype, at.scenes
@@ -99,45 +130,37 @@ class OverParticles:
             self._made[key] = make()
         return self._made[key]
 
-    def _total(self, at: StepEnd, value: wp.array) -> NDArray:
-        """(scenes,)"""
-        count = value.size // at.scenes
-        total = self._kept(count, at, lambda: sum_of(wp.float64, count, value.device, at.scenes))
-        return total(value.flatten()).numpy().copy()
-
 
 class Share(OverParticles):
     """The share of the fluid that is in some boxes, each particle counted by 1 / (1 + e^2 / w^2), where e is the
     distance of its nearest image to the nearest box: 1 within, a half at the distance w, so that there is a gradient
     everywhere."""
 
+    kernel = "share"
+
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
         """``width`` w [m]; ``solid``: on whose middle boxes are placed, and with which they turn, in the plane."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
-    def values(self, at: StepEnd) -> NDArray:
-        x, value = at.state.positions, _empty(at, at.scenes * at.per)
-        launch(_kernels(at).share, len(x), x.device, **self._where(at), x=x, value=value)
-        return self._total(at, value) / at.per
-
-    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
+    def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
         x = at.state.positions
         place_bar, turn_bar = wp.empty_like(x), wp.empty(len(x), dtype=precision_of(at.state).real, device=x.device)
-        own = {"factor": _reals(at, factor / at.per), "x_bar": bar.positions}
-        own |= {"x": x, "place_bar": place_bar, "turn_bar": turn_bar}
-        launch(_kernels(at).share_adjoint, len(x), x.device, **self._where(at), **own)
+        super().adjoint(at, factor, bar, place_bar=place_bar, turn_bar=turn_bar)
         if self._solid is not None:
             for name, bars in ((position_name(self._solid), place_bar), (turn_name(self._solid), turn_bar)):
                 add(sum_of(bars.dtype, at.per, x.device, at.scenes)(bars), bar[name])
 
-    def _where(self, at: StepEnd) -> dict[str, Any]:
+    def _over(self, at: StepEnd) -> float:
+        return at.per
+
+    def _arguments(self, at: StepEnd) -> dict[str, Any]:
         lower, upper = (_vectors(at, corners) for corners in self._boxes(at.goal))
         if self._solid is None:
             fixed = _vectors(at, np.zeros((at.scenes, 3))), _reals(at, np.zeros(at.scenes))
         else:
             fixed = at.state[position_name(self._solid)], at.state[turn_name(self._solid)]
-        found = {"per": at.per, "width": self._width, "lower": lower, "upper": upper, **at.period}
+        found = {"width": self._width, "lower": lower, "upper": upper, **at.period}
         return {**found, "place": fixed[0], "turn": fixed[1]}
 
 
@@ -145,24 +168,23 @@ class Spread(OverParticles):
     """The mean distance of all pairs of some particles, component by component, |dx| + |dy|, over ``everywhere``;
     along a periodic axis to the nearest image."""
 
+    kernel = "apart"
+
     def __init__(self, chosen: NDArray, everywhere: float):
         """``chosen`` (m,) numbers of particles; ``everywhere`` [m]."""
         super().__init__(chosen, everywhere)
         self._chosen, self._pairs = chosen, len(chosen) ** 2 * everywhere
 
-    def values(self, at: StepEnd) -> NDArray:
-        value = _empty(at, at.scenes, len(self._chosen))
-        self._launch(_kernels(at).apart, at, value=value)
-        return self._total(at, value) / self._pairs
+    def _threads(self, at: StepEnd) -> tuple[int, ...]:
+        return at.scenes, len(self._chosen)
 
-    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        by_pair = _reals(at, factor / self._pairs)
-        self._launch(_kernels(at).apart_adjoint, at, factor=by_pair, x_bar=bar.positions)
+    def _over(self, at: StepEnd) -> float:
+        return self._pairs
 
-    def _launch(self, kernel: Any, at: StepEnd, **arguments: Any) -> None:
-        x = at.state.positions
-        chosen = self._kept("chosen", at, lambda: wp.array(self._chosen, dtype=wp.int32, device=x.device))
-        launch(kernel, (at.scenes, len(chosen)), x.device, per=at.per, chosen=chosen, x=x, **at.period, **arguments)
+    def _arguments(self, at: StepEnd) -> dict[str, Any]:
+        device = at.state.positions.device
+        chosen = self._kept("chosen", at, lambda: wp.array(self._chosen, dtype=wp.int32, device=device))
+        return {**at.period, "chosen": chosen}
 
 
 class Missed(OverParticles):
@@ -171,24 +193,18 @@ class Missed(OverParticles):
     Targets go on beyond the end of a period, as positions do: a lap too many is a distance.
     """
 
+    kernel = "missed"
+
     def __init__(self, targets: NDArray, weights: NDArray):
         """``targets`` (steps, n, d) [m], those of step k, counted from 1, at k - 1; ``weights`` (steps, n)."""
         super().__init__(targets, weights)
         self._targets, self._weights = targets, weights
 
-    def values(self, at: StepEnd) -> NDArray:
-        value = _empty(at, at.scenes * at.per)
-        self._launch(_kernels(at).missed, at, value=value)
-        return self._total(at, value)
-
-    def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        self._launch(_kernels(at).missed_adjoint, at, factor=_reals(at, factor), x_bar=bar.positions)
-
-    def _launch(self, kernel: Any, at: StepEnd, **arguments: Any) -> None:
-        x = at.state.positions
+    def _arguments(self, at: StepEnd) -> dict[str, Any]:
         target, weight = self._kept("targets", at, lambda: (_vectors(at, self._targets), _reals(at, self._weights)))
-        step = wp.array(np.clip(at.step, 1, len(self._targets)) - 1, dtype=wp.int32, device=x.device)
-        launch(kernel, len(x), x.device, per=at.per, step=step, target=target, weight=weight, x=x, **arguments)
+        steps = np.clip(at.step, 1, len(self._targets)) - 1
+        step = wp.array(steps, dtype=wp.int32, device=at.state.positions.device)
+        return {"step": step, "target": target, "weight": weight}
 
 
 @dataclass(frozen=True)
@@ -299,10 +315,6 @@ def _miss(at: StepEnd, solid: str) -> NDArray:
     return apart(_numbers(at.state, position_name(solid))[:, :1] - at.goal[:, :1], at.domain.lengths[:1])[:, 0]
 
 
-def _kernels(at: StepEnd) -> EnvironmentKernels:
-    return environment_kernels(precision_of(at.state))
-
-
 def _reals(at: StepEnd, values: NDArray) -> wp.array:
     return wp.array(values, dtype=precision_of(at.state).real, device=at.state.positions.device)
 
@@ -312,10 +324,6 @@ def _vectors(at: StepEnd, values: NDArray) -> wp.array:
     return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
         values.shape[:-1]
     )
-
-
-def _empty(at: StepEnd, *shape: int) -> wp.array:
-    return wp.empty(shape, dtype=wp.float64, device=at.state.positions.device)
 
 
 def _numbers(state: State, name: str) -> NDArray:
