@@ -16,9 +16,8 @@ import cortado
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
 from cortado.gradients import EnsembleMean, Estimate
 from cortado.losses import FinalPositions
-from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
-from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
+from cortado.optimisation.optimisers import BY_NAME, LBFGS, Adam, GradientDescent, LineSearch
 from cortado.problem import Problem
 from cortado.runs.run_folder import REPLAY_LOG
 from cortado.simulation import Simulation

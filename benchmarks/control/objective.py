@@ -9,8 +9,7 @@ import numpy as np
 
 from cortado import DivergedError, Problem
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
-from cortado.optimisation.fixed_parameters import FixedParameters
-from cortado.optimisation.transforms import Transformed
+from cortado.optimisation.transforms import FixedParameters, Transformed
 from cortado.scene.parameter_values import Arrays
 
 from ..counting import Counted, Steps

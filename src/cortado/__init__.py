@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from cortado.errors import DivergedError as DivergedError
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
-    from cortado.optimisation.evaluate import evaluate as evaluate
     from cortado.optimisation.fitting.fit import Fit as Fit
     from cortado.optimisation.fitting.fit import fit as fit
+    from cortado.optimisation.optimise import evaluate as evaluate
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.pictures.side_by_side import film_side_by_side as film_side_by_side
@@ -65,7 +65,7 @@ _HOMES = {
     "Simulation": "simulation",
     "Trajectory": "runs.trajectory",
     "certify": "certificate",
-    "evaluate": "optimisation.evaluate",
+    "evaluate": "optimisation.optimise",
     "film_side_by_side": "pictures.side_by_side",
     "fit": "optimisation.fitting.fit",
     "load_scene": "scene.scene",

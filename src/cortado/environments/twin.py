@@ -12,8 +12,7 @@ from cortado.environments.terms import MinusReward
 from cortado.errors import InputError, shown
 from cortado.gradients import GradientEstimator
 from cortado.losses import Frames
-from cortado.optimisation.fixed_parameters import FixedParameters
-from cortado.optimisation.transforms import Affine, Transformed
+from cortado.optimisation.transforms import Affine, FixedParameters, Transformed
 from cortado.problem import Problem
 from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation

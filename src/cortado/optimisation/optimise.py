@@ -1,29 +1,251 @@
 """`cortado.optimise`: lower the loss of a problem, with a history, bounds, and a checkpoint to resume from.
 
 The optimiser sees one vector; this module ravels the named parameters into it, keeps the replay log, and gives the best
-parameters back.
+parameters back. `cortado.evaluate` is for points that do not depend on one another, such as a population of a search.
 """
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import require_function, require_truth
+from cortado.arrays import (
+    as_numbers,
+    as_one_number,
+    is_whole,
+    require_function,
+    require_methods,
+    require_table,
+    require_truth,
+)
 from cortado.calls import public
-from cortado.errors import InputError
+from cortado.errors import InputError, shown, warn
+from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.files.input_files import as_path
-from cortado.optimisation.differentiable import LossFunction, Optimisable, as_differentiable
-from cortado.optimisation.evaluator import Evaluator, as_given
-from cortado.optimisation.named_optimisers import as_optimiser
-from cortado.optimisation.replay_log import Log, MemoryLog, ParameterLayout, ReplayLog
-from cortado.optimisation.result import Parameters, Record, Result
-from cortado.optimisation.search import Optimiser, Search
-from cortado.optimisation.start import checked_bounds, checked_start, require_count, require_within
-from cortado.words import counted
+from cortado.gradients import Estimate, GradientEstimator
+from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_estimator, evaluated, without_runs
+from cortado.on_top import on_top
+from cortado.optimisation.evaluator import Evaluator, Optimisable, Parameters, Record, as_given
+from cortado.optimisation.optimisers import as_optimiser
+from cortado.optimisation.search import Log, MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector
+from cortado.scene.parameter_values import Values
+from cortado.words import counted, sized
+
+LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
+"""Parameters by name -> the loss, and its gradient by the same names."""
+MOST_ITERATIONS = 10_000_000
+"""Updates of a search, in tasks too; more are taken for a mistake."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of the parameters, which returns its own gradient, as a `Optimisable`."""
+
+    function: LossFunction
+
+    @property
+    def fingerprint(self) -> str:
+        """The name of the function."""
+        kind = type(self.function)
+        return str(getattr(self.function, "__qualname__", kind.__qualname__))
+
+    def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
+        """What the function returns; raises `InputError` where an estimator is given, as the gradient is the function's
+        own."""
+        if gradient is not None:
+            raise InputError("gradient is given, but must be left out where a function makes its own.")
+        return self.function(parameters)
+
+
+def as_differentiable(problem: Any) -> Optimisable:
+    """The problem itself, or a function made into one; raises `InputError` for anything else."""
+    if isinstance(problem, type):
+        raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")
+    if hasattr(problem, "value_and_gradient"):
+        return problem
+    if callable(problem):
+        return Function(problem)
+    raise InputError(
+        f"What is optimised is {shown(problem)}, but must be a cortado.Problem, an object with value_and_gradient, or "
+        "a function of the parameters that returns its loss and its gradient."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The best parameters of an optimisation, with its history."""
+
+    parameters: Parameters
+    """With the lowest loss seen."""
+    loss: float
+    """The lowest seen."""
+    last_parameters: Parameters
+    """The optimiser's last iterate."""
+    history: tuple[Record, ...]
+    """One per evaluation, in order."""
+    updates: int
+    """That the optimiser made, with those replayed from the checkpoint."""
+    evaluations: int
+    """How many there are in the history, with those replayed from the checkpoint."""
+    message: str
+    """How it ended, a sentence."""
+    converged: bool
+    """Whether the optimiser's own test was met, and the gradient agreed with what steps did; only L-BFGS has a test."""
+    refused: int = 0
+    """Evaluations of which there is no run, as it diverged or a parameter was out of its range, so that the steps to
+    them were refused; they are not in the history."""
+    left_out: int = 0
+    """Runs that averages over ensembles left out, for the same reasons; of those that were not replayed."""
+    misled: bool = False
+    """Whether the gradient disagreed with what steps did, as beyond the horizon of `cortado.certify`, by which the
+    search cannot be trusted; `message` says what to try."""
+    stays: bool = False
+    """Whether the loss stayed at a good part of the first one, as in a wrong valley."""
+    problem: Any = field(default=None, repr=False)
+    """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
+    and in a result that was pickled."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "problem": None}
+
+    def __repr__(self) -> str:
+        found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"
+        end = re.split("[,:;.]", self.message)[0]
+        return f"Result({sized(self.parameters)}: {found}; {end})"
+
+    def _repr_html_(self) -> str:
+        """With the ends of runs, first and found, beside the target; the parameters; the losses of all evaluations."""
+        losses, start = [record.loss for record in self.history], self.history[0].parameters
+        page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
+        return page
+
+
+def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
+    """The start as float64 arrays, or InputError if there is a parameter that cannot be optimised."""
+    if not isinstance(start, Mapping):
+        raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
+    if not start:
+        raise InputError("The start names no parameter to optimise; give one or more, as {'gravity': value}.")
+    return {name: _checked_value(f"The start of '{name}'", value) for name, value in start.items()}
+
+
+def _checked_value(what: str, value: Any) -> Vector:
+    """A value as a float64 array, or InputError if it is not made of finite numbers."""
+    array = as_numbers(what, value).copy()
+    if array.size == 0:
+        raise InputError(f"{what} has shape {array.shape}, but must have at least one number.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} has components that are not finite; start from finite numbers.")
+    return array
+
+
+def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
+    """Lower and upper bounds as vectors (size,), or InputError if they do not fit the parameters."""
+    if not isinstance(bounds, Mapping):
+        raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
+    unknown = sorted(set(bounds) - set(layout.names), key=str)
+    if unknown:
+        raise InputError(
+            f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "
+            f"optimised parameters are {', '.join(map(repr, layout.names))}."
+        )
+    shapes = dict(zip(layout.names, layout.shapes, strict=True))
+    sides = {name: _checked_pair(name, bounds.get(name, (None, None)), shapes[name]) for name in shapes}
+    lower = layout.ravel({name: pair[0] for name, pair in sides.items()})
+    upper = layout.ravel({name: pair[1] for name, pair in sides.items()})
+    return lower, upper
+
+
+def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Vector, Vector]:
+    """The lower and upper bound of one parameter, each of its shape, infinite where there is none."""
+    try:
+        lower, upper = pair
+        low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
+        high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
+        low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"The bounds of '{name}' must be (lower, upper), each None, a number or an array of shape "
+            f"{shape}, not {pair!r}."
+        ) from None
+    if not (low <= high).all():
+        raise InputError(f"The lower bound of '{name}' must not exceed the upper one; neither may be NaN.")
+    return low, high
+
+
+def require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
+    """Raise InputError if the start is outside of the bounds."""
+    outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
+    for name, marks in outside.items():
+        if marks.any():
+            raise InputError(
+                f"The start of '{name}' is outside of its bounds in {int(marks.sum())} of {marks.size} "
+                "components; start within the bounds, or widen them."
+            )
+
+
+def require_count(iterations: int) -> None:
+    """Raise InputError unless the number of iterations is a positive integer, and one that a search can make."""
+    if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
+        wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
+        raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
+
+
+@public
+def evaluate(
+    problem: Differentiable,
+    points: Iterable[Values],
+    gradient: GradientEstimator | None = None,
+    executor: Executor | None = None,
+    loss_if_diverged: float | None = None,
+    on_result: OnResult | None = None,
+) -> list[Estimate]:
+    """The loss of a problem at many points, in their order, with the same bits wherever they are computed.
+
+    Parameters:
+        problem: a `Problem`, or one in other coordinates (`cortado.optimisation.transforms.Transformed`).
+        points: the parameters of each point, by name. They are taken as they are needed.
+        gradient: how the gradient is computed at each point, such as `gradients.Exact()`; left out, the ``gradient`` of
+            each `Estimate` is empty, and points are run forward only.
+        executor: where they are computed, see `cortado.executors`; one after the other in this process if left out.
+        loss_if_diverged: the loss of a point that has no run, as it diverges or a parameter is out of its range, such
+            as infinity for a search that leaves it aside. Left out, it is NaN, and a `CortadoWarning` says how many
+            such points there are, and what became of the first of them. The gradient of such a point is NaN, and its
+            `Estimate.diverged` has the error.
+        on_result: called with the number of a point and its `Estimate` as they arrive, in whatever order.
+
+    Raises the error of the first point that has another one; and that of the first point where no point has a run,
+    unless they are given a loss.
+    """
+    require_function("on_result", on_result, "the number of a point", "its Estimate")
+    require_methods("problem", problem, ("value",), "a cortado.Problem")
+    if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
+        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+    if loss_if_diverged is not None:
+        loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
+    chosen = checked_executor(InProcess() if executor is None else executor)
+    estimator = None if gradient is None else checked_estimator(gradient)
+    loss = np.nan if loss_if_diverged is None else loss_if_diverged
+    made = (Point(_by_name(values), estimator, loss, NO_RUN) for values in points)
+    found = evaluated(problem, made, chosen, on_result=on_result)
+    lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
+    if lost and loss_if_diverged is None:
+        first, error = next(iter(lost.items()))
+        if len(lost) == len(found):
+            raise error
+        said = without_runs([*lost.values()], counted(len(found), "point"))
+        sentence = f"{said}, and their losses are NaN. The first of them is point {first}: {error}"
+        warn(sentence)
+    return found
+
+
+def _by_name(point: Values) -> Values:
+    require_table("a point", point, "{'gravity': value}")
+    return point
 
 
 @public

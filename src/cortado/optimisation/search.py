@@ -1,17 +1,295 @@
-"""What an optimiser is given and returns, and the checks of settings that optimisers share."""
+"""What an optimiser sees of a search, one vector and what is computed of it, and the replay log of that.
 
+An optimiser is deterministic: given the losses and gradients of a former run, it takes the same steps. The replay log
+keeps every evaluation of the loss and its gradient, and so it is a complete checkpoint of any optimiser: a run is
+resumed by replaying the optimiser against the log. It is a file that only grows, as a database of sqlite3 needs locks,
+which file systems of clusters may lack.
+"""
+
+import json
+import os
+import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol, Self, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
-from cortado.errors import InputError, shown
-from cortado.optimisation.replay_log import ParameterLayout, Vector
+from cortado.errors import ComputationError, InputError, shown
+from cortado.files.output_files import parsed_json, sentences, write_atomically, write_fully
+from cortado.runs.run_folder import REPLAY_LOG
 from cortado.scene.fields import as_number
 from cortado.words import quoted
 
+Vector = npt.NDArray[np.float64]
+FORMAT = "cortado replay log 1"
+LONGEST_HEADER = 2**20
+"""Bytes of the first line of a log."""
 PerParameter = float | Mapping[str, float]
+HALVINGS = 10
+"""How often one step is halved before the search ends."""
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """Where each named parameter lies in the one vector that an optimiser sees."""
+
+    names: tuple[str, ...]
+    # in the order in which they follow each other in the vector
+    shapes: tuple[tuple[int, ...], ...]
+    # one per name; () for a scalar
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, Vector]) -> Self:
+        """The layout of these parameters, in their order."""
+        return cls(tuple(parameters), tuple(np.shape(value) for value in parameters.values()))
+
+    @property
+    def sizes(self) -> list[int]:
+        """The number of components of each parameter."""
+        return [int(np.prod(shape)) for shape in self.shapes]
+
+    @property
+    def size(self) -> int:
+        """The number of components of the vector."""
+        return sum(self.sizes)
+
+    def ravel(self, parameters: Mapping[str, Any]) -> Vector:
+        """The vector (size,) of parameters that have the names and shapes of this layout."""
+        parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
+        return np.concatenate(parts)
+
+    def unravel(self, vector: Vector) -> dict[str, Vector]:
+        """The parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
+        parts = np.split(vector, np.cumsum(self.sizes)[:-1])
+        return {
+            name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
+        }
+
+    def spread(self, values: float | Mapping[str, float]) -> Vector:
+        """One number for every component (size,), from one number or from one number per parameter."""
+        by_name = values if isinstance(values, Mapping) else dict.fromkeys(self.names, values)
+        return np.repeat([float(by_name[name]) for name in self.names], self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedEvaluation:
+    """One evaluation of the loss and its gradient."""
+
+    parameters: Vector
+    # (size,), each component in its parameter's unit
+    loss: float
+    gradient: Vector
+
+
+class Log(Protocol):
+    """What the optimisation needs of a replay log."""
+
+    @property
+    def fate(self) -> str:
+        """What becomes of the evaluations, for messages: the end of "the evaluations ..."."""
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int) -> LoggedEvaluation:
+        """The evaluation of that index, bit for bit as it was appended."""
+
+    def append(self, evaluation: LoggedEvaluation) -> None:
+        """Keep one more evaluation."""
+
+    def close(self) -> None:
+        """Free what the log holds open."""
+
+
+class MemoryLog:
+    """A replay log that lives as long as the process."""
+
+    fate = "were not kept, as there is no checkpoint"
+
+    def __init__(self) -> None:
+        self._evaluations: list[LoggedEvaluation] = []
+
+    def __len__(self) -> int:
+        return len(self._evaluations)
+
+    def read(self, index: int) -> LoggedEvaluation:
+        """The evaluation of that index."""
+        return self._evaluations[index]
+
+    def append(self, evaluation: LoggedEvaluation) -> None:
+        """Keep one more evaluation."""
+        self._evaluations.append(evaluation)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class ReplayLog:
+    """A replay log in one file of a folder; a kill at any moment costs at most the evaluation being written.
+
+    The file is a line of JSON (format, names, shapes, settings) and then one record of fixed size per
+    evaluation: index (uint64), loss, parameters and gradient (float64), and the CRC-32 of all these (uint32),
+    little-endian. The first line appears with the file in one rename; every record is on the disk before
+    `append` returns. Only the last record can be torn; the next evaluation is written over it.
+    """
+
+    def __init__(
+        self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
+    ) -> None:
+        """Open the log of `folder`, or begin one there.
+
+        Parameters:
+            folder: made if it is not there.
+            layout: names and shapes of the parameters.
+            settings: what else must be the same when the run is resumed, as text by name.
+            resume: go on with the evaluations in the folder, if there are any.
+
+        Raises InputError if the folder holds evaluations and `resume` is false, if they belong to other
+        settings, or if the file is damaged elsewhere than at its end.
+        """
+        self._layout = layout
+        self._path = Path(folder) / REPLAY_LOG
+        self._record_size = 8 + 8 * (1 + 2 * layout.size) + 4
+        shapes = [list(shape) for shape in layout.shapes]
+        header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
+        if self._path.exists() and not self._path.is_file():
+            raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
+        if not resume:
+            _require_unused(self._path)
+        if not resume or not self._path.exists():
+            _begin(self._path, header)
+        with sentences(self._path):
+            self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
+        try:
+            self._first_record = _check_header(self._file, header, self._path)
+            self._count = self._count_whole()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def fate(self) -> str:
+        """Where the evaluations are kept."""
+        return f"are in '{self._path}'"
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> LoggedEvaluation:
+        """The evaluation of that index, 0 <= index < len(self), bit for bit as it was appended."""
+        self._file.seek(self._first_record + index * self._record_size)
+        values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
+        size = self._layout.size
+        return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
+
+    def append(self, evaluation: LoggedEvaluation) -> None:
+        """Write one more evaluation; it is on the disk on return. Raises ComputationError if the disk refuses."""
+        values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
+        content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
+        try:
+            self._file.seek(self._first_record + self._count * self._record_size)
+            write_fully(self._file, content + struct.pack("<I", zlib.crc32(content)))
+            os.fsync(self._file.fileno())
+        except OSError as problem:
+            raise ComputationError(
+                f"An evaluation cannot be written to '{self._path}': {problem.strerror or problem}; free some space "
+                f"and resume. The {self._count} evaluations before it are kept."
+            ) from problem
+        self._count += 1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _count_whole(self) -> int:
+        """The number of whole records, without a torn last one; InputError if another one is damaged."""
+        end = self._file.seek(0, os.SEEK_END)
+        complete = (end - self._first_record) // self._record_size
+        whole = self._leading_whole_records()
+        if whole < complete - 1:
+            raise InputError(
+                f"Evaluation {whole} of the {complete} in '{self._path}' is damaged; restore the file from a "
+                "copy, or begin again in another checkpoint folder."
+            )
+        return whole
+
+    def _leading_whole_records(self) -> int:
+        """How many records, from the first, have their index and checksum right."""
+        self._file.seek(self._first_record)
+        index = 0
+        while _is_whole(self._file.read(self._record_size), index, self._record_size):
+            index += 1
+        return index
+
+
+def _require_unused(path: Path) -> None:
+    """Raise InputError if there is a log with anything after its first line."""
+    if not path.exists():
+        return
+    with open(path, "rb") as file:
+        file.readline()
+        used = bool(file.read(1))
+    if used:
+        raise InputError(
+            f"'{path}' already holds the evaluations of an optimisation; go on with it by resume=True, or "
+            "give another checkpoint folder."
+        )
+
+
+def _begin(path: Path, header: Mapping[str, Any]) -> None:
+    """Write the first line of a new log so that the file is there with the whole line, or not at all."""
+    with sentences(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(header) + "\n")
+
+
+def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
+    """Compare the first line with what is expected of it; the position of the first record [byte]."""
+    found = _read_header(file, path)
+    for key, wanted in header.items():
+        if found.get(key) != wanted:
+            former, given = _differing(_shown(found.get(key)), _shown(wanted))
+            raise InputError(
+                f"'{path}' cannot be resumed, because it was begun with {key} = {former} and "
+                f"is now given {key} = {given}; give the former, or another checkpoint folder."
+            )
+    return file.tell()
+
+
+def _read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
+    """The first line of the log."""
+    try:
+        found = parsed_json(file.readline(LONGEST_HEADER))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError(f"'{path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
+    return found
+
+
+def _shown(value: str | Sequence[Any] | None) -> str:
+    """A setting as a message shows it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _differing(former: str, given: str) -> tuple[str, str]:
+    """Of two texts made of as many parts, separated by semicolons, those that differ."""
+    formers, givens = former.split("; "), given.split("; ")
+    if len(formers) != len(givens):
+        return former, given
+    parts = [pair for pair in zip(formers, givens, strict=True) if pair[0] != pair[1]]
+    return "; ".join(one for one, _ in parts), "; ".join(other for _, other in parts)
+
+
+def _is_whole(record: bytes, index: int, size: int) -> bool:
+    """Whether these bytes are the record of that index, whole."""
+    if len(record) < size:
+        return False
+    content, (checksum,) = record[:-4], struct.unpack("<I", record[-4:])
+    return struct.unpack("<Q", content[:8])[0] == index and zlib.crc32(content) == checksum
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +372,28 @@ def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> N
             f"{name} is given for {quoted(values)}, but the optimised parameters are "
             f"{quoted(layout.names)}; give it for each of these, or one number for all."
         )
+
+
+class Iterate:
+    """A point that has been evaluated, and moves."""
+
+    def __init__(self, search: Search):
+        self._search, self.x = search, search.start
+        self.loss, self.gradient = search.evaluate(search.start)
+
+    def move(self, target: Vector) -> float:
+        """Go to a vector (size,), or, where it has no run, half of the way there, or a quarter, and so on, which is one
+        update. Returns which part of the way it was; raises the error of the last part where that has no run either."""
+        self._search.updated()
+        part, tried = 1.0, target
+        found = self._search.attempt(tried)
+        while found is None:
+            part /= 2.0
+            tried = self._search.project(self.x + part * (target - self.x))
+            found = self._search.attempt(tried) if part > 0.5**HALVINGS else self._search.evaluate(tried)
+        self.x, (self.loss, self.gradient) = tried, found
+        return part
+
+    def outcome(self, name: str) -> Outcome:
+        """That of an optimiser without a test of convergence."""
+        return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")

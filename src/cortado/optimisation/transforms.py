@@ -1,4 +1,4 @@
-"""Transforms of parameters: coordinates u of a parameter p(u) in which an optimiser may step freely.
+"""Transforms of parameters: coordinates u of a parameter p(u) in which an optimiser may step freely; fixed ones.
 
 Whatever u is, p(u) is a parameter that can be: fractions that add up to 1, a number that stays positive, a parameter
 over time that changes slowly.
@@ -245,3 +245,57 @@ def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gr
     """The derivatives with respect to coordinates, given those with respect to the parameters."""
     names = coordinates.keys() & gradient.keys()
     return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}
+
+
+class FixedParameters:
+    """A problem as a function of the other parameters alone. Ensembles vary the first positions around those that are
+    fixed."""
+
+    def __init__(self, problem: Problem, fixed: Arrays):
+        """``fixed``: parameters by name, with ``initial_positions`` (n, d) [m]."""
+        self._problem, self._fixed = problem, fixed
+        self.simulation = _Simulation(problem, fixed["initial_positions"])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return FixedParameters, (self._problem, self._fixed)
+
+    @property
+    def fingerprint(self) -> str:
+        """A text that identifies the problem; it does not tell the fixed values apart."""
+        return f"{self._problem.fingerprint}; fixed {', '.join(self._fixed)}"
+
+    def value(self, parameters: Values) -> Any:
+        """The loss, forward only."""
+        return self._problem.value(self._all(parameters))
+
+    def forward_pass(self, parameters: Values) -> ForwardPass:
+        """A forward run that estimators can go back through."""
+        return self._problem.forward_pass(self._all(parameters))
+
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return self._problem.room(estimator)
+
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        return self._problem.together([self._all(point) for point in points], estimator)
+
+    def _all(self, parameters: Values) -> Values:
+        return {**self._fixed, **parameters}
+
+
+class _Simulation:
+    """A simulation with other first positions, as ensembles look at it."""
+
+    batch = None
+
+    def __init__(self, problem: Problem, initial_positions: Any):
+        self._problem = problem
+        self.scene, self.positions = problem.simulation.scene, initial_positions
+        self.precision, self.known = problem.simulation.precision, problem.simulation.known
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Simulation, (self._problem, self.positions)

@@ -32,8 +32,8 @@ from cortado.gradients import (
 )
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
+from cortado.optimisation.optimise import MOST_ITERATIONS
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
-from cortado.optimisation.start import MOST_ITERATIONS
 from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, components, count, field_error, quantity
 from cortado.scene.parameter_values import NAMES, UNITS
 from cortado.scene.scene import Scene
