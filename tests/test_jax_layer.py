@@ -7,9 +7,22 @@ import numpy as np
 import pytest
 
 import cortado
+import layered
 from cortado import InputError, Simulation, gradients, sensors
 from cortado.optimisation.layers.layer import KEPT
-from layered import POINT, STIFF, matched, scheduled, shear, sheared
+from layered import (
+    BAD_PARAMETERS,
+    POINT,
+    STIFF,
+    assert_refused,
+    matched,
+    same_bits,
+    scheduled,
+    shear,
+    sheared,
+    uses_of_parameters,
+    uses_of_state,
+)
 from scenes import jet, plane, scene, two_layers
 
 STEP = 1e-8
@@ -61,12 +74,6 @@ def chained(layer, simulation):
 def point(jax, simulation):
     values = simulation.positions, shear(simulation), np.array([0.4, -9.0]), np.array(0.7)
     return tuple(jax.numpy.asarray(value) for value in values)
-
-
-def same_bits(one, other):
-    assert one.keys() == other.keys()
-    for name in one:
-        assert np.asarray(one[name]).tobytes() == np.asarray(other[name]).tobytes(), name
 
 
 # ---- derivatives -------------------------------------------------------------------------------------------------
@@ -485,79 +492,26 @@ def test_a_picture_has_the_derivatives_of_differences_in_reverse_mode(jax, layer
 # ---- bad uses ----------------------------------------------------------------------------------------------------
 
 
-def without(table, name):
-    return {key: value for key, value in table.items() if key != name}
-
-
 BAD_STATES = {
-    "no table": (lambda s: 3.0, "state is 3.0, but must be given by name"),
-    "left out": (lambda s: None, "state is left out, but must have positions"),
-    "without a field": (lambda s: without(s, "velocities"), "state has .*, but must have positions, velocities"),
-    "without its time": (lambda s: without(s, "time"), "state has .*, but must have .* time"),
-    "another field": (lambda s: {**s, "colour": s["time"]}, "state has .*colour.*, but must have positions"),
-    "another shape": (lambda s: {**s, "positions": s["positions"][1:]}, r"state positions has shape \(63, 2\), but"),
-    "transposed": (lambda s: {**s, "velocities": s["velocities"].T}, r"state velocities has shape \(2, 64\), but"),
+    **layered.BAD_STATES,
     "float32": (lambda s: {**s, "positions": s["positions"].astype("float32")}, "state positions is float32, but"),
-    "complex": (lambda s: {**s, "positions": s["positions"] + 0j}, "state positions is an array of complex128, but"),
-    "truth values": (lambda s: {**s, "positions": s["positions"] > 0}, "state positions is an array of bool, but"),
-    "text": (lambda s: {**s, "positions": "here"}, "state positions is 'here', but must be a number or an array"),
-    "nothing": (lambda s: {**s, "positions": None}, "state positions is None, but must be a number or an array"),
-    "NaN": (lambda s: {**s, "positions": s["positions"] * np.nan}, "state positions has a value that is not finite"),
-    "infinite": (lambda s: {**s, "velocities": s["velocities"] + np.inf}, "state velocities has a value that is not"),
-    "huge": (lambda s: {**s, "velocities": s["velocities"] + 1e60}, "state velocities has a value of size 1e"),
-    "a negative time": (lambda s: {**s, "time": s["time"] - 1.0}, "state clock is at -1.0 s, but must be"),
-    "NaN as time": (lambda s: {**s, "time": s["time"] * np.nan}, "state clock is at nan s, but must be"),
-    "another fluid": (lambda s: {**s, "reference_density": 2.0 * s["reference_density"]}, "state reference_density is"),
-    "outside": (lambda s: {**s, "positions": s["positions"] + 5.0}, "outside the container"),
-    "another spacing": (lambda s: {**s, "positions": 0.5 * s["positions"]}, "spacings of 0.05 m from the nearest"),
     "at one place": (
         lambda s: {**s, "positions": s["positions"].at[3].set(s["positions"][5])},
         "particles 3 and 5 at one place",
     ),
-}
-BAD_PARAMETERS = {
-    "no table": (lambda: [1.0], r"parameters is \[1.0\], but must be given by name"),
-    "unknown": (lambda: {"gravty": np.zeros(2)}, "parameter 'gravty' is unknown, but must be one of"),
-    "of another scene": (lambda: {"surface_tension": 1.0}, "parameter surface_tension is given, but must be left out"),
-    "another shape": (lambda: {"gravity": np.zeros(3)}, r"parameter gravity has shape \(3,\), but must be \(2,\)"),
-    "another number of steps": (lambda: {"gravity": np.zeros((4, 2))}, r"parameter gravity has shape \(4, 2\), but"),
-    "first values": (lambda: {"initial_velocities": np.zeros((64, 2))}, "must be left out with a state"),
-    "negative": (lambda: {"viscosity": -1.0}, "parameter viscosity is -1.0, but must be at least 0"),
-    "NaN": (lambda: {"viscosity": np.nan}, "parameter viscosity has a value that is not finite"),
-    "text": (lambda: {"viscosity": "thick"}, "parameter viscosity is 'thick', but must be a number"),
-    "complex": (lambda: {"viscosity": 1j}, "parameter viscosity is 1j, but must be a number"),
-    "nothing": (lambda: {"viscosity": None}, "parameter viscosity is None, but must be a number"),
-    "both": (lambda: {"tilt": [3.0], "gravity": [0.0, 1.0]}, "gravity is given, but must be left out, as tilt is"),
 }
 
 
 @pytest.mark.parametrize("name", BAD_STATES)
 def test_a_bad_state_is_refused_in_a_sentence(layer, simulation, problem, name):
     change, words = BAD_STATES[name]
-    bad = change(layer.state(simulation))
-    for use in (
-        lambda: layer.step(simulation, bad, steps=2),
-        lambda: layer.rollout(simulation, bad, steps=2),
-        lambda: layer.measure(simulation, "density")(bad),
-        *([] if bad is None else [lambda: layer.value(problem)({}, bad)]),
-    ):
-        with pytest.raises(InputError, match=words) as caught:
-            use()
-        assert "\n" not in str(caught.value)
+    assert_refused(words, *uses_of_state(layer, simulation, problem, change(layer.state(simulation))))
 
 
 @pytest.mark.parametrize("name", BAD_PARAMETERS)
 def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, name):
     make, words = BAD_PARAMETERS[name]
-    state = layer.state(simulation)
-    for use in (
-        lambda: layer.step(simulation, state, make(), steps=2),
-        lambda: layer.value(problem)(make(), state),
-        *([] if name == "first values" else [lambda: layer.value(problem)(make())]),
-    ):
-        with pytest.raises(InputError, match=words) as caught:
-            use()
-        assert "\n" not in str(caught.value)
+    assert_refused(words, *uses_of_parameters(layer, simulation, problem, make))
 
 
 def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, problem):
@@ -596,9 +550,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.restart_state(simulation, other), "state positions has shape"),
         (lambda: layer.state(simulation, "last"), "state is 'last', but must be a RestartState"),
     ]:
-        with pytest.raises(InputError, match=words) as caught:
-            use()
-        assert "\n" not in str(caught.value)
+        assert_refused(words, use)
 
 
 def test_second_derivatives_are_refused_in_a_sentence(jax, layer, problem):
