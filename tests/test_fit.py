@@ -172,6 +172,19 @@ def experiment(simulation):
     return found.measured_again(found.predicted({"viscosity": TRUE, **found.start}))
 
 
+def assert_slopes(experiment, at, directions, h):
+    """The derivatives along directions are those of differences over a step, and are given with what is predicted."""
+    predicted, slopes = experiment.linearised(at, directions)
+    for k, direction in enumerate(directions):
+        ends = [
+            experiment.predicted({n: v + way * h * direction.get(n, 0.0) for n, v in at.items()}) for way in (1.0, -1.0)
+        ]
+        for name, slope in slopes.items():
+            difference = (ends[0][name] - ends[1][name]) / (2.0 * h)
+            assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
+    assert all(np.array_equal(predicted[name], one) for name, one in experiment.predicted(at).items())
+
+
 def test_the_jacobian_is_the_limit_of_differences(experiment):
     at = {"viscosity": np.array(TRUE), "gravity": np.array([0.3, -9.0]), **experiment.start}
     at["camera.translation"] = np.array([1e-3, 2e-3, 0.0])  # else pixels look exactly along the faces between cells
@@ -181,16 +194,7 @@ def test_the_jacobian_is_the_limit_of_differences(experiment):
         {"camera.width": np.array(0.1)},
         {"camera.translation": np.array([0.01, 0.02, 0.0])},
     ]
-    predicted, slopes = experiment.linearised(at, directions)
-    for k, direction in enumerate(directions):
-        ends = [
-            experiment.predicted({n: v + way * 1e-4 * direction.get(n, 0.0) for n, v in at.items()})
-            for way in (1.0, -1.0)
-        ]
-        for name, slope in slopes.items():
-            difference = (ends[0][name] - ends[1][name]) / 2e-4
-            assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
-    assert all(np.array_equal(predicted[name], one) for name, one in experiment.predicted(at).items())
+    assert_slopes(experiment, at, directions, 1e-4)
 
 
 def test_viscosity_acts_as_in_a_run_with_the_value_that_is_tried():
@@ -231,14 +235,7 @@ def clocked(simulation):
 def test_the_derivative_along_a_clock_is_that_of_time(clocked):
     at = {"viscosity": np.array(TRUE), "tracers.start": np.array(0.0013), "gauge.start": np.array(-0.0007)}
     along = [{"tracers.start": np.array(1.0)}, {"gauge.start": np.array(1.0), "viscosity": np.array(0.3)}]
-    _, slopes = clocked.linearised(at, along)
-    for k, direction in enumerate(along):
-        ends = [
-            clocked.predicted({n: v + way * 1e-5 * direction.get(n, 0.0) for n, v in at.items()}) for way in (1.0, -1.0)
-        ]
-        for name, slope in slopes.items():
-            difference = (ends[0][name] - ends[1][name]) / 2e-5
-            assert np.linalg.norm(difference - slope[..., k]) <= 1e-5 * np.linalg.norm(slope[..., k]), (name, direction)
+    assert_slopes(clocked, at, along, 1e-5)
 
 
 @pytest.mark.parametrize("late", [0.011, -0.008])

@@ -27,6 +27,7 @@ VIEWS: dict[str, View] = {
     "perspective": Volume(Perspective(OUTSIDE, MIDDLE, (0.1, 1, 0), 40.0, resolution=RESOLUTION), 9.0),
     "within": Volume(Perspective(INSIDE, MIDDLE, (0, 1, 0), 100.0, resolution=RESOLUTION, far=0.6), 9.0),
 }
+CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 views = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
 
@@ -380,25 +381,22 @@ def test_same_bits_twice(view):
     assert bits() == bits()
 
 
+@pytest.mark.parametrize(
+    ("options", "precision", "device", "most"),
+    [
+        ({"precision": FLOAT32}, FLOAT32, "cpu", (1e-5, 1e-4)),
+        pytest.param({"device": "cuda:0"}, FLOAT64, "cuda:0", (1e-12, 1e-10), marks=CUDA),
+    ],
+    ids=["float32", "cuda"],
+)
 @views
-def test_single_precision(view):
+def test_single_precision_and_the_gpu_agree(view, options, precision, device, most):
     values = scene()
-    made, single = renderer(view), renderer(view, precision=FLOAT32)
-    np.testing.assert_allclose(picture(single, values, FLOAT32), picture(made, values), rtol=0, atol=1e-5)
-    wanted = gradient(made.adjoint(weights(made)))
-    for name, found in gradient(single.adjoint(weights(made))).items():
-        assert np.linalg.norm(found - wanted[name]) < 1e-4 * np.linalg.norm(wanted[name]), name
-
-
-@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
-@views
-def test_the_gpu_agrees(view):
-    values = scene()
-    made, other = renderer(view), renderer(view, device="cuda:0")
-    np.testing.assert_allclose(picture(other, values, device="cuda:0"), picture(made, values), rtol=0, atol=1e-12)
+    made, other = renderer(view), renderer(view, **options)
+    np.testing.assert_allclose(picture(other, values, precision, device), picture(made, values), rtol=0, atol=most[0])
     wanted = gradient(made.adjoint(weights(made)))
     for name, found in gradient(other.adjoint(weights(made))).items():
-        assert np.linalg.norm(found - wanted[name]) < 1e-10 * np.linalg.norm(wanted[name]), name
+        assert np.linalg.norm(found - wanted[name]) < most[1] * np.linalg.norm(wanted[name]), name
 
 
 def test_a_renderer_keeps_what_the_way_back_needs():

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import itertools
 import json
 import os
 import re
@@ -237,10 +236,9 @@ def test_what_killed_processes_left_unfinished_is_removed(tmp_path):
 
 def test_unwritable_places_are_sentences(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        new_run(tmp_path / "file")
-    with pytest.raises(InputError, match="cannot be written"):
-        new_run(tmp_path / "file" / "below")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match="cannot be written"):
+            new_run(place)
 
 
 def test_report_is_one_self_contained_escaped_page(tmp_path):
@@ -312,24 +310,23 @@ def test_progress_on_a_file_is_a_line_now_and_then():
     assert chatty.getvalue() == "run 1/4, loss 0.1235\nrun 4/4, 0:00:00 left\n"
 
 
-def test_no_time_is_told_after_more_than_was_expected(monkeypatch):
-    """As of an optimiser that evaluates more than once an iteration."""
-    seconds, chatty = itertools.count(0.0, 30.0), io.StringIO()
-    monkeypatch.setattr("time.monotonic", lambda: next(seconds))
-    with track(2, "optimise", stream=chatty, interval=0.0) as advance:
+@pytest.mark.parametrize(
+    ("times", "number", "lines"),
+    [
+        (range(0, 120, 30), 2, ["run 1/2", "run 2/2, 0:00:00 left", "run 3"]),
+        ([0.0, 60.0, 61.0, 62.0], 10, ["run 1/10", "run 2/10, 0:00:08 left", "run 3/10, 0:00:07 left"]),
+    ],
+    ids=["more than was expected", "compiling"],
+)
+def test_the_time_left_is_that_of_what_is_left(monkeypatch, times, number, lines):
+    """None is told after more than was expected, as of an optimiser that evaluates more than once an iteration; and
+    compiling, which the first step waits for, is not counted."""
+    seconds, chatty = iter(times), io.StringIO()
+    monkeypatch.setattr("time.monotonic", lambda: float(next(seconds)))
+    with track(number, "run", stream=chatty, interval=0.0) as advance:
         for _ in range(3):
             advance()
-    assert chatty.getvalue().splitlines() == ["optimise 1/2", "optimise 2/2, 0:00:00 left", "optimise 3"]
-
-
-def test_the_time_left_counts_no_compiling(monkeypatch):
-    """Which the first step waits for: 60 s, and then a second for each step."""
-    seconds, chatty = iter([0.0, 60.0, 61.0, 62.0]), io.StringIO()
-    monkeypatch.setattr("time.monotonic", lambda: next(seconds))
-    with track(10, "run", stream=chatty, interval=0.0) as advance:
-        for _ in range(3):
-            advance()
-    assert chatty.getvalue().splitlines() == ["run 1/10", "run 2/10, 0:00:08 left", "run 3/10, 0:00:07 left"]
+    assert chatty.getvalue().splitlines() == lines
 
 
 def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):

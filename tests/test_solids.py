@@ -298,14 +298,16 @@ def test_two_solids_of_one_name_are_refused():
         scene([{**PILLAR, "name": "a"}, {**DISC, "name": "a"}])
 
 
-def test_a_solid_that_leaves_no_room_for_a_fluid_is_said():
-    with pytest.raises(InputError, match=r"fluid.0 has no particle"):
-        discretise(scene([{"shape": "box", "lower": [-0.1, -0.1], "upper": [0.8, 0.8]}]))
-
-
-def test_a_solid_out_of_reach_is_said():
-    with pytest.raises(InputError, match="solid 'solid 0' has no surface that fluid"):
-        discretise(scene([{"shape": "sphere", "centre": [5.0, 5.0], "radius": 0.2}]))
+@pytest.mark.parametrize(
+    ("solid", "words"),
+    [
+        ({"shape": "box", "lower": [-0.1, -0.1], "upper": [0.8, 0.8]}, r"fluid.0 has no particle"),
+        ({"shape": "sphere", "centre": [5.0, 5.0], "radius": 0.2}, "solid 'solid 0' has no surface that fluid"),
+    ],
+)
+def test_a_solid_that_leaves_no_room_or_is_out_of_reach_is_said(solid, words):
+    with pytest.raises(InputError, match=words):
+        discretise(scene([solid]))
 
 
 def test_positions_in_a_solid_are_refused():

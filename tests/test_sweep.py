@@ -95,9 +95,17 @@ def test_values_that_go_together_are_no_product():
         ([], ["a=1", "a=2"], "--zip gives a twice"),
         ([], ["a"], "--zip is 'a', but must have the form"),
         ([f"a={','.join(map(str, range(400)))}"], [f"b={','.join(map(str, range(400)))}"], "makes 160,000"),
+        ([], [], "--set is missing"),
+        (["a"], [], "--set is 'a', but must have the form key=value,value"),
+        (["a="], [], "--set is 'a='"),
+        (["=1"], [], "--set is '=1'"),
+        (["a=1,,2"], [], "--set is 'a=1,,2'"),
+        (["a=1,2", "a=3"], [], "--set gives a twice"),
+        (["a=1,2,1"], [], "must give each value of a once"),
+        ([f"{key}={','.join(map(str, range(100)))}" for key in "abc"], [], "makes 1,000,000 combinations"),
     ],
 )
-def test_values_that_do_not_go_together_are_a_sentence(options, zipped, words):
+def test_values_that_make_no_combinations_are_a_sentence(options, zipped, words):
     with pytest.raises(InputError) as caught:
         combinations(options, zipped)
     assert_one_sentence(str(caught.value))
@@ -118,26 +126,6 @@ def test_folders_have_names_of_their_own_that_say_what_is_in_them():
     assert len(long) < 140 and len({strange, other, long}) == 3
     assert combinations(["a=../../b"])[0].name.count("/") == 0
     assert combinations(["a=2,[1, 2]"])[1].name == strange, "whatever else is swept"
-
-
-@pytest.mark.parametrize(
-    "options, words",
-    [
-        ([], "--set is missing"),
-        (["a"], "--set is 'a', but must have the form key=value,value"),
-        (["a="], "--set is 'a='"),
-        (["=1"], "--set is '=1'"),
-        (["a=1,,2"], "--set is 'a=1,,2'"),
-        (["a=1,2", "a=3"], "--set gives a twice"),
-        (["a=1,2,1"], "must give each value of a once"),
-        ([f"{key}={','.join(map(str, range(100)))}" for key in "abc"], "makes 1,000,000 combinations"),
-    ],
-)
-def test_options_that_make_no_combinations_are_a_sentence(options, words):
-    with pytest.raises(InputError) as caught:
-        combinations(options)
-    assert_one_sentence(str(caught.value))
-    assert words in str(caught.value)
 
 
 def test_what_sensors_read_is_in_the_table(sweep):
@@ -270,19 +258,30 @@ def test_a_worker_that_does_not_see_the_folder_says_so(folder):
         member(combinations(["problem.steps=4"])[0])
 
 
+SIZE = ["scene.toml", "--set", "solver.time_step=0.001"]
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
         (["task.toml"], "--set is missing"),
         (["task.toml", *RATES, "--steps", "5"], "--steps is given, but must be left out"),
         (["task.toml", "--set", "optimise.learning_rate=0.5,-1"], "optimise.learning_rate is -1"),
-        (["scene.toml", "--set", "solver.time_step=0.001", "--steps", "0"], "steps is 0"),
+        ([*SIZE, "--steps", "0"], "steps is 0"),
         (["scene.toml", "--set", "solver.time_stop=0.001,0.002"], "solver.time_stop"),
         (["task.toml", *RATES, "--workers", "0"], "--workers is 0"),
         (["task.toml", *RATES, "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler and --workers"),
         (["task.toml", *RATES, "--scheduler", "tcp://127.0.0.1:1"], "There is no scheduler at 'tcp://127.0.0.1:1'"),
         (["task.toml", *RATES, "--scheduler", "nowhere"], "There is no scheduler at 'nowhere'"),
         (["nothing.toml", *RATES], "nothing.toml"),
+        ([*SIZE, "--steps", "3", "--time", "0.1"], "--time is given, but must"),
+        ([*SIZE, "--time", "0"], "--time is 0, but must be a number of sec"),
+        ([*SIZE, "--time", "inf"], "--time is inf, but must be a number of"),
+        (["task.toml", *RATES, "--time", "0.1"], "--time is given, but must be left out, as the task says"),
+        (["task.toml", *RATES, "--fps", "10"], "--fps is given, but must be left out of a sweep of a task."),
+        ([*SIZE, "--fps", "-1"], "--fps is -1, but must be a number of frames"),
+        ([*SIZE, "--fps", "1", "--record-every", "2"], "--fps is given, but"),
+        ([*SIZE, "--record-every", "0"], "--record-every is 0, but must be"),
     ],
 )
 def test_wrong_arguments_are_refused(sweep, folder, monkeypatch, arguments, words):
@@ -392,27 +391,3 @@ def test_times_that_cannot_be_the_same_are_said(sweep):
     code, _, err = sweep("scene.toml", "--set", "solver.time_step=0.001,0.0015", "--steps", 4, "--out", "runs")
     assert code == 0
     assert err.startswith("Warning: not all combinations end at 0.004 s") and "0.0015 ends at 0.0045 s" in err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (
-            ["scene.toml", "--set", "solver.time_step=0.001", "--steps", "3", "--time", "0.1"],
-            "--time is given, but must",
-        ),
-        (["scene.toml", "--set", "solver.time_step=0.001", "--time", "0"], "--time is 0, but must be a number of sec"),
-        (["scene.toml", "--set", "solver.time_step=0.001", "--time", "inf"], "--time is inf, but must be a number of"),
-        (["task.toml", *RATES, "--time", "0.1"], "--time is given, but must be left out, as the task says"),
-        (["task.toml", *RATES, "--fps", "10"], "--fps is given, but must be left out of a sweep of a task."),
-        (
-            ["scene.toml", "--set", "solver.time_step=0.001", "--fps", "-1"],
-            "--fps is -1, but must be a number of frames",
-        ),
-        (["scene.toml", "--set", "solver.time_step=0.001", "--fps", "1", "--record-every", "2"], "--fps is given, but"),
-        (["scene.toml", "--set", "solver.time_step=0.001", "--record-every", "0"], "--record-every is 0, but must be"),
-    ],
-)
-def test_a_time_that_cannot_be_is_refused(sweep, arguments, words):
-    code, out, err = sweep(*arguments, "--out", "runs")
-    assert (code, out) == (2, "") and words in err
