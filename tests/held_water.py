@@ -9,8 +9,7 @@ import trimesh
 
 from cortado import Scene, Simulation
 from cortado.scene.fields import rotation_matrix
-from cortado.scene.solid_shapes import BoxSolid, CupSolid, MeshSolid
-from cortado.scene.solids import SolidTable
+from cortado.scene.solids import BoxSolid, CupSolid, MeshSolid, SolidTable
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
 GRAVITY = 9.81

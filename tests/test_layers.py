@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import cortado
-from cortado.on_top import FUNCTIONS, on_top
+from cortado.lazy import FUNCTIONS, on_top
 from module_graph import all_before, loaded_before, sources
 
 ROOT = Path(cortado.__file__).parent

@@ -9,15 +9,15 @@ from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.solid_shapes import (
+from cortado.scene.solids import (
     BoxSolid,
     CapsuleSolid,
     CupSolid,
     CylinderSolid,
     PolygonSolid,
     SphereSolid,
+    solids_of,
 )
-from cortado.scene.solids import solids_of
 from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
 

@@ -1,4 +1,8 @@
-"""Names of a package that are imported when they are first used, so that the package itself is quick to import."""
+"""Names that are imported when they are first used, so that packages are quick to import, and of packages on top.
+
+The core imports none of the packages that lie on top of it, which do pictures, films, exports, and pages for notebooks.
+A method such as `Trajectory.film` asks for a function by its name, and only then the package is imported that has it.
+"""
 
 import importlib
 
@@ -26,3 +30,24 @@ def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return found
+
+
+FUNCTIONS = {
+    "export": "pictures.exports.formats",
+    "film_page": "pictures.notebook",
+    "fit_page": "optimisation.fitting.figures",
+    "labelled": "pictures.exports.formats",
+    "result_page": "pictures.notebook",
+    "simulation_film": "pictures.run_pictures",
+    "simulation_page": "pictures.notebook",
+    "simulation_picture": "pictures.run_pictures",
+    "trajectory_film": "pictures.run_pictures",
+    "trajectory_page": "pictures.notebook",
+    "trajectory_picture": "pictures.run_pictures",
+}
+"""The modules that have them, within `cortado`."""
+
+
+def on_top(name: str) -> "Any":
+    """The function of that name, one of `FUNCTIONS`."""
+    return getattr(importlib.import_module(f"cortado.{FUNCTIONS[name]}"), name)

@@ -1,39 +1,159 @@
-"""Parameters in, loss out; loss and gradient; and the derivative along a direction."""
+"""Parameters in, loss out; loss and gradient; and the derivative along a direction.
+
+`ProblemForwardPass` is a run that can be gone back through. The fingerprint tells which problem a search is of, so that
+it is not resumed with another one.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
-from cortado.calls import public
+from cortado.calls import Staying, fixed, public
+from cortado.code_words import code_words
+from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import DivergedError, InputError, warn
-from cortado.fingerprint import fingerprint_of
-from cortado.fixed import fixed
-from cortado.forward_pass import ProblemForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
-from cortado.losses import Frames, Loss, Snapshot, SnapshotBatch
-from cortado.losses.loss import moment_of
+from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch
+from cortado.losses import fingerprint as loss_fingerprint
+from cortado.losses.loss import StepBar, moment_of
 from cortado.losses.run_losses import LossesByStep, derivative_along
-from cortado.particles.state import State
+from cortado.particles.state import Parameters, State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
+from cortado.rollout.device_states import OfLost, without_lost
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
 from cortado.rollout.run_checks import one_for_each
-from cortado.runs.quantities.moment import Moment, row_of
+from cortado.runs.quantities.moment import Moment, add_to_row, row_of
 from cortado.runs.sensors.placement import warn_of_places
 from cortado.runs.trajectory import noted
 from cortado.scene.parameter_values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
+from cortado.sph.free_energy import FREE_ENERGIES
+from cortado.sph.makers import fingerprint as parts_fingerprint
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 KEPT = 2
 """Batches of a problem, of different sizes, that are kept for the next evaluation."""
+
+
+@dataclass(frozen=True)
+class ProblemForwardPass(Staying):
+    """A forward run of a problem with its loss, and the ways back through it."""
+
+    loss: Any
+    """Of a batch (batch,)."""
+    instead = "but the problem can, and the parameters, with which it is run again"
+    _residual: Residual
+    _values: Arrays
+    _bars: Mapping[int, SnapshotAdjoint]
+    _space: ParameterSpace
+    _derivatives: dict[AdjointEstimator, BackwardStep]
+
+    @property
+    def rollout(self) -> Rollout:
+        """The run."""
+        return self._residual.rollout
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the rollout."""
+        return self.rollout.turn
+
+    def _derivative(self, estimator: AdjointEstimator) -> BackwardStep:
+        """The estimator's backward step, made once for each problem."""
+        if self.rollout.solver.layout.batch is not None and not estimator.batches:
+            raise InputError(
+                f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
+                "each scene by itself."
+            )
+        try:
+            is_new = estimator not in self._derivatives
+        except TypeError as error:
+            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
+        if is_new:
+            solver = self.rollout.solver
+            parts = solver.gradient_memory(self.rollout.log)
+            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
+            self._derivatives[estimator] = estimator.derivative(self.rollout)
+        return self._derivatives[estimator]
+
+    @in_turn
+    def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
+        """The gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the last
+        to the first.
+
+        Other evaluations of the problem may be in between: the bits are the same. Raises `InputError` for an estimator
+        whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
+        scenes of a batch.
+        """
+        derivative = self._derivative(estimator)
+        return self._gradient(derivative, self._first_adjoint(derivative, observe))
+
+    @in_turn
+    def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
+        """As `back`, and the derivatives with respect to the fields of the first state, by name, and to its
+        ``time``."""
+        derivative = self._derivative(estimator)
+        first = self._first_adjoint(derivative)
+        initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
+        return self._gradient(derivative, first), without_lost(self._lost, initial_state)
+
+    @property
+    def _lost(self) -> OfLost:
+        """Their losses have no numbers, and so no derivatives."""
+        return dict.fromkeys(self.rollout.lost, np.nan)
+
+    def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
+        self._residual.bring_back()
+        first = self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+        for own in (bar.step for bar in self._bars.values()):
+            if own is not None:
+                self._add(own, derivative.parameters())
+        return first
+
+    def _add(self, own: StepBar, total: Parameters) -> None:
+        """Add adjoints of the parameters of one step to those of all steps."""
+        for name, bar in own.parameters.items():
+            whole = total[name].numpy()
+            add_to_row(self.rollout, name, bar, own.row, whole)
+            total[name].assign(whole)
+
+    def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
+        bars, values = self._bars, self._values
+        gradient = self._space.gradient(self.rollout, values, first, derivative.parameters())
+        if "colours" in values:
+            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
+        gradient = without_lost(self._lost, gradient)
+        return {name: gradient[name] for name in values}
+
+
+def _fingerprint(simulation: Simulation, steps: int, loss: Any, states: Sequence[RestartState]) -> str:
+    """A text of the parts of a problem that its values follow from; see `Problem.fingerprint`."""
+    energy = simulation.free_energy
+    parts = {
+        "scene": simulation.scene.computed_json().encode(),
+        "first positions": simulation.positions.tobytes(),
+        "target and loss": loss_fingerprint(loss).encode(),
+    }
+    checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
+    for state in states:
+        fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
+        clock = repr(state.clock) + (f" {state.clock.time_step!r}" if state.clock.time_step else "")
+        checksums.append(f"state {sha256(fields + clock.encode()).hexdigest()[:16]}")
+    code = "" if energy in FREE_ENERGIES.values() else f" {code_words(energy.functions)}"
+    energies = f"free energy {energy.name} {energy.curvature}{code}"
+    own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
+    told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
+    return "; ".join([f"{steps} steps", simulation.precision.name, *checksums, energies, *told])
 
 
 @public
@@ -269,7 +389,7 @@ class Problem:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
         may be in a file), free energy (by its name, curvature and code), forces and solver of one's own,
         ``fingerprint`` of the loss, or the code of a function; for any other loss only its type is known."""
-        return fingerprint_of(self.simulation, self.steps, self.loss, self._states)
+        return _fingerprint(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""

@@ -12,7 +12,7 @@ from weakref import WeakSet
 import numpy as np
 
 from cortado.arrays import whole_number
-from cortado.calls import public
+from cortado.calls import fixed, public
 from cortado.device.lanes import checked_lanes
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
@@ -21,8 +21,7 @@ from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.calibration import circulation_factor
 from cortado.errors import InputError, shown, unwarned, warn
 from cortado.files.image_encoding import ShadedPicture
-from cortado.fixed import fixed
-from cortado.on_top import on_top
+from cortado.lazy import on_top
 from cortado.particles.state import State
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer

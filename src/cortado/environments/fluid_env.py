@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import require_table, whole_number
+from cortado.calls import Staying
 from cortado.environments.catalogue import task_of
 from cortado.environments.scenes import SEEN, Scenes, Start
 from cortado.environments.task import Task, checked_actions
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, LibraryMissingError, shown
 from cortado.files.image_encoding import to_srgb
-from cortado.fixed import Staying
 from cortado.runs.sensors.sensor import Sensor
 from cortado.runs.trajectory import Frame
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import read_only, require_methods
+from cortado.calls import fixed
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
@@ -15,7 +16,6 @@ from cortado.device.reduction import TreeReduction, sum_of
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.files.image_encoding import LIGHT, check_light
-from cortado.fixed import fixed
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Adjoint, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.particles.state import State, to_device

@@ -8,11 +8,11 @@ from typing import Any, Protocol, overload, runtime_checkable
 import numpy as np
 
 from cortado.arrays import is_whole
+from cortado.calls import FixedDict, fixed
 from cortado.code_words import code_words
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import add
 from cortado.errors import InputError, shown
-from cortado.fixed import FixedDict, fixed
 from cortado.particles.state import State
 from cortado.runs.quantities.moment import Moment
 from cortado.scene.containers import Container

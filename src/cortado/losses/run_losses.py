@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number, require_arguments
+from cortado.calls import fixed
 from cortado.code_words import code_words
 from cortado.device.threads import WARP
 from cortado.errors import InputError
-from cortado.fixed import fixed
 from cortado.losses.loss import (
     ADJOINT_FIELDS,
     Adjoint,

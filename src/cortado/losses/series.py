@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number, read_only, whole_number
+from cortado.calls import fixed
 from cortado.errors import InputError
-from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Frames, Snapshot
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 

@@ -28,7 +28,7 @@ from cortado.executors import Executor, InProcess, OnResult, checked_executor
 from cortado.files.input_files import as_path
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_estimator, evaluated, without_runs
-from cortado.on_top import on_top
+from cortado.lazy import on_top
 from cortado.optimisation.evaluator import Evaluator, Optimisable, Parameters, Record, as_given
 from cortado.optimisation.optimisers import as_optimiser
 from cortado.optimisation.search import Log, MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
-from cortado.calls import face
+from cortado.calls import face, keep_own
 from cortado.device.memory import require
 from cortado.errors import InputError, shown
-from cortado.fixed import keep_own
 from cortado.optimisation.search import (
     Iterate,
     Optimiser,

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.special import softmax
 
 from cortado.arrays import as_numbers, read_only, require_methods, require_table, require_whole
+from cortado.calls import FixedDict, fixed
 from cortado.errors import DivergedError, InputError
-from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.problem import Problem
 from cortado.rollout.rollout import Observer

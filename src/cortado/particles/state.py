@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
+from cortado.calls import Staying
 from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction, sum_of
-from cortado.fixed import Staying
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameter_values import REGISTRY, Known, argument
 from cortado.scene.parameters import Axis

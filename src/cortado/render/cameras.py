@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number, is_whole
-from cortado.calls import public
+from cortado.calls import keep_own, public
 from cortado.errors import InputError, shown
-from cortado.fixed import keep_own
 
 Vector = tuple[float, ...]
 

@@ -8,13 +8,12 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
-from cortado.calls import public
+from cortado.calls import fixed, public
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
 from cortado.device.warp_start import start_warp
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
-from cortado.fixed import fixed
 from cortado.particles.state import padded
 from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import positive, vector

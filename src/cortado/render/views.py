@@ -11,9 +11,8 @@ from typing import Protocol
 import numpy as np
 
 from cortado.arrays import is_whole
-from cortado.calls import public
+from cortado.calls import keep_own, public
 from cortado.errors import InputError, shown
-from cortado.fixed import keep_own
 from cortado.render.cameras import Camera, Orthographic, Perspective, Vector, check_resolution, positive, vector
 
 WHITE = (1.0, 1.0, 1.0)

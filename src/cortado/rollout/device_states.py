@@ -11,11 +11,11 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
+from cortado.calls import FixedDict
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.fixed import FixedDict
 from cortado.particles.fields import Entry
 from cortado.particles.state import Parameters, State, components
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace

@@ -14,13 +14,13 @@ from weakref import WeakSet
 import numpy as np
 import warp as wp
 
+from cortado.calls import Staying
 from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph
 from cortado.device.memory import require, step_parts, within
 from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
-from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
 from cortado.rollout.step_sizes import StepSizes

@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import check_steps
+from cortado.calls import Staying
 from cortado.device.memory import require
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError, shown, warn
-from cortado.fixed import Staying
 from cortado.particles.state import Parameters, State
 from cortado.rollout.device_states import (
     DeviceRows,

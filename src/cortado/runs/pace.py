@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import warn
-from cortado.on_top import on_top
+from cortado.lazy import on_top
 from cortado.scene.appearance import Picture
 from cortado.words import counted
 

@@ -17,7 +17,7 @@ from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
 from cortado.files.image_encoding import ShadedPicture
 from cortado.files.input_files import as_path
-from cortado.on_top import on_top
+from cortado.lazy import on_top
 from cortado.runs.frame_file import FRACTION, Marks, append_frame, fraction_names, frame_writer
 from cortado.runs.pace import Film
 from cortado.runs.sensors.readings import Readings

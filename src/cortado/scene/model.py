@@ -32,8 +32,7 @@ from cortado.scene.fluids import AnyFluid, turned
 from cortado.scene.motions import Schedule
 from cortado.scene.packages import AnyForces
 from cortado.scene.parameters import PARAMETERS
-from cortado.scene.solid_shapes import AnySolid
-from cortado.scene.solids import solids_of
+from cortado.scene.solids import AnySolid, solids_of
 from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.tables import Table
 

@@ -1,4 +1,4 @@
-"""Solids, which fluid flows around or is held by: what all have, whatever their shape."""
+"""Solids, which fluid flows around or is held by: what all have, and the shapes that they may have."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -8,11 +8,15 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
 
+from cortado.arrays import unit
+from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
+from cortado.scene.common_shapes import INDEX_OF_AXIS, BoxShape, CylinderShape, MeshShape, PolygonShape, SphereShape
 from cortado.scene.containers import Container
 from cortado.scene.fields import (
     MISSING,
@@ -23,6 +27,7 @@ from cortado.scene.fields import (
     Rotation,
     Text,
     Turning,
+    Vector,
     check_turn,
     field_error,
     quantity,
@@ -234,3 +239,185 @@ def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
     if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
         found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
         raise field_error(path, found, f"at least {of}, {least:g} m, thick")
+
+
+ALONG = 1e-9
+"""Component of a normal along a period, of one that is none."""
+
+
+class PlaneSolid(SolidTable):
+    """All that is behind a plane, such as a slope or a wall, at rest; fluid is on the side that `normal` points to. It
+    has no end, and so needs a container, which it cuts."""
+
+    shape: Literal["plane"] = "plane"
+    position: Vector[Length]
+    """(d,) A point of the plane [m]."""
+    normal: Vector[Annotated[float, quantity()]]
+    """(d,) Away from it into the fluid, of any length."""
+    _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        turned = super().in_dimension(dimension, path)
+        if not any(self.normal):
+            raise field_error((*path, "normal"), self.normal, "a vector that is not 0")
+        if self.side == "inside":
+            raise field_error((*path, "side"), self.side, '"outside": fluid is where the normal of a plane points')
+        if self.rotation is not None:
+            raise field_error((*path, "rotation"), self.rotation, "left out, as normal says how a plane is turned")
+        for name, value in (("motion", self.motion), ("surface_velocity", self.surface_velocity)):
+            if value not in ("fixed", None):
+                raise field_error((*path, name), value, 'left out, as a plane is at rest; a "box" may move')
+        return turned
+
+    def in_container(self, container: Container, path: FieldPath) -> Self:
+        ends, dimension = container.extent(), len(self.position)
+        if ends is None:
+            wanted = "another one in a scene without a container, as a plane has no end: give it a [container] to cut"
+            raise field_error((*path, "shape"), self.shape, f'{wanted}, or take a "box"')
+        along = (container.periods(dimension)[1] > 0.0) & (np.abs(self._unit()) > ALONG)
+        if along.any():
+            where = f"0 along axis {int(np.argmax(along))}, where the container is periodic"
+            raise field_error((*path, "normal"), self.normal, f"{where} and the plane would not meet itself")
+        corners = np.where(self._unit() > 0.0, *ends) - np.array(self.position)
+        if corners @ self._unit() >= 0.0:
+            found = Words("outside of the container, all of which is in front of it")
+            raise field_error((*path, "position"), found, "such that the plane cuts the container")
+        bounded = self.model_copy()
+        object.__setattr__(bounded, "__pydantic_private__", {"_ends": tuple(map(tuple, np.array(ends).tolist()))})
+        return bounded
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        position, unit = np.array(self.position), self._unit()
+        lower, upper = np.array(self._ends or (position - 1.0, position + 1.0))
+        return HalfSpace(unit, 0.0, lower - position, upper - position), position
+
+    def thinnest(self, spacing: float) -> float:
+        return np.inf
+
+    def _unit(self) -> Points:
+        return unit(np.array(self.normal))
+
+
+Size = Annotated[float, quantity("m", gt=0.0)]
+
+
+class BoxSolid(BoxShape, SolidTable):
+    """A box, or a rectangle in 2-D."""
+
+    measures: ClassVar = ("lower", "upper")
+
+    def thinnest(self, spacing: float) -> float:
+        return float(np.subtract(self.upper, self.lower).min())
+
+
+class SphereSolid(SphereShape, SolidTable):
+    """A sphere, or a disc in 2-D."""
+
+    measures: ClassVar = ("centre", "radius")
+
+    def thinnest(self, spacing: float) -> float:
+        return 2.0 * self.radius
+
+
+class CapsuleSolid(SolidTable):
+    """All that is no further than a radius from a segment."""
+
+    measures: ClassVar = ("start", "end", "radius")
+    shape: Literal["capsule"] = "capsule"
+    start: Vector[Length]
+    """(d,) One end of the segment [m]."""
+    end: Vector[Length]
+    """(d,) The other end [m]."""
+    radius: Size
+    """From the segment to the surface [m]."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        start, end = np.array(self.start), np.array(self.end)
+        return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
+
+    def thinnest(self, spacing: float) -> float:
+        return 2.0 * self.radius
+
+
+class CylinderSolid(CylinderShape, SolidTable):
+    """A cylinder, in 3-D."""
+
+    measures: ClassVar = ("base", "radius", "height")
+    instead: ClassVar = '"box", "sphere", "capsule", "cup" or "polygon"'
+
+    def thinnest(self, spacing: float) -> float:
+        return min(2.0 * self.radius, self.height)
+
+
+class CupSolid(SolidTable):
+    """A cup that is open at the top; in 2-D its cut through the axis."""
+
+    measures: ClassVar = ("base", "radius", "height", "thickness")
+    shape: Literal["cup"] = "cup"
+    base: Vector[Length]
+    """(d,) Middle of the bottom, outside [m]."""
+    radius: Size
+    """From the axis to the side, inside [m]."""
+    height: Size
+    """From the bottom, outside, to the rim [m]."""
+    thickness: Size
+    """Of the side and the bottom [m]."""
+    axis: Literal["x", "y", "z"] = "y"
+    """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
+
+    @model_validator(mode="after")
+    def _check_height(self) -> Self:
+        if self.thickness >= self.height:
+            raise field_error(("thickness",), self.thickness, f"less than height, {self.height:g}")
+        return self
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if dimension == 2 and self.axis != "y":
+            raise field_error((*path, "axis"), self.axis, '"y" in 2-D')
+        return super().in_dimension(dimension, path)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        dimension, middle = len(self.base), self._middle()
+        outside, rim, bottom = self.radius + self.thickness, self.height - middle, self.thickness - middle
+        half = [(outside, -middle), (outside, rim), (self.radius, rim), (self.radius, bottom)]
+        profile = Polygon(np.array([*half, *((-x, y) for x, y in half[::-1])]))
+        up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
+        shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
+        return shape, np.array(self.base) + middle * up
+
+    def thinnest(self, spacing: float) -> float:
+        return self.thickness
+
+    def _middle(self) -> float:
+        """How high its centroid is above the base [m]."""
+        power = len(self.base) - 1
+        solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
+        whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
+        moment = 0.5 * whole * self.height - 0.5 * cavity * (self.height + self.thickness)
+        return moment / (whole - cavity)
+
+
+class PolygonSolid(PolygonShape, SolidTable):
+    """A polygon, in 2-D."""
+
+    measures: ClassVar = ("corners",)
+    least_thickness: ClassVar = 0.5
+
+    def thinnest(self, spacing: float) -> float:
+        return Polygon(np.array(self.corners)).thinnest()
+
+
+class MeshSolid(MeshShape, SolidTable):
+    """What a mesh of triangles holds, in 3-D."""
+
+    measures: ClassVar = ("scale",)
+    least_thickness: ClassVar = 0.5
+
+    def thinnest(self, spacing: float) -> float:
+        return self.thinnest_sheet(spacing)
+
+
+AnySolid = Annotated[
+    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | PlaneSolid | MeshSolid,
+    Field(discriminator="shape"),
+]

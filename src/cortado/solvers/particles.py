@@ -12,13 +12,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.calls import Staying
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
 from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
-from cortado.fixed import Staying
 from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch

@@ -23,10 +23,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import read_only
+from cortado.calls import fixed
 from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.errors import InputError, shown
-from cortado.fixed import fixed
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, check_steps, require_table
+from cortado.calls import FixedDict, fixed
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.fixed import FixedDict, fixed
 from cortado.losses import FinalPositions, Snapshot
 from cortado.optimisation.fitting.observations import CLOCK, Again, Direction, Frames, Observation
 from cortado.particles.state import State

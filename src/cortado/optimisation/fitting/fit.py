@@ -10,7 +10,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number, require_function, require_table, whole_number
 from cortado.calls import public
 from cortado.errors import ComputationError, DivergedError, InputError, shown
-from cortado.on_top import on_top
+from cortado.lazy import on_top
 from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
 from cortado.optimisation.fitting.doubts import dear_causes, doubts_of
 from cortado.optimisation.fitting.experiment import Experiment

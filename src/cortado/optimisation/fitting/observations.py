@@ -9,10 +9,10 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
+from cortado.calls import fixed
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import wrapped
 from cortado.errors import InputError, shown
-from cortado.fixed import fixed
 from cortado.losses import Snapshot
 from cortado.render import Renderer
 from cortado.render.views import Calibration

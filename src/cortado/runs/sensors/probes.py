@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.calls import fixed
 from cortado.errors import InputError, shown
-from cortado.fixed import fixed
 from cortado.runs.sensors.sensor import (
     ACROSS,
     Reading,

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.calls import fixed
 from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solid import Solid
-from cortado.fixed import fixed
 from cortado.particles.state import padded
 from cortado.runs.sensors.sensor import (
     ACROSS,
