@@ -62,12 +62,11 @@ def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
     pair = isinstance(returned, (tuple, list)) and len(returned) == 2
     if pair and isinstance(returned[1], Mapping):
         return returned[0], returned[1]
+    found = returned
     if pair:
-        found: Any = Words(f"a loss and a gradient of type {type(returned[1]).__name__}")
+        found = Words(f"a loss and a gradient of type {type(returned[1]).__name__}")
     elif isinstance(returned, (tuple, list)):
         found = Words(f"a {type(returned).__name__} of {len(returned)}")
-    else:
-        found = returned
     raise InputError(
         f"What is optimised returned {shown(found)}, but must return two things: the loss, a number, and its gradient, "
         "a dictionary with an array for each parameter by its name."
@@ -315,18 +314,14 @@ class Evaluator:
             made: Any = problem
             trials = [Point(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
             evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
-        else:
+        else:  # it always computes its gradient too
             for point in points:
-                keep(self._loss(point))
+                try:
+                    keep(self._evaluated(point)[0])
+                except REFUSED:
+                    keep(math.inf)
         self.logged += len(vectors)
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
-
-    def _loss(self, parameters: dict[str, Any]) -> Any:
-        """The loss of a problem that always computes its gradient too."""
-        try:
-            return self._evaluated(parameters)[0]
-        except REFUSED:
-            return math.inf
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
         """The loss and its gradient, as the problem returns them."""

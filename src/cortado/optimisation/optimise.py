@@ -31,7 +31,7 @@ from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_e
 from cortado.lazy import on_top
 from cortado.optimisation.evaluator import Evaluator, Optimisable, Parameters, Record, as_given
 from cortado.optimisation.optimisers import as_optimiser
-from cortado.optimisation.search import Log, MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector
+from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector
 from cortado.scene.parameter_values import Values
 from cortado.words import counted, sized
 
@@ -130,17 +130,13 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
         raise InputError("The start names no parameter to optimise; give one or more, as {'gravity': value}.")
-    return {name: _checked_value(f"The start of '{name}'", value) for name, value in start.items()}
-
-
-def _checked_value(what: str, value: Any) -> Vector:
-    """A value as a float64 array, or InputError if it is not made of finite numbers."""
-    array = as_numbers(what, value).copy()
-    if array.size == 0:
-        raise InputError(f"{what} has shape {array.shape}, but must have at least one number.")
-    if not np.isfinite(array).all():
-        raise InputError(f"{what} has components that are not finite; start from finite numbers.")
-    return array
+    found = {name: as_numbers(f"The start of '{name}'", value).copy() for name, value in start.items()}
+    for name, array in found.items():
+        if array.size == 0:
+            raise InputError(f"The start of '{name}' has shape {array.shape}, but must have at least one number.")
+        if not np.isfinite(array).all():
+            raise InputError(f"The start of '{name}' has components that are not finite; start from finite numbers.")
+    return found
 
 
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
@@ -155,8 +151,7 @@ def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayou
         )
     shapes = dict(zip(layout.names, layout.shapes, strict=True))
     sides = {name: _checked_pair(name, bounds.get(name, (None, None)), shapes[name]) for name in shapes}
-    lower = layout.ravel({name: pair[0] for name, pair in sides.items()})
-    upper = layout.ravel({name: pair[1] for name, pair in sides.items()})
+    lower, upper = (layout.ravel({name: pair[k] for name, pair in sides.items()}) for k in range(2))
     return lower, upper
 
 
@@ -308,7 +303,10 @@ def optimise(
         "gradient": _description(gradient),
         "problem": str(getattr(differentiable, "fingerprint", "")),
     }
-    with closing(_open_log(checkpoint, resume, layout, identity)) as log:
+    if resume and checkpoint is None:
+        raise InputError("resume=True needs the checkpoint folder of the run to resume; give checkpoint=...")
+    own_log = MemoryLog() if checkpoint is None else ReplayLog(checkpoint, layout, identity, resume)
+    with closing(own_log) as log:
         evaluator = Evaluator(differentiable, gradient, layout, start, log, on_iteration)
         search = Search(
             evaluate=evaluator,
@@ -327,7 +325,7 @@ def optimise(
     doubt = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run, held)
     ended = outcome.message.replace(" converged ", " ended ") if doubt.misled else outcome.message
     return Result(
-        parameters=_copied(best.parameters),
+        parameters={name: a.copy() if isinstance(a, np.ndarray) else a for name, a in best.parameters.items()},
         loss=best.loss,
         last_parameters=as_given(layout.unravel(outcome.last), start),
         history=tuple(evaluator.history),
@@ -347,17 +345,6 @@ optimize = optimise
 """The same, for those who spell it so."""
 
 
-def _open_log(
-    checkpoint: str | os.PathLike[str] | None, resume: bool, layout: ParameterLayout, settings: Mapping[str, str]
-) -> Log:
-    """The replay log on disk, or in memory if there is no checkpoint."""
-    if checkpoint is not None:
-        return ReplayLog(checkpoint, layout, settings, resume)
-    if resume:
-        raise InputError("resume=True needs the checkpoint folder of the run to resume; give checkpoint=...")
-    return MemoryLog()
-
-
 def _description(setting: object) -> str:
     """The repr of a setting, without the address that a plain object shows in it."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
@@ -368,8 +355,3 @@ def _without_runs_in_words(refused: int, left_out: int) -> str:
     why = ["refused " + counted(refused, "step")] * bool(refused)
     why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
     return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""
-
-
-def _copied(parameters: Parameters) -> Parameters:
-    """Parameters that share no array with others."""
-    return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in parameters.items()}

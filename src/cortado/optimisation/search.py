@@ -10,7 +10,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, Self, runtime_checkable
@@ -97,31 +97,20 @@ class Log(Protocol):
     def read(self, index: int) -> LoggedEvaluation:
         """The evaluation of that index, bit for bit as it was appended."""
 
-    def append(self, evaluation: LoggedEvaluation) -> None:
+    def append(self, evaluation: LoggedEvaluation, /) -> None:
         """Keep one more evaluation."""
 
     def close(self) -> None:
         """Free what the log holds open."""
 
 
-class MemoryLog:
+class MemoryLog(list[LoggedEvaluation]):
     """A replay log that lives as long as the process."""
 
     fate = "were not kept, as there is no checkpoint"
 
-    def __init__(self) -> None:
-        self._evaluations: list[LoggedEvaluation] = []
-
-    def __len__(self) -> int:
-        return len(self._evaluations)
-
     def read(self, index: int) -> LoggedEvaluation:
-        """The evaluation of that index."""
-        return self._evaluations[index]
-
-    def append(self, evaluation: LoggedEvaluation) -> None:
-        """Keep one more evaluation."""
-        self._evaluations.append(evaluation)
+        return self[index]
 
     def close(self) -> None:
         """Nothing is open."""
@@ -159,8 +148,10 @@ class ReplayLog:
             raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
         if not resume:
             _require_unused(self._path)
-        if not resume or not self._path.exists():
-            _begin(self._path, header)
+        if not resume or not self._path.exists():  # the file is there with the whole first line, or not at all
+            with sentences(self._path.parent):
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(self._path, json.dumps(header) + "\n")
         with sentences(self._path):
             self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
@@ -207,22 +198,16 @@ class ReplayLog:
     def _count_whole(self) -> int:
         """The number of whole records, without a torn last one; InputError if another one is damaged."""
         end = self._file.seek(0, os.SEEK_END)
-        complete = (end - self._first_record) // self._record_size
-        whole = self._leading_whole_records()
+        complete, whole = (end - self._first_record) // self._record_size, 0
+        self._file.seek(self._first_record)
+        while _is_whole(self._file.read(self._record_size), whole, self._record_size):
+            whole += 1
         if whole < complete - 1:
             raise InputError(
                 f"Evaluation {whole} of the {complete} in '{self._path}' is damaged; restore the file from a "
                 "copy, or begin again in another checkpoint folder."
             )
         return whole
-
-    def _leading_whole_records(self) -> int:
-        """How many records, from the first, have their index and checksum right."""
-        self._file.seek(self._first_record)
-        index = 0
-        while _is_whole(self._file.read(self._record_size), index, self._record_size):
-            index += 1
-        return index
 
 
 def _require_unused(path: Path) -> None:
@@ -239,40 +224,24 @@ def _require_unused(path: Path) -> None:
         )
 
 
-def _begin(path: Path, header: Mapping[str, Any]) -> None:
-    """Write the first line of a new log so that the file is there with the whole line, or not at all."""
-    with sentences(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, json.dumps(header) + "\n")
-
-
 def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
     """Compare the first line with what is expected of it; the position of the first record [byte]."""
-    found = _read_header(file, path)
-    for key, wanted in header.items():
-        if found.get(key) != wanted:
-            former, given = _differing(_shown(found.get(key)), _shown(wanted))
-            raise InputError(
-                f"'{path}' cannot be resumed, because it was begun with {key} = {former} and "
-                f"is now given {key} = {given}; give the former, or another checkpoint folder."
-            )
-    return file.tell()
-
-
-def _read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
-    """The first line of the log."""
     try:
         found = parsed_json(file.readline(LONGEST_HEADER))
     except ValueError:
         found = None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise InputError(f"'{path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
-    return found
-
-
-def _shown(value: str | Sequence[Any] | None) -> str:
-    """A setting as a message shows it."""
-    return value if isinstance(value, str) else json.dumps(value)
+    for key, wanted in header.items():
+        if found.get(key) != wanted:
+            former, given = _differing(
+                *(one if isinstance(one, str) else json.dumps(one) for one in (found.get(key), wanted))
+            )
+            raise InputError(
+                f"'{path}' cannot be resumed, because it was begun with {key} = {former} and "
+                f"is now given {key} = {given}; give the former, or another checkpoint folder."
+            )
+    return file.tell()
 
 
 def _differing(former: str, given: str) -> tuple[str, str]:
@@ -345,14 +314,9 @@ class Optimiser(Protocol):
         """Lower the loss by at most `search.iterations` updates."""
 
 
-def _values(values: PerParameter) -> Iterator[object]:
-    """The numbers of a setting that may be given per parameter."""
-    return iter(values.values() if isinstance(values, Mapping) else [values])
-
-
 def require_positive(name: str, values: PerParameter) -> None:
     """Raise InputError unless every number is positive and finite."""
-    for value in _values(values):
+    for value in values.values() if isinstance(values, Mapping) else [values]:
         number = as_number(value)
         if number is None or number <= 0.0:
             raise InputError(f"{name} must be a positive, finite number, not {shown(value)}.")

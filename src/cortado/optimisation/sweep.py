@@ -115,7 +115,16 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
     ``results``: what came out, as in result.json, by the number of the combination. Columns: the folder, every key that
     changes, "done" or "failed", every number that came out, and why it failed.
     """
-    rows = [_row(combinations[number], results[number]) for number in sorted(results)]
+    rows = [
+        {
+            "folder": combinations[number].name,
+            **dict(combinations[number].values),
+            "status": "failed" if failed(result) else "done",
+            **_flat({name: value for name, value in result.items() if name != "failures"}),
+            "failures": " ".join(result["failures"]),
+        }
+        for number, result in sorted(results.items())
+    ]
     columns = list(dict.fromkeys(column for row in rows for column in row if column != "failures")) + ["failures"]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -136,17 +145,6 @@ def folders_in(folder: Path) -> list[str]:
 def failed(result: Mapping[str, Any]) -> bool:
     """Whether a result has failures."""
     return bool(result["failures"])
-
-
-def _row(combination: Combination, result: Mapping[str, Any]) -> dict[str, Any]:
-    found = {name: value for name, value in result.items() if name != "failures"}
-    return {
-        "folder": combination.name,
-        **dict(combination.values),
-        "status": "failed" if failed(result) else "done",
-        **_flat(found),
-        "failures": " ".join(result["failures"]),
-    }
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:

@@ -137,8 +137,33 @@ class Affine:
         return self.matrix.shape[self.base.ndim :]
 
 
+class OtherParameters:
+    """A problem as a function of other parameters than its own."""
+
+    problem: Problem
+
+    def parameters(self, u: Values) -> Values:
+        """Those of the problem."""
+        raise NotImplementedError
+
+    def value(self, u: Values) -> Any:
+        """The loss, forward only."""
+        return self.problem.value(self.parameters(u))
+
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return self.problem.room(estimator)
+
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        require_points(points)
+        return self.problem.together([self.parameters(u) for u in points], estimator)
+
+
 @fixed
-class Transformed:
+class Transformed(OtherParameters):
     """A problem as a function of coordinates: those of the given bijectors, all other parameters as they are."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
@@ -170,10 +195,6 @@ class Transformed:
         known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
         return {**parameters, **{name: self.coordinates[name].coordinate(value) for name, value in known.items()}}
 
-    def value(self, u: Mapping[str, Any]) -> float:
-        """The loss, forward only."""
-        return self.problem.value(self.parameters(u))
-
     def value_and_gradient(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None
     ) -> tuple[float, Arrays]:
@@ -191,16 +212,11 @@ class Transformed:
         """A forward run that estimators can go back through."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
-    def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Batchable.room`."""
-        return self.problem.room(estimator)
-
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
         """See `Batchable.together`."""
-        require_points(points)
-        found = self.problem.together([self.parameters(u) for u in points], estimator)
+        found = super().together(points, estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):
                 one.gradient.update(by_coordinates(self.coordinates, u, one.gradient))
@@ -247,44 +263,31 @@ def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gr
     return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}
 
 
-class FixedParameters:
-    """A problem as a function of the other parameters alone. Ensembles vary the first positions around those that are
-    fixed."""
+class FixedParameters(OtherParameters):
+    """A problem some of whose parameters, first positions among them, replace those of its scene, as a function of the
+    others alone. Ensembles vary the first positions around those that are fixed."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
         """``fixed``: parameters by name, with ``initial_positions`` (n, d) [m]."""
-        self._problem, self._fixed = problem, fixed
+        self.problem, self._fixed = problem, fixed
         self.simulation = _Simulation(problem, fixed["initial_positions"])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
-        return FixedParameters, (self._problem, self._fixed)
+        return FixedParameters, (self.problem, self._fixed)
 
     @property
     def fingerprint(self) -> str:
         """A text that identifies the problem; it does not tell the fixed values apart."""
-        return f"{self._problem.fingerprint}; fixed {', '.join(self._fixed)}"
+        return f"{self.problem.fingerprint}; fixed {', '.join(self._fixed)}"
 
-    def value(self, parameters: Values) -> Any:
-        """The loss, forward only."""
-        return self._problem.value(self._all(parameters))
+    def parameters(self, u: Values) -> Values:
+        """Those of the problem."""
+        return {**self._fixed, **u}
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
         """A forward run that estimators can go back through."""
-        return self._problem.forward_pass(self._all(parameters))
-
-    def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Batchable.room`."""
-        return self._problem.room(estimator)
-
-    def together(
-        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
-    ) -> list[Estimate | DivergedError]:
-        """See `Batchable.together`."""
-        return self._problem.together([self._all(point) for point in points], estimator)
-
-    def _all(self, parameters: Values) -> Values:
-        return {**self._fixed, **parameters}
+        return self.problem.forward_pass(self.parameters(parameters))
 
 
 class _Simulation:

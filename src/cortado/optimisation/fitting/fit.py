@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,7 @@ class Fit:
     @property
     def values(self) -> dict[str, Any]:
         """Parameters by name: arrays, or numbers."""
-        return {n: float(v) if not v.shape else v for n, v in self.coordinates.values(self.u).items()}
+        return _plain(self.coordinates.values(self.u))
 
     @property
     def labels(self) -> list[str]:
@@ -148,8 +149,7 @@ class Fit:
     @property
     def standard_errors(self) -> dict[str, Any]:
         """By name, in the shape and the unit of the parameter; 0 for a number that was not searched."""
-        spread = self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0)
-        return {n: float(v) if not v.shape else v for n, v in spread.items()}
+        return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
     def correlation(self) -> np.ndarray:
@@ -161,12 +161,8 @@ class Fit:
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
         """Pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
         found, labels = self.correlation, self.labels
-        return tuple(
-            (labels[i], labels[j], float(found[i, j]))
-            for i in range(len(labels))
-            for j in range(i + 1, len(labels))
-            if abs(found[i, j]) > ALIKE
-        )
+        pairs = combinations(range(len(labels)), 2)
+        return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > ALIKE)
 
     def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
         """By name, the lower and the upper end of an interval that contains the true value with this probability, if
@@ -177,11 +173,8 @@ class Fit:
 
         reach = student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom)
         reach = reach * np.sqrt(np.diag(self.coordinate_covariance))
-        ends = [self.coordinates.values(self.u + way * reach) for way in (-1.0, 1.0)]
-        return {
-            n: (float(a), float(b)) if not a.shape else (a, b)
-            for (n, a), b in zip(ends[0].items(), ends[1].values(), strict=True)
-        }
+        lower, upper = (_plain(self.coordinates.values(self.u + way * reach)) for way in (-1.0, 1.0))
+        return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
         """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
@@ -280,6 +273,11 @@ class Fit:
         return [*apart, *ended, *refused, *self.doubts]
 
 
+def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """By name arrays, but numbers for those of shape ()."""
+    return {name: array if array.shape else float(array) for name, array in arrays.items()}
+
+
 def with_error(value: float, error: float) -> str:
     """A value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
     if not np.isfinite(error) or error <= 0.0:
@@ -361,7 +359,8 @@ def fit(
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
-    """From one start: a first search, with residuals as they are, and a second one with weights that they ask for."""
+    """From one start: a first search, with residuals as they are, and a second one with weights that they ask for; with
+    the covariance, and what the residuals say of the noise and of the model."""
     at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
@@ -369,7 +368,25 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
     weights = noise_of(problem, at, weights)
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
-    return _fitted(problem, at, weights, converged if settled is None else settled, start)
+    found = Certainty.of(problem, at, weights)
+    return Fit(
+        coordinates=problem.coordinates,
+        u=at.u,
+        coordinate_covariance=found.covariance,
+        naive_covariance=counted_covariance(problem, at, weights),
+        degrees_of_freedom=found.degrees_of_freedom,
+        parts=found.parts,
+        doubts=doubts_of(problem, at, weights, found),
+        converged=converged if settled is None else settled,
+        tried=(Tried(start, at.u, misfit(problem, at.residuals)),),
+        runs=problem.runs,
+        tangents=problem.tangents,
+        refused=problem.refused,
+        sum_of_squares=problem.sum_of_squares(at.residuals, weights),
+        hessian=found.hessian,
+        problem=problem,
+        at=at,
+    )
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
@@ -389,31 +406,6 @@ def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None
     doubts = (*found.doubts, *other_valleys(found, tried))
     counted = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
     return replace(counted, tried=tuple(tried), doubts=doubts)
-
-
-def _fitted(
-    problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], converged: bool, start: np.ndarray
-) -> Fit:
-    """With the covariance, and what the residuals say of the noise and of the model."""
-    found = Certainty.of(problem, at, weights)
-    return Fit(
-        coordinates=problem.coordinates,
-        u=at.u,
-        coordinate_covariance=found.covariance,
-        naive_covariance=counted_covariance(problem, at, weights),
-        degrees_of_freedom=found.degrees_of_freedom,
-        parts=found.parts,
-        doubts=doubts_of(problem, at, weights, found),
-        converged=converged,
-        tried=(Tried(start, at.u, misfit(problem, at.residuals)),),
-        runs=problem.runs,
-        tangents=problem.tangents,
-        refused=problem.refused,
-        sum_of_squares=problem.sum_of_squares(at.residuals, weights),
-        hessian=found.hessian,
-        problem=problem,
-        at=at,
-    )
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:

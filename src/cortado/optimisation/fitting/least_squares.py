@@ -7,8 +7,7 @@ through what it leaves. The slopes of the interpolant are the estimate of the Ja
 between them, far ones the curvature, as far as the residuals are smooth, which their likelihood says.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -252,11 +251,7 @@ class LeastSquares:
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
         """Of each part; raises `DivergedError`."""
-        found = []
-        for k, experiment in enumerate(self.experiments):
-            self.runs += 1
-            with self._counting():
-                found.append(experiment.predicted(self.values_of(k, self.coordinates.values(u))))
+        found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
@@ -286,13 +281,10 @@ class LeastSquares:
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
-        for k, experiment in enumerate(self.experiments):
+        for k in range(len(self.experiments)):
             own = {number: self.values_of(k, direction) for number, direction in directions.items()}
             run = [number for number, one in own.items() if one]
-            self.runs, self.tangents = self.runs + 1, self.tangents + len(run)
-            at, along = self.values_of(k, values), [own[number] for number in run]
-            with self._counting():
-                predicted, slopes = experiment.linearised(at, along) if run else (experiment.predicted(at), {})
+            predicted, slopes = self._run(k, values, [own[number] for number in run])
             for part in self.parts:
                 if part.experiment == k:
                     jacobian = np.zeros((*part.observation.measured.shape, len(u)))
@@ -311,11 +303,14 @@ class LeastSquares:
         """Of weighted residuals."""
         return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
-    @contextmanager
-    def _counting(self) -> Iterator[None]:
-        """Count a run that diverges."""
+    def _run(
+        self, number: int, values: dict[str, np.ndarray], along: Sequence[dict[str, np.ndarray]]
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """What an experiment predicts, and its derivatives along directions, if there are any; counted."""
+        experiment, at = self.experiments[number], self.values_of(number, values)
+        self.runs, self.tangents = self.runs + 1, self.tangents + len(along)
         try:
-            yield
+            return experiment.linearised(at, along) if along else (experiment.predicted(at), {})
         except DivergedError:
             self.refused += 1
             raise
