@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.errors import CortadoError, CortadoWarning
-from cortado.pictures.shown_run import is_out
+from cortado.pictures.film import is_out
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 

@@ -16,7 +16,7 @@ from cortado.certificate import Consistency, certify
 from cortado.certificate.consistency import balanced
 from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
 from cortado.certificate.loss_history import LossHistory, in_float64
-from cortado.pictures.run_plots import gradient_check
+from cortado.pictures.run_pictures import gradient_check
 from cortado.problem import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.scene import load_scene

@@ -16,7 +16,7 @@ from bad_scenes import assert_one_sentence
 from cortado import CortadoError, CortadoWarning, Scene, SceneError, Simulation
 from cortado.optimisation.datasets import DatasetTable
 from cortado.pictures.painter import colours_of, painter
-from cortado.runs.pace import Pace
+from cortado.runs.frames import Pace
 from cortado.scene.appearance import Moment, View
 from cortado.scene.model import Bingham, SceneTables
 from every_key import given, key_at, keys_of, places, put, same, told

@@ -11,12 +11,13 @@ import trimesh
 
 import cortado
 from cortado import ComputationError, InputError, Trajectory
-from cortado.pictures.exports import formats, held_volume
-from cortado.pictures.exports.exported import Exported, WholeFrames
-from cortado.pictures.exports.formats import FORMATS
-from cortado.pictures.labels import Scale
-from cortado.pictures.shown_run import ShownRun
-from cortado.runs.frame_file import Marks
+from cortado.pictures import export_formats as formats
+from cortado.pictures import exported
+from cortado.pictures.export_formats import FORMATS
+from cortado.pictures.exported import Exported, WholeFrames
+from cortado.pictures.film import ShownRun
+from cortado.pictures.painter import Scale
+from cortado.runs.frames import Marks
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
@@ -342,7 +343,7 @@ def test_fluid_that_waits_in_an_emitter_is_not_exported(tmp_path, capsys):
 def test_a_surface_that_does_not_enclose_the_fluid_is_told(tmp_path, capsys, monkeypatch):
     trajectory()[2:].export(tmp_path / "held", to="ply")
     assert "encloses" not in capsys.readouterr().out
-    monkeypatch.setattr(held_volume, "MOST", 0.0)
+    monkeypatch.setattr(exported, "MOST_SHIFT", 0.0)
     trajectory()[2:].export(tmp_path / "cut", to="ply")
     told = re.search(r"cut: at 1 s the surface encloses (\S+) m³, where there are 0.016 m³", capsys.readouterr().out)
     mesh = trimesh.load(tmp_path / "cut/surface_00000.ply", process=False)

@@ -11,13 +11,12 @@ from cortado.discretise.shapes import corners
 from cortado.errors import InputError, SceneError
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures import Dolly, Follow, Keyframes, Orbit
-from cortado.pictures.labels import Scale
-from cortado.pictures.painter import MOVING, painter, plan
+from cortado.pictures.film import ShownRun, ages, is_out, vorticity
+from cortado.pictures.painter import MOVING, Scale, painter, plan
 from cortado.pictures.run_pictures import _with_scale, run_page
-from cortado.pictures.shown_run import ShownRun, ages, is_out, vorticity
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.near_particles import Particles
-from cortado.pictures.tracing.shadow import FloorShadow
+from cortado.pictures.tracing.solid_surfaces import FloorShadow
 from cortado.scene.appearance import LIGHTS, Moment, Picture, View
 from scenes import jet, plane, pour, scene
 

@@ -10,7 +10,7 @@ import cortado
 from cortado.device import launching
 from cortado.device.launching import BandLauncher
 from cortado.errors import ComputationError
-from cortado.pictures.exports.held_volume import contained_liquid, enclosed, with_volume
+from cortado.pictures.exported import contained_liquid, enclosed, with_volume
 from cortado.pictures.painter import stage_of
 from cortado.pictures.tracing import liquid_surface as liquid_module
 from cortado.pictures.tracing.liquid_surface import Surface, liquid_surface

@@ -8,7 +8,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.readings import Readings
+from cortado.runs.sensor import Readings
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import cortado.cli.commands.run as run_recording
 from bad_scenes import assert_one_sentence
 from cortado import InputError, Scene, Simulation, Trajectory, load_scene
-from cortado.runs.frame_file import Marks
+from cortado.runs.frames import Marks
 from cortado.scene.restart import Clock
 from scenes import jet, plane, plane_of_three, pour, two_layers
 

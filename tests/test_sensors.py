@@ -15,8 +15,7 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.series import SensorMatch
-from cortado.runs.sensors.readings import Readings, as_csv, from_csv
-from cortado.runs.sensors.sensor import value_of
+from cortado.runs.sensor import Readings, as_csv, from_csv, value_of
 from cortado.scene.containers import Container, NoContainer
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
@@ -395,7 +394,7 @@ def test_an_interruption_between_two_sensors_keeps_what_was_read(cortado_command
         return value_of(sensor, at)
 
     with monkeypatch.context() as patch:
-        patch.setattr("cortado.runs.sensors.readings.value_of", interrupted)
+        patch.setattr("cortado.runs.sensor.value_of", interrupted)
         code, _, err = cortado_command(*run, "stopped")
     assert code == 130 and "Interrupted; " in err and "Traceback" not in err
     assert len(list(csv.reader((tmp_path / "stopped" / "sensors.csv").open()))) == 5

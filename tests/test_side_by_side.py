@@ -10,10 +10,9 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado.errors import InputError, SceneError
 from cortado.pictures import Orbit
-from cortado.pictures.film import ALONE, Page, framed_together, in_a_row
-from cortado.pictures.labels import labelled
+from cortado.pictures.film import ALONE, Page, ShownRun, coloured_by, framed_together, in_a_row
+from cortado.pictures.painter import labelled
 from cortado.pictures.run_pictures import shown_as
-from cortado.pictures.shown_run import ShownRun, coloured_by
 from cortado.pictures.side_by_side import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
 from cortado.scene.appearance import Picture

@@ -12,7 +12,7 @@ from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
-from cortado.pictures.exports.exported import Exported
+from cortado.pictures.exported import Exported
 from cortado.runs.solid_motion import posed
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, distance

@@ -12,8 +12,7 @@ from cortado.pictures.particle_view import container_outline, outline, scene_vie
 from cortado.pictures.plots import particles
 from cortado.pictures.shown_solids import FAR, SolidMesh, shown_solids, solid_outline
 from cortado.pictures.stage import Stage, screen_axes
-from cortado.pictures.tracing.shadow import NODES, REACH, FloorShadow
-from cortado.pictures.tracing.solid_surfaces import SolidSurfaces
+from cortado.pictures.tracing.solid_surfaces import NODES, REACH, FloorShadow, SolidSurfaces
 from cortado.pictures.tracing.wetting import mirrored
 
 BLUE, ORANGE = (0.05, 0.1, 0.8), (0.7, 0.3, 0.05)

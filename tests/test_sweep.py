@@ -24,7 +24,7 @@ from cortado.cli.arguments import ALL_FRAMES
 from cortado.executors import Distributed, InProcess
 from cortado.files.interruption import Interrupted
 from cortado.optimisation.sweep import combinations, write_table
-from cortado.runs.sensors.readings import Readings, from_csv, summary
+from cortado.runs.sensor import Readings, from_csv, summary
 from cortado.runs.trajectory import Trajectory
 from dask_processes import PATIENCE, scheduler
 

@@ -11,7 +11,7 @@ import cortado
 from cortado.discretise.room import WITHOUT_PERIODS
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.losses import Series
-from cortado.runs.sensors.sensor import value_of
+from cortado.runs.sensor import value_of
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import WaveGauge
 from finite_differences import both_modes, distance

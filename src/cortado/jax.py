@@ -15,7 +15,7 @@ from cortado.optimisation.layers.with_jax import JaxBridge, jax
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState, Given, States
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensor import Sensor
 from cortado.scene.parameter_values import Values
 from cortado.simulation import Simulation
 

@@ -33,10 +33,10 @@ def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[
 
 
 FUNCTIONS = {
-    "export": "pictures.exports.formats",
+    "export": "pictures.export_formats",
     "film_page": "pictures.notebook",
     "fit_page": "optimisation.fitting.figures",
-    "labelled": "pictures.exports.formats",
+    "labelled": "pictures.export_formats",
     "result_page": "pictures.notebook",
     "simulation_film": "pictures.run_pictures",
     "simulation_page": "pictures.notebook",

@@ -1,5 +1,10 @@
 """What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, the load on a solid."""
 
-from cortado.runs.sensors import *  # noqa: F403
-from cortado.runs.sensors import __all__ as __all__
-from cortado.runs.sensors import __dir__ as __dir__
+from cortado.calls import face
+from cortado.runs.probes import FlowRate, PressureProbe, SolidLoad, WallForce
+from cortado.runs.sensor import Readings, Sensor
+from cortado.runs.wave_gauge import WaveGauge
+
+__all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "WallForce", "WaveGauge"]
+
+__dir__ = face(globals())

@@ -32,11 +32,10 @@ from cortado.rollout.run_checks import check_sizes, one_for_each
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import expected_frames
 from cortado.rollout.stepper import Stepping
-from cortado.runs.pace import Film
-from cortado.runs.quantities.evaluator import QuantityEvaluator
-from cortado.runs.quantities.moment import Moment
+from cortado.runs.frames import Film
+from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.discrete_scene import DiscreteScene, check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values

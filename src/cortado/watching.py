@@ -13,11 +13,9 @@ from cortado.losses.loss import Snapshot
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.stepper import Steppable
-from cortado.runs.quantities.evaluator import QuantityEvaluator
-from cortado.runs.quantities.moment import Moment, Recorder
-from cortado.runs.sensors.placement import sensors_of, warn_of_places
-from cortado.runs.sensors.readings import Readings, SensorLog
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.probes import sensors_of, warn_of_places
+from cortado.runs.quantity_values import Moment, QuantityEvaluator, Recorder
+from cortado.runs.sensor import Readings, Sensor, SensorLog
 from cortado.scene.parameter_values import Arrays
 
 

@@ -32,7 +32,7 @@ from cortado.gradients import AdjointNorms
 from cortado.gradients.estimator import NO_RUN
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
-from cortado.runs.run_files import as_json, finite
+from cortado.runs.run_folder import as_json, finite
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Range, Role
 from cortado.scene.scene import Scene

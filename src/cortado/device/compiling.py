@@ -94,10 +94,6 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
     return list(found.values())
 
 
-def _is_ours(kind: type) -> bool:
-    return any(base.__module__.startswith("cortado.") for base in kind.__mro__)
-
-
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     """Compile and load the modules of kernels that are not in the cache, if there are several; one alone can as well be
     compiled when it is launched."""
@@ -141,9 +137,6 @@ def _is_compiled(module: Any, device: Any) -> bool:
     return (folder / module._get_compile_output_name(device, block_dim=block_dim)).exists()
 
 
-def _wait_for_all() -> None:
-    wait(list(_begun.values()))
-
-
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_wait_for_all)  # a child would wait for ever for what no thread of its own ends
+    # A child would wait for ever for what no thread of its own ends.
+    os.register_at_fork(before=lambda: wait(list(_begun.values())))

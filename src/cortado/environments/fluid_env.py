@@ -15,7 +15,7 @@ from cortado.environments.task import Task, checked_actions
 from cortado.environments.twin import Twin
 from cortado.errors import InputError, LibraryMissingError, shown
 from cortado.files.image_encoding import to_srgb
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame
 
 try:

@@ -14,7 +14,7 @@ from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.reduction import add
 from cortado.errors import InputError, shown
 from cortado.particles.state import State
-from cortado.runs.quantities.moment import Moment
+from cortado.runs.quantity_values import Moment
 from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.quantity_names import check_readable
@@ -117,7 +117,7 @@ class StepBar:
 
     row: int
     """Which of a run's steps it is, or how many there are: one after the last (`row_of` of
-    `cortado.runs.quantities.moment`)."""
+    `cortado.runs.quantity_values`)."""
     parameters: Mapping[str, np.ndarray]
     """By name, with a first axis for the scenes of a batch, and one row of those over time."""
 

@@ -9,7 +9,7 @@ from cortado.arrays import as_numbers, as_one_number, read_only, whole_number
 from cortado.calls import fixed
 from cortado.errors import InputError
 from cortado.losses.loss import Adjoint, Frames, Snapshot
-from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
+from cortado.runs.sensor import Sensor, checked_sensor, value_of
 
 SAME = 1e-6
 """Relative: time steps that differ by less are the same, as one of them may have been rounded to float32."""

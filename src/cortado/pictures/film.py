@@ -1,29 +1,44 @@
-"""Pictures that change over a run, of one or of several side by side, and films of them."""
+"""Pictures that change over a run, of one or of several side by side, and films of them.
+
+One run as pictures show it is what is in the picture, and each of its frames as a state that is drawn.
+"""
+
+from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from hashlib import sha256
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.device.threads import WARP
-from cortado.discretise.shapes import Points
+from cortado.discretise.calibration import circulation_factor, rest_volume
+from cortado.discretise.shapes import Points, pairs_among
+from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import InputError
 from cortado.files.image_encoding import moving_picture
 from cortado.files.terminal import track
+from cortado.pictures.painter import Scale, colours_of, painter_on, stage_of
 from cortado.pictures.plane import PlanePainter, PlaneStage
-from cortado.pictures.stage import Stage
+from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.space import SpacePainter, State
 from cortado.pictures.tracing.steady import WINDOW
-from cortado.runs.pace import Film, Pace
-from cortado.scene.appearance import Picture
+from cortado.runs.frames import Film, Pace
+from cortado.runs.solid_motion import SolidMotions, posed, sized, solid_motions
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.appearance import Moment, Picture, View
+from cortado.scene.quantity_names import sizes
 from cortado.scene.scene import Scene
+from cortado.simulation import Simulation
+from cortado.version import __version__
 
 Ahead = Callable[[Iterator[Points]], Iterator[Points]]
 Around = tuple[tuple[int, ...], tuple[int, ...]]
@@ -31,6 +46,19 @@ Around = tuple[tuple[int, ...], tuple[int, ...]]
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
 """From a frame, a number, and those around it to a picture (rows, columns, 3), linear from 0 to 1."""
+
+
+MOST_PICTURES = 9
+"""Pictures; in more of them one sees nothing."""
+LEAST_PIXELS = 64
+"""Pixels of each picture, along either side."""
+AIR = 1.25
+"""How much higher a picture is, at least, than what it shows would be if it were as wide as the picture."""
+SLOW = 0.1
+"""Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
+seen."""
+TELLING_FRAMES = 100
+"""Frames that tell where solids come to."""
 
 
 def alone(images: list[Points]) -> Points:
@@ -90,14 +118,6 @@ class FilmedRun:
         return artist.steady_image(state, own, before, after)
 
 
-MOST = 9
-"""Pictures; in more of them one sees nothing."""
-LEAST = 64
-"""Pixels of each picture, along either side."""
-AIR = 1.25
-"""How much higher a picture is, at least, than what it shows would be if it were as wide as the picture."""
-
-
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
     """Stages of one dimension, each in its part of a page as wide as the first one's picture but for some ``spare``
     columns and no higher, all in the same scale, seen by a camera that sees all that any of them shows; and how many go
@@ -110,9 +130,10 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
     across = in_a_row(count, shown, page)
     width, height = page.width // across, page.height // -(-count // across)
     size = {"width": width, "height": min(height, round(AIR * width * shown[1] / shown[0]))}
-    if min(size.values()) < LEAST:
+    if min(size.values()) < LEAST_PIXELS:
         found = f"{count} pictures of {size['width']} x {size['height']} pixels fit into {page.width} x {page.height}"
-        raise InputError(f"{found}, but each must have {LEAST} x {LEAST}: ask for more lines, or for fewer runs.")
+        least = f"{LEAST_PIXELS} x {LEAST_PIXELS}"
+        raise InputError(f"{found}, but each must have {least}: ask for more lines, or for fewer runs.")
     return [stage.framed(ends, stage.picture.model_copy(update=size)) for stage in stages], across
 
 
@@ -126,11 +147,6 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
         return float(scale * count / (across * down))
 
     return max(range(1, count + 1), key=gain)
-
-
-SLOW = 0.1
-"""Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
-seen."""
 
 
 def lacking(scene: Scene) -> str | None:
@@ -176,3 +192,174 @@ def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
     finally:
         with WARP.lent():
             painter.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """A run, and what its particles are coloured by."""
+
+    scene: Scene
+    trajectory: Trajectory
+    values: NDArray | None = None
+    """(frames, n) what a scale colours particles by; None for the colours of phases."""
+
+    @cached_property
+    def stage(self) -> PlaneStage | Stage:
+        """What is around its fluid, with a camera that sees all of it in every frame."""
+        stride = max(len(self.trajectory) // TELLING_FRAMES, 1)
+        poses = [self._pose(k) for k in range(0, len(self.trajectory), stride)] if self._motions else []
+        return stage_of(
+            sized(self.scene, self._motions),
+            shown_places(self.scene, self.trajectory),
+            [pose for pose in poses if pose is not None],
+        )
+
+    def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
+        """Its pictures by the number of the frame, on a stage that is its own but for the camera."""
+        return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
+
+    @cached_property
+    def times(self) -> NDArray[np.float64]:
+        """(frames,) [s] of the states that are shown; see `Trajectory.due`."""
+        return self.trajectory.due
+
+    @property
+    def fingerprint(self) -> str:
+        """A checksum of what its pictures are made of."""
+        trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
+        for array in (trajectory.due, trajectory.positions[:1], trajectory.positions[-1:]):
+            found.update(np.ascontiguousarray(array).tobytes())
+        return found.hexdigest()
+
+    def _state(self, k: int, stage: PlaneStage | Stage, scale: Scale | None) -> State:
+        frame = self.trajectory[k].moved(float(self.times[k] - self.trajectory.times[k]))
+        shown = those(self._out[k])
+        colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
+        if scale is not None and self.values is not None:
+            colours = scale.colours(self.values[k])
+        fractions = None if frame.mass_fractions is None else frame.mass_fractions[shown]
+        return State(frame.positions[shown], colours[shown], self._pose(k), self._view(k, stage), fractions)
+
+    @cached_property
+    def _motions(self) -> SolidMotions:
+        known = self.trajectory.times
+        return solid_motions(self.scene, self.trajectory.others).at(
+            self.scene, known, np.arange(len(known)), self.times
+        )
+
+    @cached_property
+    def _out(self) -> list[NDArray[np.bool_]]:
+        """(frames, n) which particles have left the emitter."""
+        emitted = (frame.others.get("emitted") for frame in self.trajectory)
+        return [is_out(self.scene, one, self.trajectory.particles) for one in emitted]
+
+    def _pose(self, k: int) -> Scene | None:
+        return posed(self.scene, self._motions, k) if self._motions else None
+
+    def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
+        """Where a camera is that moves."""
+        path = (self.scene.picture or Picture()).camera_path
+        if path is None or isinstance(stage, PlaneStage):
+            return None
+        return path.view(stage.home_around if path.goes_around else stage.home, self._moment(k))
+
+    def _moment(self, k: int) -> Moment:
+        places = {table.name: table.middle() for table in self.scene.solid}
+        places |= {name: motion.positions[k] for name, motion in self._motions.items()}
+        domain = self.scene.container.domain(self.scene.dimension)
+        places = {name: domain.wrapped(place) for name, place in places.items()}
+        up = upright(np.asarray(self.scene.forces.gravity))[1]
+        return Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)
+
+
+def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.bool_]:
+    """(n,) whether each of the particles of a scene has left the emitter, of which so much came out: `Frame.others`
+    has ``emitted`` (1,) [m]; all have where there is none. Where there is no other fluid, the layer that comes first is
+    out from the start."""
+    found = np.ones(particles, dtype=bool)
+    if scene.emitter is not None and emitted is not None:
+        upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
+        least = upstream.min() if len(upstream) == particles else 0.0
+        found[particles - len(upstream) :] = upstream <= max(float(np.ravel(emitted)[0]), least)
+    return found
+
+
+def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
+    """(frames, n, d) [m] where particles are that are shown; those that wait in an emitter count at its opening."""
+    out = np.array([is_out(scene, frame.others.get("emitted"), trajectory.particles) for frame in trajectory])
+    return (
+        trajectory.positions
+        if out.all()
+        else np.where(out[..., None], trajectory.positions, trajectory.others["outlet"])
+    )
+
+
+def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
+    """What takes from arrays (n, ...) the particles that are out (n,): all of them without a copy, where all are."""
+    return slice(None) if out.all() else out
+
+
+def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
+    """(frames, n) [s] how long particles are out of the emitter, between frames as if its speed were even; of others
+    the time since the run began, and 0 of what still waits."""
+    since = np.tile(trajectory.times[0], trajectory.particles).astype(np.float64)
+    if scene.emitter is not None and "emitted" in trajectory.others:
+        upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
+        came = np.asarray(trajectory.others["emitted"], dtype=np.float64).reshape(len(trajectory), -1)[:, 0]
+        since[len(since) - len(upstream) :] = np.interp(upstream, came, trajectory.times, right=np.inf)
+    return np.maximum(trajectory.times[:, None] - since, 0.0)
+
+
+def coloured_by(
+    scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation] | None = None
+) -> NDArray | None:
+    """(frames, n) what the pictures of a scene colour particles by: recorded, computed from what was recorded, or else
+    by a simulation of it. None where they have the colours of phases.
+
+    Raises:
+        InputError: it was not recorded and cannot be computed.
+    """
+    name = (scene.picture or Picture()).colour
+    if name == "phase":
+        return None
+    if name == "age":
+        return ages(scene, trajectory)
+    if name == "speed" or name in (*trajectory.quantities, *trajectory.others):
+        return np.array([sizes(name, frame[name], scene.dimension) for frame in trajectory])
+    if simulation is not None:
+        return sizes(name, simulation().quantity(name, trajectory), scene.dimension)
+    if name == "vorticity":
+        each = [vorticity(scene, frame.positions, frame.velocities) for frame in trajectory]
+        return sizes(name, np.array(each), scene.dimension)
+    advice = f'record it, as in simulation.run(steps, record=["{name}"]), or use simulation.film(trajectory, path)'
+    raise InputError(f"{name} was not recorded, and does not follow from positions and velocities: {advice}.")
+
+
+def vorticity(scene: Scene, positions: NDArray, velocities: NDArray) -> NDArray:
+    """(n,) in the plane and (n, 3) in space [1/s]: V / mu sum_j (v_i - v_j) x grad W_ij (Monaghan 1992) of particles of
+    a scene at positions (n, d) [m] with velocities (n, d) [m/s].
+
+    It is `Simulation.quantity("vorticity")` without the division by the sum of W, which is 1 at the rest density.
+    """
+    x, v = np.asarray(positions, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
+    kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
+    spacing = scene.discretisation.spacing
+    support = scene.discretisation.support * spacing
+    lower, lengths = scene.container.periods(dimension)
+    i, j = pairs_among(x, support, lower, lengths)
+    x_ij = x[i] - x[j]
+    x_ij -= np.where(lengths > 0.0, lengths, 0.0) * np.rint(x_ij / np.where(lengths > 0.0, lengths, np.inf))
+    size = (kernel, spacing, support, dimension)
+    factor = rest_volume(*size) / circulation_factor(*size)
+    v_ij, gradient = v[i] - v[j], factor * kernel.gradient(x_ij, support)
+    if dimension == 2:
+        turning = (v_ij[:, 0] * gradient[:, 1] - v_ij[:, 1] * gradient[:, 0])[:, None]
+    else:
+        turning = np.cross(v_ij, gradient)
+    found = _summed(i, turning, len(x)) + _summed(j, turning, len(x))
+    return found[:, 0] if dimension == 2 else found
+
+
+def _summed(of: NDArray, terms: NDArray, count: int) -> NDArray:
+    """(count, k) terms (m, k) added up by the number of the particle that each is of, (m,)."""
+    return np.stack([np.bincount(of, terms[:, k], minlength=count) for k in range(terms.shape[1])], axis=1)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from cortado.discretise.room import WITHOUT_PERIODS
 from cortado.errors import CortadoError
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
-from cortado.pictures.particle_view import STYLE, Cloud, particle_view, script, thinned
+from cortado.pictures.particle_view import Cloud, particle_view, script, style, thinned
 from cortado.pictures.plots import images, loss_curve, particles
 from cortado.pictures.shown_solids import solid_outline
 from cortado.problem import Problem
-from cortado.runs.pace import Film
+from cortado.runs.frames import Film
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameter_values import UNITS
 from cortado.simulation import Simulation
@@ -55,7 +55,7 @@ def trajectory_page(run: Trajectory) -> str:
     cloud = Cloud("run", domain.wrapped(thin[0]), np.linalg.norm(thin[1], axis=2))
     view = particle_view([cloud], run.times[chosen], _spacing(run.positions[0]), stride=stride)
     drawn = picture(run, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
-    page = f"<!DOCTYPE html><meta charset='utf-8'><style>{STYLE}</style>{view}{script()}"
+    page = f"<!DOCTYPE html><meta charset='utf-8'><style>{style()}</style>{view}{script()}"
     frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 600px; border: 0"></iframe>'
     return as_words(run) + frame + f"<details><summary>As a picture</summary>{drawn}</details>"
 

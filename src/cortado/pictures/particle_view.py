@@ -33,19 +33,6 @@ LARGEST = 32767
 _PLAIN = (0.1, 0.3, 0.8)
 """The linear colour of particles that have none."""
 
-STYLE = """
-.particle-view { margin: 0 0 1.5rem; }
-.particle-view .stage { position: relative; }
-.particle-view canvas { width: 100%; display: block; border: 1px solid var(--line, #e6e2db); border-radius: 6px;
-                        cursor: grab; touch-action: pan-y; box-sizing: border-box; }
-.particle-view .name { position: absolute; padding: .3rem .7rem; color: #2b2a28; pointer-events: none; }
-.particle-view .controls { display: flex; flex-wrap: wrap; gap: .5rem; align-items: center; margin-top: .5rem; }
-.particle-view input { flex: 1 1 8rem; min-width: 0; }
-.particle-view output { font-variant-numeric: tabular-nums; min-width: 4.5em; }
-.particle-view button, .particle-view select { font: inherit; padding: .15rem .7rem; }
-.particle-view p { margin: .4rem 0 0; color: var(--faint, #6d6860); font-size: .93rem; }
-"""
-
 
 @dataclass(frozen=True)
 class Cloud:
@@ -58,6 +45,11 @@ class Cloud:
     """(frames, n) [m/s]"""
     colours: NDArray[Any] | None = None
     """(n, 3) or (frames, n, 3), linear, from 0 to 1"""
+
+
+def style() -> str:
+    """How all the views of a page look, in CSS."""
+    return Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
 def script() -> str:
@@ -80,7 +72,7 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BY
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `STYLE` be there.
+    """HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `style` be there.
 
     Args:
         clouds: of the same frames and as many particles each.

@@ -26,38 +26,6 @@ _VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm"}
 MOST_NUMBERS = 12
 """That are written out one by one."""
 
-_STYLE = f"""
-:root {{ color-scheme: light dark; --paper: #fcfbf9; --ink: #2b2a28; --faint: #6d6860; --line: #e6e2db;
-        --inset: #f3f0ea; }}
-@media (prefers-color-scheme: dark) {{
-  :root {{ --paper: #1d1c1b; --ink: #e8e4dd; --faint: #a49e94; --line: #3a3734; --inset: #282625; }}
-}}
-body {{ margin: 0 auto; max-width: 62rem; padding: 2.5rem 1.5rem 4rem; background: var(--paper); color: var(--ink);
-       font: 16px/1.55 system-ui, -apple-system, "Segoe UI", sans-serif; overflow-wrap: break-word; }}
-h1 {{ font-size: 1.7rem; font-weight: 600; margin: 0 0 1.5rem; }}
-h2 {{ font-size: 1.2rem; font-weight: 600; margin: 2.5rem 0 .8rem; }}
-p {{ max-width: 46rem; margin: 0 0 .9rem; }}
-.failed {{ border-left: 4px solid #a8504f; padding-left: .9rem; }}
-.wide {{ overflow-x: auto; margin: 1rem 0; }}
-table {{ border-collapse: collapse; }}
-th, td {{ text-align: left; vertical-align: top; padding: .35rem 1.4rem .35rem 0;
-         border-bottom: 1px solid var(--line); }}
-th {{ font-weight: 500; color: var(--faint); }}
-td {{ font-variant-numeric: tabular-nums; }}
-figure {{ margin: 0 0 2rem; }}
-img, video {{ max-width: 100%; height: auto; display: block; border: 1px solid var(--line); border-radius: 6px;
-             background: white; }}
-figcaption {{ margin-top: .5rem; color: var(--faint); font-size: .93rem; }}
-details {{ margin-top: 1rem; }}
-summary {{ cursor: pointer; color: var(--faint); }}
-pre {{ overflow-x: auto; padding: .9rem 1.1rem; background: var(--inset); border-radius: 6px; font-size: .85rem; }}
-@media (max-width: 500px) {{
-  body {{ padding: 1.2rem .9rem 3rem; }}
-  table {{ font-size: .88rem; }}
-  th, td {{ padding-right: .7rem; }}
-}}
-{particle_view.STYLE}"""
-
 
 @dataclass(frozen=True)
 class Section:
@@ -91,13 +59,15 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
     """
     parts = "\n".join(_section(section) for section in sections)
     script = particle_view.script() if any(section.view for section in sections) else ""
+    style = f"{Path(__file__).with_suffix('.css').read_text(encoding='utf-8')}\n{particle_view.style()}"
     page = f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{_safe(title)}</title>
-<style>{_STYLE}</style>
+<style>
+{style}</style>
 </head>
 <body>
 <h1>{_safe(title)}</h1>

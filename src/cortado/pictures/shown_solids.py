@@ -347,3 +347,10 @@ def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Number
     beyond = parts[:, None] - sides[parents][:, :, :1]
     distances = np.einsum("pkjc,pkc->pkj", beyond, inwards[parents])
     return np.where((cosines_of(points, corners) < SHARP)[parents][..., None], distances, FAR)
+
+
+def turn_in_space(turn: Points) -> Points:
+    """A rotation (d, d) as one of space, about z in the plane."""
+    found = np.eye(3)
+    found[: len(turn), : len(turn)] = turn
+    return found

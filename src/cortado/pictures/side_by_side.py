@@ -17,13 +17,21 @@ from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
 from cortado.files.input_files import as_path
-from cortado.pictures.film import MOST, Around, Page, Panel, film, framed_together, lacking
-from cortado.pictures.labels import Scale, labelled, side_by_side
+from cortado.pictures.film import (
+    MOST_PICTURES,
+    Around,
+    Page,
+    Panel,
+    ShownRun,
+    coloured_by,
+    film,
+    framed_together,
+    lacking,
+)
+from cortado.pictures.painter import Scale, labelled, side_by_side
 from cortado.pictures.run_pictures import device_of, shown_as
-from cortado.pictures.shown_run import ShownRun, coloured_by
-from cortado.runs.frame_file import common_rate
-from cortado.runs.pace import Film, pace_of
-from cortado.runs.run_files import computed
+from cortado.runs.frames import Film, common_rate, pace_of
+from cortado.runs.run_folder import computed
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, as_scene
@@ -92,8 +100,8 @@ def shown_alike(
 ) -> list[Scene]:
     """The scenes of runs with the table [picture] of the first one, of which keys are replaced as by `shown_as`. Raises
     `InputError` for runs that cannot be side by side, and where a package is missing."""
-    if not 0 < len(scenes) <= MOST:
-        raise InputError(f"There are {len(scenes)} runs, but from 1 to {MOST} can be side by side.")
+    if not 0 < len(scenes) <= MOST_PICTURES:
+        raise InputError(f"There are {len(scenes)} runs, but from 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
         raise InputError("Some runs are in 2-D and some in 3-D, but all that are side by side must be in one of them.")
     for scene, run in zip(scenes, trajectories, strict=True):

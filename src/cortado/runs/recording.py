@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cortado.errors import DivergedError, InputError
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.step_bounds import expected_frames
-from cortado.runs.frame_file import Marks
+from cortado.runs.frames import Marks
 from cortado.runs.solid_motion import solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameter_values import Arrays
@@ -48,40 +48,36 @@ class FrameChoice(Protocol):
 
 @dataclass(frozen=True)
 class EverySteps:
-    """A frame for every so many steps."""
+    """A frame for every so many steps; a `FrameChoice`."""
 
     steps: int
 
     @property
     def settings(self) -> dict[str, Any]:
-        """See `FrameChoice`."""
         return {"record_every": self.steps}
 
     @property
     def rate(self) -> None:
-        """See `FrameChoice`."""
+        """None, as steps are chosen."""
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """See `FrameChoice`."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """See `FrameChoice`."""
         recorded = np.array([*range(0, rollout.steps, self.steps), rollout.steps])
-        return _clock(rollout).times(recorded, float(rollout.time_steps[0]))
+        clock = Clock(rollout.clocks[0].steps, rollout.clocks[0].time)  # as steps of one length go on from the first
+        return clock.times(recorded, float(rollout.time_steps[0]))
 
     def expected(self, rollout: Rollout) -> int:
-        """See `FrameChoice`."""
         return expected_frames(rollout, self.steps)
 
     def count(self, steps: int, time: float | None) -> int:
-        """See `FrameChoice`."""
         return 1 + -(-steps // self.steps)
 
 
 @dataclass(frozen=True)
 class FramesPerSecond:
-    """So many frames in each second that is simulated: each is the first state at its time or after it.
+    """So many frames in each second that is simulated, each the first state at its time or after it; a `FrameChoice`.
 
     Raises:
         InputError: a rate that is not a number greater than 0.
@@ -96,35 +92,25 @@ class FramesPerSecond:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """See `FrameChoice`."""
         return {"fps": self.rate}
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """See `FrameChoice`."""
         passed, due = Marks(0.0, self.rate).passed(np.array([before, now])).tolist()
         return due > passed
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """See `FrameChoice`."""
         start, size = rollout.clocks[0].time, float(rollout.time_steps[0])  # where steps are chosen the longest one
         duration = min(rollout.steps * size, rollout.step_sizes.end - start + size)
         return Marks(start, self.rate).at(np.arange(min(rollout.steps, int(duration * self.rate) + 1) + 2))
 
     def expected(self, rollout: Rollout) -> int:
-        """See `FrameChoice`."""
         return len(self.announced(rollout))
 
     def count(self, steps: int, time: float | None) -> int | None:
-        """See `FrameChoice`."""
         if time is None:
             return None
         before, due = Marks(0.0, self.rate).passed(np.array([time - time / steps, time])).tolist()
         return 1 + min(steps, due if due > before else due + 1)
-
-
-def _clock(rollout: Rollout) -> Clock:
-    """Of the first state, as steps of one length go on from it."""
-    return Clock(rollout.clocks[0].steps, rollout.clocks[0].time)
 
 
 @dataclass(frozen=True, eq=False)

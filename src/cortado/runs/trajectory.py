@@ -18,9 +18,8 @@ from cortado.files import vtkhdf
 from cortado.files.image_encoding import ShadedPicture
 from cortado.files.input_files import as_path
 from cortado.lazy import on_top
-from cortado.runs.frame_file import FRACTION, Marks, append_frame, fraction_names, frame_writer
-from cortado.runs.pace import Film
-from cortado.runs.sensors.readings import Readings
+from cortado.runs.frames import FRACTION, Film, Marks, append_frame, fraction_names, frame_writer
+from cortado.runs.sensor import Readings
 from cortado.runs.solid_motion import SolidMotions, motions_in
 from cortado.scene.quantity_names import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState

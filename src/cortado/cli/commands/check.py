@@ -66,7 +66,7 @@ def _make(folder: Path) -> None:
 
 def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
     from cortado.files.output_files import write_atomically
-    from cortado.pictures.run_plots import gradient_check
+    from cortado.pictures.run_pictures import gradient_check
 
     gradient_check(certificate, out / "certificate.png")
     write_atomically(out / "certificate.json", found.encode())

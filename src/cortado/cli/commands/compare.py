@@ -16,11 +16,10 @@ import numpy as np
 from cortado.cli.commands.options import OwnQuantity, named_runs
 from cortado.errors import InputError, shown, warn
 from cortado.optimisation.sweep import Extrapolation
-from cortado.pictures.run_plots import beside_measured
+from cortado.pictures.run_pictures import beside_measured
 from cortado.pictures.side_by_side import differences
-from cortado.runs.run_files import read_json
-from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.readings import MeasuredColumn, measured_beside, summary
+from cortado.runs.run_folder import RunFolder, read_json
+from cortado.runs.sensor import MeasuredColumn, measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind", "format")

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from cortado.cli.commands.options import HERE, Where
-from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError, SceneError, shown, warn
+from cortado.errors import (
+    ComputationError,
+    CortadoWarning,
+    DivergedError,
+    InputError,
+    SceneError,
+    shown,
+    unwarned,
+    warn,
+)
 from cortado.files.interruption import keeping
 from cortado.files.output_files import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import track, untracked
@@ -26,7 +35,7 @@ from cortado.optimisation.datasets import (
     write_metadata,
 )
 from cortado.pictures.side_by_side import differences
-from cortado.runs.run_files import read_json
+from cortado.runs.run_folder import read_json
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.tables import sentences as in_sentences
@@ -152,8 +161,7 @@ def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping
     """Write the files of the data set, of runs by purpose with what is noted of each; returns their sizes in words."""
     out = member.out
     assemble(out, there)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():
         most = max(note["statistics"]["particles"] for note in notes.values())
         content = metadata(member.scene(min(notes)), member.table, there, notes, most)
     write_metadata(out, content)
@@ -188,8 +196,7 @@ def _asked(member: Member, runs: int) -> dict[str, Any]:
     """What is asked for; the first scene and those with the ends of all ranges are looked at, so that a mistake is
     found before anything is computed. Raises `SceneError`."""
     table = member.table
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
         for end in ends:
             load_scene(member.file, [*member.overrides, *end]).solver.fixed_time_step("a data set")
@@ -216,8 +223,7 @@ def _are_one(member: Member, *overrides: list[str]) -> bool:
 
 def _scene(member: Member) -> Scene:
     """The scene of the file, whose warnings come with the runs."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():
         return load_scene(member.file, member.overrides)
 
 

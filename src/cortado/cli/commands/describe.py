@@ -25,7 +25,7 @@ from cortado.rollout.parameter_space import steps_of_run
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import ROOM, scheduled_bounds
-from cortado.runs.pace import Pace
+from cortado.runs.frames import Pace
 from cortado.runs.recording import FrameChoice
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, load_scene, vector

@@ -4,129 +4,20 @@ import ast
 import textwrap
 import tomllib
 from pathlib import Path
-from string import Template
 
 from cortado.errors import InputError, shown
 from cortado.files.input_files import SCHEMA, examples_folder
 from cortado.files.output_files import is_taken, sentences, write_atomically
 from cortado.files.terminal import is_quiet
 
-_SCENE = Template("""\
-#:schema ./scene.schema.json
-# A dam breaks: $particles particles in $dimension-D. Run it: cortado run $file
-# Lines that begin with # and no space are switched off: remove the # to try them. All units are SI.
-name = "$name"
-dimension = $dimension
-
-[discretisation]
-spacing = $spacing                      # m, between particles at rest: half of it is $more times as many
-support = 2.6                       # how far a particle sees, in spacings
-kernel = "wendland_c2"              # or "wendland_c4" with a support of 3, "cubic_spline" with 2
-
-# Materials: a table for each.
-[[phase]]
-name = "water"
-rest_density = 1000.0               # kg/m3
-viscosity = 0.05                    # Pa s; water has 0.001, which needs many more particles
-colour = [0.1, 0.3, 0.8]            # red, green, blue, from 0 to 1
-
-# A second fluid: switch on this table, the next [[fluid]], and [mixture] if the two shall mix.
-#[[phase]]
-#name = "oil"
-#rest_density = 800.0
-#viscosity = 0.2
-#colour = [0.9, 0.7, 0.1]
-
-# Bodies of fluid: a table for each, with the shape "box", $shapes or "points".
-[[fluid]]
-shape = "box"
-lower = $water_lower             # m
-upper = $water_upper
-velocity = $zero          # m/s
-phase = "water"
-
-#[[fluid]]
-#shape = "box"
-#lower = $oil_lower
-#upper = $oil_upper
-#phase = "oil"
-
-#[mixture]
-#free_energy = "miscible"           # or "double_well", whose phases separate
-#mobility = 1e-5                    # m2/s, how fast they diffuse into each other
-
-[container]
-shape = "box"                       # or $containers
-lower = $zero
-upper = $room
-slip = "free"                       # "no" for walls that hold the fluid back
-
-[forces]
-gravity = $gravity        # m/s2
-viscosity = "stress"                # or "none"
-#surface_tension = 0.07             # N/m
-
-[solver]
-kind = "projection"                 # or "pcisph", which has other keys than iterations and repairs
-time_step = 0.002                   # s; `cortado describe` says what limits it; "auto" chooses it before each step
-iterations = 4                      # of the pressure, in every step
-repairs = 2                         # that bring particles back to the rest density
-
-# What changes over time: gravity, as in a box that is shaken, "tilt", or the "nozzle_path" of an [emitter].
-#[schedule.gravity]
-#times = [0.0, 0.1, 0.2, 0.3]       # s; linear in between
-#values = $shake
-
-# Pictures of the fluid itself, beside those of its particles.
-#[render]
-#view = "$view"
-#resolution = [192, 144]
-""")
-_DIMENSIONS = {
-    2: {
-        "particles": 288,
-        "spacing": "0.02",
-        "more": 4,
-        "shapes": '"sphere"',
-        "containers": '"none"',
-        "water_lower": "[0.0, 0.0]",
-        "water_upper": "[0.24, 0.48]",
-        "oil_lower": "[0.4, 0.0]",
-        "oil_upper": "[0.6, 0.2]",
-        "zero": "[0.0, 0.0]",
-        "room": "[0.8, 0.6]",
-        "gravity": "[0.0, -9.81]",
-        "shake": "[[0.0, -9.81], [6.0, -9.81], [-6.0, -9.81], [0.0, -9.81]]",
-        "view": "plane",
-    },
-    3: {
-        "particles": 864,
-        "spacing": "0.04",
-        "more": 8,
-        "shapes": '"sphere", "cylinder"',
-        "containers": '"cylinder", "none"',
-        "water_lower": "[0.0, 0.0, 0.0]",
-        "water_upper": "[0.24, 0.48, 0.48]",
-        "oil_lower": "[0.4, 0.0, 0.0]",
-        "oil_upper": "[0.6, 0.2, 0.48]",
-        "zero": "[0.0, 0.0, 0.0]",
-        "room": "[0.8, 0.6, 0.48]",
-        "gravity": "[0.0, -9.81, 0.0]",
-        "shake": "[[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [-6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
-        "view": "top",
-    },
-}
-"""What differs between 2-D and 3-D."""
-
-
 DAM = "dam"
 """The template that explains every line, in 2-D and in 3-D."""
 TEMPLATES = Path(__file__).parents[1] / "templates"
-"""Files of the others, each a scene whose first line says what it is and how it is run."""
-_SCENE_FILE = "SCENE.toml"
-"""What that line calls the file."""
-
-
+"""Their files, each a scene whose first line says what it is and how it is run."""
+IN_3D = "_3d"
+"""At the end of the name of a file of `DAM`."""
+SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
+"""What the first line calls the file, and the line with the name that a scene takes from its file."""
 ALL = "all"
 DATA = (".csv", ".mp4")
 """What an example may read, with its own name at the beginning: example_ANY.csv."""
@@ -134,7 +25,7 @@ DATA = (".csv", ".mp4")
 
 def templates() -> list[str]:
     """Their names."""
-    return [DAM, *sorted(path.stem for path in TEMPLATES.glob("*.toml"))]
+    return [DAM, *sorted({path.stem.removesuffix(IN_3D) for path in TEMPLATES.glob("*.toml")} - {DAM})]
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
@@ -144,7 +35,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
         raise InputError(f"--dimension is given, but must be left out, as only {DAM} is there in 2-D and in 3-D.")
-    if dimension not in (None, *_DIMENSIONS):
+    if dimension not in (None, 2, 3):
         raise InputError(f"--dimension is {dimension}, but must be 2 or 3.")
     if path.name in ("", ".."):
         raise InputError("NAME must be the name of a file, such as dam.toml.")
@@ -154,29 +45,19 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
     schema = file.with_name(SCHEMA.name)
     with sentences(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
-    text, options = (scene_text(file, dimension or 2), "") if template == DAM else template_text(file, template)
+    text, options = scene_text(file, f"{template}{IN_3D}" if dimension == 3 else template)
     write_atomically(file, text)
     if not is_taken(schema):
         write_atomically(schema, SCHEMA.read_bytes())
     return f"The scene is {file}; {schema} tells editors what may stand in it. Run it: cortado run {file}{options}"
 
 
-def scene_text(file: Path, dimension: int) -> str:
-    """The scene that is written to a file."""
-    named = _printable(file.name)
-    return _SCENE.substitute(_DIMENSIONS[dimension], dimension=dimension, file=named, name=named.removesuffix(".toml"))
-
-
-def template_text(file: Path, template: str) -> tuple[str, str]:
-    """The scene of a template that is written to a file, and the options with which it is run."""
+def scene_text(file: Path, template: str) -> tuple[str, str]:
+    """The scene of a template's file that is written to a file, and the options with which it is run."""
     text = (TEMPLATES / f"{template}.toml").read_text(encoding="utf-8")
-    options = text.splitlines()[0].partition(_SCENE_FILE)[2]
-    return f"#:schema ./{SCHEMA.name}\n{text.replace(_SCENE_FILE, _printable(file.name), 1)}", options
-
-
-def _printable(name: str) -> str:
-    """A name as it may stand in a scene."""
-    return "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in name)
+    name = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
+    own = text.replace(SCENE_FILE, name, 1).replace(SCENE_NAME, f'name = "{name.removesuffix(".toml")}"')
+    return f"#:schema ./{SCHEMA.name}\n{own}", text.splitlines()[0].partition(SCENE_FILE)[2]
 
 
 def list_examples(names: list[str], folder: Path) -> str:

@@ -165,7 +165,8 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
                 left_out=left_out + record.left_out,
             )
             if record.iteration + 1 == known:
-                announce(_resumed(record, len(made.searches) * settings.iterations))
+                whole = f"iteration {record.updates} of {len(made.searches) * settings.iterations}"
+                announce(f"The search goes on from {whole}, after {record.iteration + 1} evaluations.")
             if record.iteration >= known:
                 folder.append_metrics(
                     iteration=record.iteration,
@@ -195,11 +196,6 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             refused, left_out = refused + result.refused, left_out + result.left_out
     whole: dict[str, Any] = {"updates": updates, "evaluations": len(history), "refused": refused, "left_out": left_out}
     return replace(result, history=tuple(history), **whole)
-
-
-def _resumed(last: Record, iterations: int) -> str:
-    """Where a search goes on, given the last evaluation that is known."""
-    return f"The search goes on from iteration {last.updates} of {iterations}, after {last.iteration + 1} evaluations."
 
 
 def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:

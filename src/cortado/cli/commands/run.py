@@ -25,7 +25,7 @@ from cortado.pictures.report import Section
 from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Progress, Rollout
 from cortado.rollout.step_bounds import done_of, ends_at_a_time
-from cortado.runs.frame_file import Marks, append_frame, frame_writer
+from cortado.runs.frames import Marks, append_frame, frame_writer
 from cortado.runs.recording import EverySteps, FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory

@@ -17,19 +17,16 @@ from cortado.discretise.room import TOLERANCE
 from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
 from cortado.particles.state import State
-from cortado.pictures.film import lacking
+from cortado.pictures.film import coloured_by, is_out, lacking
 from cortado.pictures.plots import images, particles
 from cortado.pictures.report import Figures, Section, write_report
-from cortado.pictures.run_pictures import run_pictures, trajectory_view
-from cortado.pictures.run_plots import density_errors, readings
-from cortado.pictures.shown_run import coloured_by, is_out
+from cortado.pictures.run_pictures import density_errors, readings, run_pictures, trajectory_view
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
-from cortado.runs.frame_file import common_rate
-from cortado.runs.pace import Pace
+from cortado.runs.frames import Pace, common_rate
 from cortado.runs.run_folder import RunFolder
-from cortado.runs.sensors.readings import Readings, summary
+from cortado.runs.sensor import Readings, summary
 from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.fluid_particles import FluidMasses

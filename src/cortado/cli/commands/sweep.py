@@ -11,7 +11,7 @@ from cortado.cli.arguments import ALL_FRAMES, STEPS, FrameOptions
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.options import HERE, Where
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
-from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, warn
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
 from cortado.files.interruption import Interrupted, keeping
 from cortado.files.output_files import LOCK, locked
 from cortado.files.terminal import track, untracked
@@ -185,8 +185,7 @@ def run_sweep(
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
     """What came out of the combinations that have ended, by their numbers. All of them are looked at, so that a mistake
     is found before anything is computed; warnings come when they are."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():
         found = {number: member.finished(one) for number, one in enumerate(chosen)}
     return {number: result for number, result in found.items() if result is not None}
 
@@ -211,8 +210,7 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
 
 def _time_step(file: Path, combination: Combination) -> float:
     """Of a scene [s]; warnings come when it is run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
+    with unwarned():
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 

@@ -3,7 +3,6 @@
 import atexit
 import gc
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from cortado.cli.viewer.window import (
     quantities_of,
     sizes_of,
 )
-from cortado.errors import CortadoError, CortadoWarning, InputError
+from cortado.errors import CortadoError, InputError, unwarned
 from cortado.files.image_encoding import to_srgb
 from cortado.files.interruption import keeping
 from cortado.files.terminal import say
@@ -171,8 +170,7 @@ class LiveView:
             return
         begun = time.monotonic()
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", CortadoWarning)  # there would be one for each picture
+            with unwarned():  # there would be one for each picture
                 found = self.simulation.run(self.steps, self._controls(), self.steps, self._state)
         except CortadoError as error:
             self.running.value = False

@@ -18,7 +18,7 @@ from cortado.gradients import Exact
 from cortado.losses import CentreOfMassAlong, Loss, Snapshot
 from cortado.losses.loss import ADJOINT_FIELDS, by_field
 from cortado.pictures.particle_view import container_outline, outline
-from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids, turn_in_space
 from cortado.pictures.stage import upright
 from cortado.rollout.rollout import Rollout
 from cortado.scene.restart import RestartState
@@ -244,9 +244,7 @@ def _quaternion(turn: Points) -> np.ndarray:
     """(4,) w, x, y and z, of a rotation matrix (d, d)."""
     from scipy.spatial.transform import Rotation
 
-    whole = np.eye(3)
-    whole[: len(turn), : len(turn)] = turn
-    return np.roll(Rotation.from_matrix(whole).as_quat(), 1)
+    return np.roll(Rotation.from_matrix(turn_in_space(turn)).as_quat(), 1)
 
 
 def _upper_end(values: np.ndarray, percentile: float) -> float:

@@ -24,7 +24,7 @@ from cortado.optimisation.inverse.tables import (
 )
 from cortado.optimisation.inverse.task import GIVEN, read_tables
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping
-from cortado.runs.sensors.placement import sensors_of
+from cortado.runs.probes import sensors_of
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.tables import Table

@@ -17,16 +17,14 @@ from cortado.losses import Snapshot
 from cortado.optimisation.inverse.task import Setup, Task
 from cortado.optimisation.optimise import Result
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.pictures.film import FilmedRun, Page, Panel, film
+from cortado.pictures.film import FilmedRun, Page, Panel, film, is_out, those
 from cortado.pictures.image_files import write_picture
-from cortado.pictures.labels import side_by_side
-from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.painter import colours_of, painter, side_by_side
 from cortado.pictures.plots import images, loss_curve, panels, particles
 from cortado.pictures.report import Figures
-from cortado.pictures.shown_run import is_out, those
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.tracing.space import State
-from cortado.runs.pace import Pace, pace_of
+from cortado.runs.frames import Pace, pace_of
 from cortado.scene.appearance import Picture
 from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import Axis

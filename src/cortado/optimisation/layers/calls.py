@@ -15,7 +15,7 @@ from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, ch
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState, Given
-from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensor import Sensor
 from cortado.scene.parameter_values import Values
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation

@@ -12,10 +12,17 @@ from cortado.device.launching import BandLauncher
 from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
-from cortado.pictures.tracing.array_types import Floats, Vec2s, Vec3s
-from cortado.pictures.tracing.level_blocks import level_blocks
-from cortado.pictures.tracing.near_particles import MODULE, NearParticles, Particles, near_particles, sum_near
-from cortado.pictures.tracing.surface_net import net_of, normals_of, smoothed, triangles_of
+from cortado.pictures.tracing.near_particles import (
+    MODULE,
+    Floats,
+    NearParticles,
+    Particles,
+    Vec2s,
+    Vec3s,
+    near_particles,
+    sum_near,
+)
+from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_of, smoothed, triangles_of
 
 NEIGHBOURS = 24
 """Particles that a point of the surface has its colour from."""

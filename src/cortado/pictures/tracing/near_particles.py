@@ -15,8 +15,13 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError
-from cortado.pictures.tracing.array_types import Floats, Ints, Vec3s
 from cortado.words import counted
+
+Ints, Ints2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
+Floats, Floats2d = wp.array(dtype=wp.float32), wp.array2d(dtype=wp.float32)
+Vec2s, Vec3s = wp.array(dtype=wp.vec2), wp.array(dtype=wp.vec3)
+Vec3s2d, Vec4s2d = wp.array2d(dtype=wp.vec3), wp.array2d(dtype=wp.vec4)
+"""Types of arrays that kernels and Warp functions take."""
 
 MODULE = kernel_module("liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time

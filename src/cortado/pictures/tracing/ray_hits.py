@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.pictures.tracing.array_types import Vec3s2d
+from cortado.pictures.tracing.near_particles import Vec3s2d
 from cortado.pictures.tracing.surroundings import (
     CLEAR,
     FAR,

@@ -1,4 +1,7 @@
-"""Surfaces on the device that traces rays, and those of the solids of a stage."""
+"""Surfaces of the solids of a stage on the device that traces rays, and the shadow on the floor.
+
+Fluid and solids cast it; it is soft, and in the colour of the fluid.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,11 +10,28 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.launching import BandLauncher
+from cortado.device.launching import launch as launch_once
+from cortado.device.modules import kernel_module
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid, SolidMesh
 from cortado.pictures.stage import Stage
-from cortado.pictures.tracing.shadow import FloorShadow
+from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec3s, Vec3s2d, Vec4s2d
 from cortado.pictures.tracing.surroundings import LitSurface, Solids
+
+NODES = 320
+"""Along either side of the floor that may lie in shadow."""
+ABOVE = 1e-3
+"""In sizes of what is shown: a side of a solid that is no higher lies on the floor."""
+REACH = 1.5
+"""Half the width of that part of the floor, in sizes of what is shown."""
+KEY, AROUND = 0.022, 0.05
+"""How soft the shadows of the lamp and of the sky are, in sizes of what is shown."""
+CLOSE = 0.15
+"""How far above the floor the sky's shadow ends, about, in sizes of what is shown."""
+SKY = 0.32
+"""The part of the light that comes from the sky."""
+
 
 Soften = Callable[[wp.array], wp.array]
 
@@ -59,6 +79,185 @@ LONGEST = 0.04
 
 
 Placed = tuple[ShownSolid, SolidMesh]
+
+
+MODULE = kernel_module("shadow")
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def cast(
+    places: Vec3s,
+    looks: wp.array(dtype=Look),
+    volumes: Floats,
+    corner: wp.vec3,
+    cell: wp.float32,
+    slope: wp.vec2,
+    fading: wp.float32,
+    begin: wp.vec2i,
+    thickness: Vec4s2d,
+):
+    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
+    and its thickness; the less the higher it is, by ``fading`` [1/m]. ``begin``: the first node that is there."""
+    i = wp.tid()
+    height = places[i][1] - corner[1]
+    x = (places[i][0] - height * slope[0] - corner[0]) / cell
+    z = (places[i][2] - height * slope[1] - corner[2]) / cell
+    u = int(wp.floor(x)) - begin[0]
+    v = int(wp.floor(z)) - begin[1]
+    if u >= 0 and v >= 0 and u + 1 < thickness.shape[0] and v + 1 < thickness.shape[1]:
+        c = looks[i]
+        above = volumes[i] * wp.exp(-fading * height) / (cell * cell) * wp.vec4(c[0], c[1], c[2], 1.0)
+        for n in range(4):
+            m = n & 1
+            k = n >> 1
+            a = 1.0 - wp.abs(x - float(begin[0] + u + m))
+            b = 1.0 - wp.abs(z - float(begin[1] + v + k))
+            wp.atomic_add(thickness, u + m, v + k, a * b * above)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, found: Vec4s2d):
+    """Along one axis, or ``across``, along the other."""
+    n = first + wp.tid()
+    i = n / sharp.shape[1]
+    j = n % sharp.shape[1]
+    total = wp.vec4(0.0)
+    for k in range(1 - weights.shape[0], weights.shape[0]):
+        u = i + wp.where(across > 0, 0, k)
+        v = j + wp.where(across > 0, k, 0)
+        if u >= 0 and v >= 0 and u < sharp.shape[0] and v < sharp.shape[1]:
+            total += weights[wp.abs(k)] * sharp[u, v]
+    found[i, j] = total
+
+
+@wp.func
+def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
+    """The part of the light that something of a thickness keeps off, of its own colour less than of others."""
+    reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
+    colour = wp.vec3(above[0], above[1], above[2])
+    hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
+    return reached * (wp.vec3(opacity - 0.35 * tinted) - 0.65 * tinted * hue)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def darken(
+    first: wp.int32,
+    key: Vec4s2d,
+    around: Vec4s2d,
+    strength: wp.vec2,
+    layer: wp.float32,
+    opacity: wp.float32,
+    tinted: wp.float32,
+    begin: wp.vec2i,
+    light: Vec3s2d,
+):
+    """What the lamp's light and the sky's leave, of so much ``strength`` each, of the nodes from ``begin`` on."""
+    n = first + wp.tid()
+    i = n / key.shape[1]
+    j = n % key.shape[1]
+    left = wp.vec3(1.0) - strength[0] * kept_off(key[i, j], layer, opacity, tinted)
+    left -= strength[1] * kept_off(around[i, j], layer, opacity, tinted)
+    u = begin[0] + i
+    v = begin[1] + j
+    light[u, v] = wp.min(light[u, v], left)
+
+
+@dataclass(frozen=True)
+class Caster:
+    """What casts a shadow, in many small parts."""
+
+    parts: Particles
+    """In the frame of the picture."""
+    to_lamp: wp.array
+    """(n,) the volumes of the parts [m3], as the lamp sees them"""
+    to_sky: wp.array
+    """(n,) as the sky does"""
+    opacity: float = 1.0
+    tinted: float = 0.0
+    """How much more light of its own colour comes through, from 0 to 1."""
+
+
+class FloorShadow:
+    """The part of the light that reaches the floor."""
+
+    def __init__(self, stage: Stage, launch: BandLauncher):
+        middle = 0.5 * (stage.lower + stage.upper)
+        self._stage, self._launch, self._device = stage, launch, launch.device
+        self.corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
+        """(3,) [m] where the first node is"""
+        self.cell = 2.0 * REACH * stage.size / (NODES - 1)
+        """How far nodes are apart [m]."""
+        self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
+        """(nodes, nodes) by x and z"""
+
+    def of_fluid(self, particles: Particles) -> None:
+        """Add that of particles, in the frame of the picture."""
+        stage = self._stage
+        volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
+        caster = Caster(particles, volumes, volumes, tinted=0.4 * stage.transparency)
+        self._add(caster, 0.8 * stage.spacing, stage.spacing)
+
+    def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
+        """Add that of a solid."""
+        stage = self._stage
+        a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
+        middle = (a + b + c) / 3.0
+        casts = middle[:, 1] > stage.lower[1] + ABOVE * stage.size
+        if stage.cuts_solids:
+            casts &= ((middle >= stage.lower) & (middle <= stage.upper))[:, ::2].all(axis=1)
+        middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
+        volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
+        parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
+        to_lamp, to_sky = (self._array(one) for one in volumes)
+        self._add(Caster(parts, to_lamp, to_sky, opacity=1.0 - shown.transparency), 0.0, stage.spacing)
+
+    def _add(self, caster: Caster, least: float, layer: float) -> None:
+        if not len(caster.parts):
+            return
+        stage = self._stage
+        slope = stage.sun[::2] / stage.sun[1]
+        soft = [max(part * stage.size, least) / self.cell for part in (KEY, AROUND)]
+        bells = [_bell(sigma) for sigma in soft]
+        begin, shape = self._reached(caster.parts, slope, max(map(len, bells)))
+        seen = {"begin": wp.vec2i(*begin), "corner": wp.vec3(*self.corner), "cell": self.cell}
+        fading = 1.0 / (CLOSE * stage.size)
+        key = self._thickness(caster, caster.to_lamp, bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
+        own = {"slope": wp.vec2(0.0, 0.0), "fading": fading}
+        around = self._thickness(caster, caster.to_sky, bells[1], shape, **own, **seen)
+        strength = wp.vec2(stage.picture.sun_and_sky.shadow, SKY)
+        how = {"strength": strength, "layer": layer, "opacity": caster.opacity, "tinted": caster.tinted}
+        self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
+
+    def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
+        """The first of the nodes that the shadow of parts may reach, with so many ``around`` it, and how many there are
+        along each side: those elsewhere stay light, and take no time."""
+        lower, upper = (end - self.corner for end in parts.ends(self._launch))
+        shifts = np.outer((0.0, lower[1], upper[1]), slope)
+        first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
+        last = np.ceil((upper[::2] - shifts.min(axis=0)) / self.cell) + around
+        first, last = (np.clip(end, 0, NODES - 2).astype(int) for end in (first, last))
+        rows, columns = (last - first + 2).tolist()
+        return first.tolist(), (rows, columns)
+
+    def _thickness(self, caster: Caster, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any) -> Any:
+        """Of vec4, as `cast` adds it up at nodes of this shape, blurred by a bell."""
+        sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
+        given = {"places": caster.parts.places, "looks": caster.parts.looks, "volumes": volumes}
+        launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
+        weights, other = self._array(bell), wp.empty_like(sharp)
+        self._launch(blur, sharp.size, across=0, weights=weights, sharp=sharp, found=other)
+        self._launch(blur, sharp.size, across=1, weights=weights, sharp=other, found=sharp)
+        return sharp
+
+    def _array(self, values: Points) -> wp.array:
+        return wp.array(values.astype(np.float32), dtype=wp.float32, device=self._device)
+
+
+def _bell(sigma: float) -> Points:
+    """The weights of a place and of those so many nodes beside it, by a Gaussian that is ``sigma`` nodes wide."""
+    bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
+    found: Points = bell / (2.0 * bell.sum() - 1.0)
+    return found
 
 
 class SolidSurfaces:

@@ -17,8 +17,7 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.tracing.liquid_surface import Level, liquid_level, liquid_surface, spheres
 from cortado.pictures.tracing.near_particles import Particles, list_marked, marked
-from cortado.pictures.tracing.shadow import FloorShadow, cast
-from cortado.pictures.tracing.solid_surfaces import DeviceSurface, SolidSurfaces
+from cortado.pictures.tracing.solid_surfaces import DeviceSurface, FloorShadow, SolidSurfaces, cast
 from cortado.pictures.tracing.steady import steadied, still_of
 from cortado.pictures.tracing.surroundings import EDGE, GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.tracing.trace import Eye, find_contrast, illuminate_kernel, trace_kernel

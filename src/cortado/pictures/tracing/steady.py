@@ -13,9 +13,17 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import BandLauncher
-from cortado.pictures.tracing.array_types import Floats, Floats2d, Ints, Ints2d, Vec3s2d
-from cortado.pictures.tracing.level_blocks import CUBES, WIDTH, Blocks, block_at, index_of, place_of
-from cortado.pictures.tracing.near_particles import MODULE, NearParticles, count_near
+from cortado.pictures.tracing.near_particles import (
+    MODULE,
+    Floats,
+    Floats2d,
+    Ints,
+    Ints2d,
+    NearParticles,
+    Vec3s2d,
+    count_near,
+)
+from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
 """Frames before and after one that have a share in its level and in its shadow, the less the farther they are."""

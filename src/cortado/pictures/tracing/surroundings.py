@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.pictures.tracing.array_types import Floats, Ints, Vec2s, Vec3s, Vec3s2d
+from cortado.pictures.tracing.near_particles import Floats, Ints, Vec2s, Vec3s, Vec3s2d
 
 
 @wp.struct

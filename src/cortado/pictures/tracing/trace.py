@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.pictures.tracing.array_types import Ints, Vec2s, Vec3s, Vec3s2d
+from cortado.pictures.tracing.near_particles import Ints, Vec2s, Vec3s, Vec3s2d
 from cortado.pictures.tracing.ray_hits import glass_functions, meet_solid, reach_solid, shaded_solid, surface_functions
 from cortado.pictures.tracing.surroundings import (
     FAR,

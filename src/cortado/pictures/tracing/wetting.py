@@ -15,8 +15,7 @@ from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.stage import Stage
-from cortado.pictures.tracing.array_types import Ints, Vec3s
-from cortado.pictures.tracing.near_particles import MODULE, Look, Particles, last_of, mixed
+from cortado.pictures.tracing.near_particles import MODULE, Ints, Look, Particles, Vec3s, last_of, mixed
 from cortado.pictures.tracing.surroundings import GLASS_BOX, Environment
 
 SKIN = 0.7

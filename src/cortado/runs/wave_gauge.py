@@ -24,7 +24,7 @@ from cortado.discretise.room import Domain
 from cortado.discretise.shapes import corners, grid
 from cortado.discretise.solid import Solid
 from cortado.particles.state import padded
-from cortado.runs.sensors.sensor import (
+from cortado.runs.sensor import (
     ACROSS,
     Reading,
     Seen,

@@ -350,7 +350,7 @@ class Vorticity:
 
 @dataclass(frozen=True)
 class WallForceQuantity:
-    """What a particle pushes all walls with: see `cortado.runs.quantities.formulas`."""
+    """What a particle pushes all walls with: see `cortado.runs.quantity_formulas`."""
 
     loads: WallLoads
     dimension: int

@@ -15,8 +15,8 @@ from cortado.files.image_encoding import to_srgb
 from cortado.files.input_files import as_path
 from cortado.files.output_files import sentences, unfinished, write_atomically
 from cortado.files.terminal import announce, track
-from cortado.pictures.exports.exported import Exported, ExportedFrame, Mesh, Pose, in_space
-from cortado.runs.frame_file import FRACTION
+from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose, in_space
+from cortado.runs.frames import FRACTION
 from cortado.runs.solid_motion import SolidMotion
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.quantity_names import QUANTITIES

@@ -1,1 +1,0 @@
-"""Runs as files of other programs: meshes, points and solids over time, and labelled arrays."""
