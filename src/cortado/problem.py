@@ -21,8 +21,8 @@ from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimat
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.losses import fingerprint as loss_fingerprint
-from cortado.losses.loss import StepBar, moment_of
-from cortado.losses.run_losses import LossesByStep, derivative_along
+from cortado.losses.loss import StepBar, moment_of, slope
+from cortado.losses.run_losses import LossesByStep
 from cortado.particles.state import Parameters, State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.device_states import OfLost, without_lost
@@ -300,8 +300,9 @@ class Problem:
         loss, bars = self._losses.total_and_adjoints(ends, self._going)
         for step, dot in dots.items():
             dot |= self.along(ends[step], bars[step].quantities, dot, parameters, directions)
-        slope = derivative_along(bars, dots, directions.get("colours"), np.shape(loss))
-        return slope + 0.0 * loss if slope.ndim else float(slope)
+            dot |= {name: directions[name] for name in ("colours",) if name in directions}
+        found = sum((slope(bars[step], dots[step], np.shape(loss)) for step in sorted(dots)), np.zeros(np.shape(loss)))
+        return found + 0.0 * loss if found.ndim else float(found)
 
     @in_turn
     def tangents(

@@ -21,7 +21,7 @@ from cortado.losses import (
     Snapshot,
     SnapshotAdjoint,
 )
-from cortado.losses.loss import Adjoint, by_field
+from cortado.losses.loss import Adjoint, by_field, slope
 from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
@@ -156,8 +156,9 @@ class LossHistory:
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
-            differences.append(_change(loss, before, after) if rounded and h < 1.0 else _values(loss, before, after))
-            sums.append(np.nan if rounded else loss.value(before) + loss.value(after))
+            old, new = loss.value(before), loss.value(after)
+            differences.append(_change(loss, before, after) if rounded and h < 1.0 else new - old)
+            sums.append(np.nan if rounded else old + new)
         unknown = [np.nan] * (len(self.sample_steps) - len(sums))
         bends = np.abs(self._total(sums + unknown) - 2.0 * losses) / h
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
@@ -174,7 +175,7 @@ class LossHistory:
         for row, h in zip(found, ROUGH, strict=True):
             for k, (loss, before, after) in enumerate(self._beside(parameters, along, h)):
                 if isinstance(loss, Rounded):
-                    by_adjoint, by_value = _change(loss, before, after), _values(loss, before, after)
+                    by_adjoint, by_value = _change(loss, before, after), loss.value(after) - loss.value(before)
                     size, noise = max(abs(by_adjoint), abs(by_value)), ROUND_OFF * abs(loss.value(after))
                     row[k] = abs(by_adjoint - by_value) / size if size > ABOVE_ROUND_OFF * noise else np.inf
         seen = found.min(axis=0)
@@ -220,17 +221,10 @@ class LossHistory:
             _, bar = loss.value_and_adjoint(ends[step])
             wanted = [name for name in by_field(bar, dimension) if name not in dots[step]]
             more = self.problem.along(ends[step], wanted, dots[step], parameters, along)
-            slopes.append(_product(bar, dots[step] | more) + _of_colours(bar, along))
+            slopes.append(float(slope(bar, {**along, **dots[step], **more})))
             strain.append(_strain(ends[step].positions, dots[step]["positions"]))
-        return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
-
-    def _judged(self, ends: dict[int, Snapshot]) -> np.ndarray:
-        return self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
-
-
-def _values(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """The difference of a loss between two states."""
-    return loss.value(after) - loss.value(before)
+        losses = self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
+        return Tangent(losses, self._total(slopes), np.array(strain))
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
@@ -240,23 +234,11 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
-    distance, colours = {name: new[name] - old[name] for name in new}, {"colours": after.colours - before.colours}
+    distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
     bars = [loss.value_and_adjoint(end)[1] for end in ends]
     beyond = {name for bar in bars for name in by_field(bar, before.dimension) if name not in distance}
     distance |= {name: after[name] - before[name] for name in beyond}
-    return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
-
-
-def _product(bar: Adjoint, dot: Arrays) -> float:
-    """The adjoint of a state times its tangent."""
-    arrays = by_field(bar, dot["positions"].shape[1])
-    return float(sum((array.astype(np.float64) * dot[name]).sum() for name, array in arrays.items()))
-
-
-def _of_colours(bar: object, along: Arrays) -> float:
-    if isinstance(bar, SnapshotAdjoint) and "colours" in along:
-        return float((bar.colours * along["colours"]).sum())
-    return 0.0
+    return 0.5 * sum(float(slope(bar, distance)) for bar in bars)
 
 
 def _strain(positions: np.ndarray, dot: np.ndarray) -> float:

@@ -166,6 +166,32 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
     return bar.numpy(dimension) if isinstance(bar, State) else dict(zip(ADJOINT_FIELDS, bar, strict=False))
 
 
+def adjoint_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
+    """Any adjoint of a state, as Warp arrays and, of quantities, by name."""
+    if isinstance(bar, SnapshotAdjoint):
+        return bar
+    no_colours = np.zeros_like(end.colours)
+    if isinstance(bar, State):
+        return SnapshotAdjoint(bar, no_colours)
+    state, arrays = end.state.like(), by_field(bar, end.dimension)
+    state.set(arrays)
+    quantities = {name: array for name, array in arrays.items() if name not in state.names}
+    return SnapshotAdjoint(state, no_colours, quantities)
+
+
+def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
+    """The derivative of a loss along tangents of fields, quantities and ``colours`` (phases, 3), by name, what is left
+    out being 0: a number, or of a batch in the shape ``leading``, (batch,). Vectors are (n, d), or all (n, 3)."""
+    arrays = by_field(bar, np.shape(dots["positions"])[-1])
+    arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
+    products = [
+        array.astype(np.float64) * np.asarray(dots[name], dtype=np.float64)
+        for name, array in arrays.items()
+        if name in dots
+    ]
+    return sum((each.reshape(*leading, -1).sum(axis=-1) for each in products), np.zeros(leading))
+
+
 class Loss(Protocol):
     """A differentiable number of the end of a trajectory.
 

@@ -20,13 +20,12 @@ from cortado.losses.loss import (
     Snapshot,
     SnapshotAdjoint,
     SnapshotBatch,
+    adjoint_on_device,
     batch_values,
     batch_values_and_adjoints,
-    by_field,
     moment_of,
 )
 from cortado.particles.state import State
-from cortado.scene.parameter_values import Arrays
 from cortado.scene.quantity_names import check_readable
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
@@ -221,42 +220,7 @@ class LossesByStep(dict[int, Loss]):
         self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}
-            bars = {step: _on_device(bar, ends[step]) for step, (_, bar) in one.items()}
+            bars = {step: adjoint_on_device(bar, ends[step]) for step, (_, bar) in one.items()}
             return sum(value for value, _ in one.values()), bars
         each = {step: batch_values_and_adjoints(loss, ends[step], going) for step, loss in self.items()}
         return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}
-
-
-def _on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    if isinstance(bar, SnapshotAdjoint):
-        return bar
-    no_colours = np.zeros_like(end.colours)
-    if isinstance(bar, State):
-        return SnapshotAdjoint(bar, no_colours)
-    state, arrays = end.state.like(), by_field(bar, end.dimension)
-    state.set(arrays)
-    of_quantities = {name: array for name, array in arrays.items() if name not in state.names}
-    return SnapshotAdjoint(state, no_colours, of_quantities)
-
-
-def derivative_along(
-    bars: Mapping[int, SnapshotAdjoint],
-    dots: Mapping[int, Arrays],
-    colours_dot: Any,
-    leading: tuple[int, ...],
-) -> np.ndarray:
-    """The sum of all products of adjoints and tangents, in the shape ``leading``: (batch,), or () of a single scene.
-
-    ``bars`` are the adjoints of the states by the number of steps before them, ``dots`` their tangents by the names of
-    fields and quantities, vectors (n, 3), ``colours_dot`` (phases, 3) the tangent of the colours, None where they stay.
-    """
-
-    def product(bar: np.ndarray, dot: Any) -> np.ndarray:
-        each = bar.astype(np.float64) * np.asarray(dot, dtype=np.float64)
-        return np.asarray(each.reshape(*leading, -1).sum(axis=-1))
-
-    terms = [] if colours_dot is None else [product(bar.colours, colours_dot) for bar in bars.values()]
-    for step in sorted(dots):
-        bar = by_field(bars[step], 3)
-        terms += [product(bar[name], dot) for name, dot in dots[step].items()]
-    return sum(terms, np.zeros(leading))
