@@ -8,12 +8,14 @@ import pytest
 import warp as wp
 
 from benchmarks.by_hand import ROOT, noting_factories, pairs, without_walls
+from cortado.device.launching import bundles_of, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.particles.made_derivatives import made_adjoint, made_tangent, pointwise_kernels
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import fluid_sum, pair_sum, wall_sum
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from test_kernels import array, cloud
 
 D = Discretisation(CUBIC_SPLINE, FLOAT64)
@@ -78,6 +80,36 @@ def vector_walls(x_ij: vector) -> vector:
 def test_what_a_term_cannot_be_is_said(make, term, message):
     with pytest.raises(TypeError, match=re.escape(message)):
         make(term)
+
+
+def test_arguments_of_a_kernel_are_what_their_names_say():
+    """Few arrays one by one and many in bundles, in two scenes."""
+    module, numbers, n = kernel_module("test_arguments"), wp.array(dtype=real), 6
+    rng = np.random.default_rng(3)
+
+    @particle_kernel(module, "+a b:before c", numbers=["factor"])
+    def few(i: int, member: int, factor: real, time_step: real, c_i: real, table: numbers) -> tuple[real, real, real]:
+        return time_step * c_i, factor * table[i], real(member) + c_i
+
+    @particle_kernel(module, "+a b:before c d e f g h", numbers=["factor"])
+    def many(
+        i: int, member: int, factor: real, time_step: real, c_i: real, d_i: real, table: numbers
+    ) -> tuple[real, real, real, real, real, real, real, real]:
+        return time_step * c_i, factor * table[i], real(member) + c_i, d_i, d_i, d_i, d_i, d_i
+
+    for kernel, arrays in (few, "abc"), (many, "abcdefgh"):
+        start = {name: rng.normal(size=n) for name in (*arrays, "before", "table")}
+        on_device = {name: wp.array(value, dtype=real, device="cpu") for name, value in start.items()}
+        time_step = wp.array([0.5, 2.0], dtype=real, device="cpu")
+        launch(kernel, n, wp.get_device("cpu"), on_device, particles=3, factor=0.3, time_step=time_step)
+        wanted = {
+            "a": start["a"] + np.repeat([0.5, 2.0], 3) * start["c"],
+            "b": start["before"] + 0.3 * start["table"],
+            "c": np.repeat([0.0, 1.0], 3) + start["c"],
+        }
+        for name, value in wanted.items():
+            np.testing.assert_allclose(on_device[name].numpy(), value, rtol=1e-14)
+        assert ("to" in bundles_of(kernel)) == (kernel is many)
 
 
 MEMBERS, PARTICLES = 2, 5

@@ -156,6 +156,7 @@ def summed(
     exec(text, known)
     made: Any = wp.Function(known[name], name, "", module=module, source=text)
     made.shares_lanes = True  # which `cortado.device.lanes.check_lanes` looks for
+    made.arrays, made.others, made.results, made.discretisation = arrays, others, results, d
     return made
 
 
@@ -326,7 +327,7 @@ def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = N
     terms = {"_term": term, "_wall_term": wall, "_grown_term": wall if grows is None else grows.wall}
     functions = {name: wp.func(one.function, module=module) for name, one in terms.items()}
     made = summed(term.name, d, term.arrays, term.others, term.results, loops, functions, module)
-    made.term, made.wall, made.discretisation = term, wall, d
+    made.term, made.wall = term, wall
     return made
 
 

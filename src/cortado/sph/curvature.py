@@ -98,12 +98,8 @@ class CurvatureFunctions:
     """The adjoint of q, of q, the spacing and the adjoints of w and e."""
     curvature: Any
     """kappa of B and D."""
-    curvature_back: Any
-    """kappa and the symmetric adjoints of B and D, for that of kappa; a tangent follows from those for 1."""
     outermost: Any
     """k of a, b and delta."""
-    outermost_back: Any
-    """The derivatives of k by a and b."""
 
 
 @cache
@@ -160,15 +156,6 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
         return -part / (B[0, 0] * a + B[1, 0] * b + B[2, 0] * c + singular)
 
     @wp.func(module=module)
-    def curvature_back(B: matrix, D: matrix, bar: real):
-        by_B, by_D = wp.grad(curvature)(B, D)
-        return (
-            curvature(B, D),
-            (real(0.5) * bar) * (by_B + wp.transpose(by_B)),
-            (real(0.5) * bar) * (by_D + wp.transpose(by_D)),
-        )
-
-    @wp.func(module=module)
     def outermost(a: real, b: real, depth: real) -> real:
         mean = a / (b + lone)
         more = depth * mean
@@ -176,14 +163,7 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
         divisor = real(1.0) - real(2.0) * hollow + rest * rest / (real(4.0) * hollow) + wp.max(more + hollow, real(0.0))
         return mean / divisor
 
-    @wp.func(module=module)
-    def outermost_back(a: real, b: real, depth: real):
-        by_a, by_b, _by_depth = wp.grad(outermost)(a, b, depth)
-        return by_a, by_b
-
-    return CurvatureFunctions(
-        *(normal, normal_tangent, normal_back), *(curvature, curvature_back), *(outermost, outermost_back)
-    )
+    return CurvatureFunctions(normal, normal_tangent, normal_back, curvature, outermost)
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,10 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.curvature import curvature_functions, curvature_sums
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
@@ -62,100 +61,53 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
-    colour_sum, average_sum, bend_sum, mean_sum = sums.colour, sums.average, sums.bend, sums.mean
     moments = moment_functions(precision, dimension)
     whole, even = moments.whole, moments.change
     topic = f"surface_curvature_{dimension}d"
     module = discretisation.module(True, topic)
     own = curvature_functions(precision, dimension, module)
     normal_of, curvature_of, outermost = own.normal, own.curvature, own.outermost
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
 
-    @wp.kernel(module=module)
-    def colour(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        # out
-        g: wp.array(dtype=vector),
-        z: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        g_i, others = colour_sum(i, x, s)
-        if lane() > 0:
-            return
-        g[i] = g_i
-        z[i] = others + real(1 - s.filling[i]) * s.self_weight * s.volume
+    @particle_kernel(module, "g z", [over(sums.colour, "g others")])
+    def colour(i: int, g: vector, others: real, s: neighbourhood) -> tuple[vector, real]:
+        return g, others + real(1 - s.filling[i]) * s.self_weight * s.volume
 
-    @wp.kernel(module=module)
+    @particle_kernel(module, "q w e", [over(sums.average, "others")], numbers=["spacing"])
     def normal(
-        s: neighbourhood,
-        spacing: real,
-        x: wp.array(dtype=vector),
-        g: wp.array(dtype=vector),
-        z: wp.array(dtype=real),
-        # out
-        q: wp.array(dtype=vector),
-        w: wp.array(dtype=real),
-        e: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        others = average_sum(i, x, g, s)
-        if lane() > 0:
-            return
-        q_i = (others + (real(1 - s.filling[i]) * s.self_weight * s.volume) * g[i]) / z[i]
-        w_i, e_i = normal_of(q_i, spacing)
-        q[i] = q_i
-        w[i] = w_i
-        e[i] = e_i
+        i: int, others: vector, spacing: real, g_i: vector, z_i: real, s: neighbourhood
+    ) -> tuple[vector, real, vector]:
+        q = (others + (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_i) / z_i
+        w, e = normal_of(q, spacing)
+        return q, w, e
 
-    @wp.kernel(module=module)
-    def bend(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        e: wp.array(dtype=vector),
-        w: wp.array(dtype=real),
-        # out
-        B: wp.array(dtype=matrix),
-        D: wp.array(dtype=matrix),
-        c: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        diagonal, others, turned, mixed = bend_sum(i, x, e, w, s)
-        if lane() > 0:
-            return
-        B_i, D_i = whole(diagonal, others), even(turned, mixed)
-        B[i] = B_i
-        D[i] = D_i
-        c[i] = w[i] * curvature_of(B_i, D_i)
+    @particle_kernel(module, "B D c", [over(sums.bend, "diagonal others turned mixed")])
+    def bend(diagonal: vector, others: vector, turned: vector, mixed: vector, w_i: real) -> tuple[matrix, matrix, real]:
+        B, D = whole(diagonal, others), even(turned, mixed)
+        return B, D, w_i * curvature_of(B, D)
 
-    @wp.kernel(module=module)
+    @particle_kernel(
+        module,
+        "a b acceleration:acceleration_in",
+        [over(sums.mean, "others_a others_b")],
+        numbers=["depth", "per_width"],
+    )
     def mean(
-        s: neighbourhood,
+        i: int,
+        others_a: real,
+        others_b: real,
         depth: real,
         per_width: real,
-        surface_tension: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        q: wp.array(dtype=vector),
-        w: wp.array(dtype=real),
-        c: wp.array(dtype=real),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        a: wp.array(dtype=real),
-        b: wp.array(dtype=real),
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        a_i, b_i = mean_sum(i, x, c, w, s)
-        if lane() > 0:
-            return
+        surface_tension: real,
+        m_i: real,
+        q_i: vector,
+        w_i: real,
+        c_i: real,
+        s: neighbourhood,
+    ) -> tuple[real, real, vector]:
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
-        a_all, b_all = a_i + self_weight * c[i], b_i + self_weight * w[i]
-        a[i] = a_all
-        b[i] = b_all
-        strength = surface_tension[i // s.particles] * per_width / m[i]
-        acceleration[i] = acceleration_in[i] + (strength * outermost(a_all, b_all, depth) * w[i]) * q[i]
+        a, b = others_a + self_weight * c_i, others_b + self_weight * w_i
+        strength = surface_tension * per_width / m_i
+        return a, b, (strength * outermost(a, b, depth) * w_i) * q_i
 
     made = discretisation, dimension, topic
     three = zip((colour, normal, bend, mean), curvature_tangents(*made), curvature_adjoints(*made), strict=True)
@@ -168,111 +120,76 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
-    colour_sum, average_sum, bend_sum, mean_sum = (
-        *(sums.colour_tangent, sums.average_tangent),
-        *(sums.bend_tangent, sums.mean_tangent),
-    )
     even = moment_functions(precision, dimension).change
     module = discretisation.tangent_module(topic)
     own = curvature_functions(precision, dimension, module)
-    normal_of, curvature_back, outermost, outermost_back = (
-        *(own.normal_tangent, own.curvature_back),
-        *(own.outermost, own.outermost_back),
-    )
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
-    coloured, bent = bundle(x=vector, g=vector, z=real), bundle(x=vector, e=vector, w=real)
-    meant = bundle(x=vector, m=real, q=vector, w=real, c=real)
+    normal_of, curvature_of, outermost = own.normal_tangent, own.curvature, own.outermost
 
-    @wp.kernel(module=module, enable_backward=False)
-    def colour_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        # out
-        g_dot: wp.array(dtype=vector),
-        z_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        g_i_dot, z_i_dot = colour_sum(i, x, x_dot, s)
-        if lane() > 0:
-            return
-        g_dot[i] = g_i_dot
-        z_dot[i] = z_i_dot
-
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average_tangent, "others")], numbers=["spacing"])
     def normal_tangent(
-        s: neighbourhood,
-        spacing: real,
-        now: coloured,
-        dot: coloured,
-        q: wp.array(dtype=vector),
-        # out
-        q_dot: wp.array(dtype=vector),
-        w_dot: wp.array(dtype=real),
-        e_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        others = average_sum(i, now.x, dot.x, now.g, dot.g, s)
-        if lane() > 0:
-            return
-        own_part = (real(1 - s.filling[i]) * s.self_weight * s.volume) * dot.g[i]
-        q_i_dot = (others + own_part - dot.z[i] * q[i]) / now.z[i]
-        w_i_dot, e_i_dot = normal_of(q[i], spacing, q_i_dot)
-        q_dot[i] = q_i_dot
-        w_dot[i] = w_i_dot
-        e_dot[i] = e_i_dot
+        i: int, others: vector, spacing: real, g_dot_i: vector, z_i: real, z_dot_i: real, q_i: vector, s: neighbourhood
+    ) -> tuple[vector, real, vector]:
+        own_part = (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_dot_i
+        q_dot = (others + own_part - z_dot_i * q_i) / z_i
+        w_dot, e_dot = normal_of(q_i, spacing, q_dot)
+        return q_dot, w_dot, e_dot
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "c_dot", [over(sums.bend_tangent, "diagonal others turned mixed")])
     def bend_tangent(
-        s: neighbourhood,
-        now: bent,
-        dot: bent,
-        B: wp.array(dtype=matrix),
-        D: wp.array(dtype=matrix),
-        c: wp.array(dtype=real),
-        # out
-        c_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        diagonal, others, turned, mixed = bend_sum(i, now.x, dot.x, now.e, dot.e, now.w, dot.w, s)
-        if lane() > 0:
-            return
-        kappa, by_B, by_D = curvature_back(B[i], D[i], real(1.0))
+        diagonal: vector,
+        others: vector,
+        turned: vector,
+        mixed: vector,
+        w_i: real,
+        w_dot_i: real,
+        B_i: matrix,
+        D_i: matrix,
+    ) -> real:
+        by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
         kappa_dot = wp.ddot(by_B, even(diagonal, others)) + wp.ddot(by_D, even(turned, mixed))
-        c_dot[i] = dot.w[i] * kappa + now.w[i] * kappa_dot
+        return w_dot_i * curvature_of(B_i, D_i) + w_i * kappa_dot
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(
+        module,
+        "acceleration_dot:acceleration_in_dot",
+        [over(sums.mean_tangent, "others_a others_b")],
+        numbers=["depth", "per_width"],
+    )
     def mean_tangent(
-        s: neighbourhood,
+        i: int,
+        others_a: real,
+        others_b: real,
         depth: real,
         per_width: real,
-        surface_tension: wp.array(dtype=real),
-        surface_tension_dot: wp.array(dtype=real),
-        now: meant,
-        dot: meant,
-        a: wp.array(dtype=real),
-        b: wp.array(dtype=real),
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        a_dot, b_dot = mean_sum(i, now.x, dot.x, now.c, dot.c, now.w, dot.w, s)
-        if lane() > 0:
-            return
-        self_weight, member = real(1 - s.filling[i]) * s.self_weight * s.volume, i // s.particles
-        a_dot += self_weight * dot.c[i]
-        b_dot += self_weight * dot.w[i]
-        k, w_i, q_i = outermost(a[i], b[i], depth), now.w[i], now.q[i]
-        by_a, by_b = outermost_back(a[i], b[i], depth)
+        surface_tension: real,
+        surface_tension_dot: real,
+        m_i: real,
+        m_dot_i: real,
+        q_i: vector,
+        q_dot_i: vector,
+        w_i: real,
+        w_dot_i: real,
+        c_dot_i: real,
+        a_i: real,
+        b_i: real,
+        s: neighbourhood,
+    ) -> vector:
+        self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
+        a_dot, b_dot = others_a + self_weight * c_dot_i, others_b + self_weight * w_dot_i
+        k = outermost(a_i, b_i, depth)
+        by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
         k_dot = by_a * a_dot + by_b * b_dot
-        strength = surface_tension[member] * per_width / now.m[i]
-        strength_dot = (surface_tension_dot[member] * per_width - strength * dot.m[i]) / now.m[i]
-        along = strength_dot * k * w_i + strength * (k_dot * w_i + k * dot.w[i])
-        acceleration_dot[i] = acceleration_in_dot[i] + along * q_i + (strength * k * w_i) * dot.q[i]
+        strength = surface_tension * per_width / m_i
+        strength_dot = (surface_tension_dot * per_width - strength * m_dot_i) / m_i
+        along = strength_dot * k * w_i + strength * (k_dot * w_i + k * w_dot_i)
+        return along * q_i + (strength * k * w_i) * q_dot_i
 
-    return colour_tangent, normal_tangent, bend_tangent, mean_tangent
+    return (
+        sum_kernel("colour_tangent", module, "g_dot z_dot", sums.colour_tangent),
+        normal_tangent,
+        bend_tangent,
+        mean_tangent,
+    )
 
 
 @cache
@@ -281,135 +198,76 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
-    colour_back, average_back, bend_back, mean_back = (
-        *(sums.colour_back, sums.average_back),
-        *(sums.bend_back, sums.mean_back),
-    )
     module = discretisation.module(False, topic)
     own = curvature_functions(precision, dimension, module)
-    normal_back, curvature_back, outermost, outermost_back = (
-        *(own.normal_back, own.curvature_back),
-        *(own.outermost, own.outermost_back),
-    )
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
-    acting, of_means = bundle(m=real, q=vector, w=real, a=real, b=real), bundle(a=real, b=real)
-    bent, matrices = bundle(x=vector, e=vector, w=real), bundle(B=matrix, D=matrix)
+    normal_back, curvature_of, outermost = own.normal_back, own.curvature, own.outermost
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+m_bar +surface_tension_bar q_bar w_bar a_bar b_bar", numbers=["depth", "per_width"])
     def force_adjoint(
-        particles: int,
         depth: real,
         per_width: real,
-        surface_tension: wp.array(dtype=real),
-        now: acting,
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        m_bar: wp.array(dtype=real),
-        surface_tension_bar: wp.array(dtype=real),
-        # out
-        q_bar: wp.array(dtype=vector),
-        w_bar: wp.array(dtype=real),
-        bar: of_means,
-    ):
+        surface_tension: real,
+        m_i: real,
+        q_i: vector,
+        w_i: real,
+        a_i: real,
+        b_i: real,
+        acceleration_bar_i: vector,
+    ) -> tuple[real, real, vector, real, real, real]:
         """What the adjoint of the acceleration asks of a particle's own numbers."""
-        i = wp.tid()
-        m_i, w_i, k = now.m[i], now.w[i], outermost(now.a[i], now.b[i], depth)
-        by_a, by_b = outermost_back(now.a[i], now.b[i], depth)
-        strength = surface_tension[i // particles] * per_width / m_i
-        work = wp.dot(now.q[i], acceleration_bar[i])
-        m_bar[i] = m_bar[i] - strength * k * w_i * work / m_i
-        surface_tension_bar[i] = surface_tension_bar[i] + per_width / m_i * k * w_i * work
-        q_bar[i] = (strength * k * w_i) * acceleration_bar[i]
-        w_bar[i] = strength * k * work
-        bar.a[i] = strength * w_i * work * by_a
-        bar.b[i] = strength * w_i * work * by_b
+        k = outermost(a_i, b_i, depth)
+        by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
+        strength, work = surface_tension * per_width / m_i, wp.dot(q_i, acceleration_bar_i)
+        return (
+            -strength * k * w_i * work / m_i,
+            per_width / m_i * k * w_i * work,
+            (strength * k * w_i) * acceleration_bar_i,
+            strength * k * work,
+            strength * w_i * work * by_a,
+            strength * w_i * work * by_b,
+        )
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(
+        module, "+x_bar +w_bar B_bar D_bar", [over(sums.mean_back, "c_part w_part x_part", a="a_bar", b="b_bar")]
+    )
     def mean_adjoint(
+        i: int,
+        c_part: real,
+        w_part: real,
+        x_part: vector,
+        w_i: real,
+        a_bar_i: real,
+        b_bar_i: real,
+        B_i: matrix,
+        D_i: matrix,
         s: neighbourhood,
-        x: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        a_bar: wp.array(dtype=real),
-        b_bar: wp.array(dtype=real),
-        now: matrices,
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        w_bar: wp.array(dtype=real),
-        # out
-        bar: matrices,
-    ):
+    ) -> tuple[vector, real, matrix, matrix]:
         """From the adjoints of a and b to those of B and D."""
-        i = s.first + wp.tid() // LANES
-        c_part, w_part, x_part = mean_back(i, x, c, w, a_bar, b_bar, s)
-        if lane() > 0:
-            return
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
-        c_bar = c_part + self_weight * a_bar[i]
-        kappa, B_bar, D_bar = curvature_back(now.B[i], now.D[i], w[i] * c_bar)
-        x_bar[i] = x_bar[i] + x_part
-        w_bar[i] = w_bar[i] + w_part + self_weight * b_bar[i] + kappa * c_bar
-        bar.B[i] = B_bar
-        bar.D[i] = D_bar
+        c_bar = c_part + self_weight * a_bar_i
+        by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
+        half = real(0.5) * w_i * c_bar  # of each matrix and of its transpose, as both are symmetric
+        w_bar = w_part + self_weight * b_bar_i + curvature_of(B_i, D_i) * c_bar
+        return x_part, w_bar, half * (by_B + wp.transpose(by_B)), half * (by_D + wp.transpose(by_D))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend_back, "e_bar w_part x_part")], numbers=["spacing"])
     def bend_adjoint(
-        s: neighbourhood,
+        e_bar: vector,
+        w_part: real,
+        x_part: vector,
         spacing: real,
-        now: bent,
-        bar: matrices,
-        q: wp.array(dtype=vector),
-        z: wp.array(dtype=real),
-        w_bar: wp.array(dtype=real),
-        q_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        # out
-        r: wp.array(dtype=vector),
-        z_bar: wp.array(dtype=real),
-    ):
+        q_i: vector,
+        z_i: real,
+        w_bar_i: real,
+        q_bar_i: vector,
+    ) -> tuple[vector, vector, real]:
         """From the adjoints of B, D, w and q to those of V sum W_ij g_j, which r is, and of z."""
-        i = s.first + wp.tid() // LANES
-        e_bar, w_part, x_part = bend_back(i, now.x, now.e, now.w, bar.B, bar.D, s)
-        if lane() > 0:
-            return
-        r_i = (q_bar[i] + normal_back(q[i], spacing, w_bar[i] + w_part, e_bar)) / z[i]
-        x_bar[i] = x_bar[i] + x_part
-        r[i] = r_i
-        z_bar[i] = -wp.dot(q[i], r_i)
+        r = (q_bar_i + normal_back(q_i, spacing, w_bar_i + w_part, e_bar)) / z_i
+        return x_part, r, -wp.dot(q_i, r)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def normal_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        g: wp.array(dtype=vector),
-        r: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        # out
-        g_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        g_part, x_part = average_back(i, x, g, r, s)
-        if lane() > 0:
-            return
-        g_bar[i] = g_part + (real(1 - s.filling[i]) * s.self_weight * s.volume) * r[i]
-        x_bar[i] = x_bar[i] + x_part
+    @particle_kernel(module, "g_bar +x_bar", [over(sums.average_back, "g_part x_part")])
+    def normal_adjoint(i: int, g_part: vector, x_part: vector, r_i: vector, s: neighbourhood) -> tuple[vector, vector]:
+        return g_part + (real(1 - s.filling[i]) * s.self_weight * s.volume) * r_i, x_part
 
-    @wp.kernel(module=module, enable_backward=False)
-    def colour_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        g_bar: wp.array(dtype=vector),
-        z_bar: wp.array(dtype=real),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        x_part = colour_back(i, x, g_bar, z_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_part
-
+    colour_adjoint = sum_kernel("colour_adjoint", module, "+x_bar", sums.colour_back)
     return colour_adjoint, normal_adjoint, bend_adjoint, (force_adjoint, mean_adjoint)

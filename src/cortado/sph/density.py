@@ -12,10 +12,10 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
+from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.particles.solid_shares import solid_kernel
 
 
@@ -74,52 +74,16 @@ def _density_work(d: Discretisation) -> Any:
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions, in the Warp modules of
     a topic: one that a solver has of its own saves it a module to load."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
+    module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
-    weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True, topic))
-    def density(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        # out
-        n: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = weights(i, x, s)
-        if lane() > 0:
-            return
-        n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
+    @particle_kernel(module, "n", [over(sums.weights, "total")])
+    def density(i: int, total: real, s: neighbourhood) -> real:
+        return s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.tangent_module(topic), enable_backward=False)
-    def density_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        # out
-        n_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = weights_tangent(i, x, x_dot, s)
-        if lane() > 0:
-            return
-        n_dot[i] = s.volume * total
-
-    @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)
-    def density_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = weights_adjoint(i, x, n_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + s.volume * total
-
-    return Kernels(density, density_tangent, density_adjoint)
+    return Kernels(
+        density,
+        sum_kernel("density_tangent", tangent_module, "n_dot", sums.weights_tangent, times="s.volume"),
+        sum_kernel("density_adjoint", adjoint_module, "+x_bar", sums.weights_adjoint, times="s.volume", r="n_bar"),
+    )

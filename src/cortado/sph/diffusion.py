@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.discretise.calibration import diffusion_limit
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import OutOfRangeError
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import dotted, over, particle_kernel
 from cortado.scene.scene import Scene
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy, Mobility
 
@@ -146,17 +145,10 @@ class Diffusion:
     energy: FreeEnergy
     mobility: Mobility
 
-    def module(self, forward: bool) -> Any:
-        """The Warp module of forward kernels, or of those of the adjoint."""
-        return self.discretisation.module(forward, self._topic)
-
-    def tangent_module(self) -> Any:
-        """The Warp module of the kernels of forward mode."""
-        return self.discretisation.tangent_module(self._topic)
-
     @property
-    def _topic(self) -> str:
-        return f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}"
+    def modules(self) -> tuple[Any, Any, Any]:
+        """The Warp modules of forward, tangent and adjoint kernels."""
+        return self.discretisation.modules(f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}")
 
 
 @dataclass(frozen=True)
@@ -177,15 +169,13 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     neighbourhood = neighbourhood_type(precision)
     sums = pairwise_laplacian_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
     mobile, mobile_gradient = form.value, form.gradient
 
-    potential_changes = bundle(x=vector, n=real, m=real, c=fractions)
-    flux_changes = bundle(x=vector, n=real, m=real, w=real, chi=fractions)
-    flux_adjoints = bundle(x=vector, n=real, m=real, c=fractions, time_step=real, mobility=real)
+    module, tangent_module, adjoint_module = diffusion.modules
+    of_c, of_chi = {"w": "m", "u": "c"}, {"u": "chi"}
+    """What the sum is of in the potential and in the flux."""
 
     @wp.func
     def project(u: fractions) -> fractions:
@@ -198,192 +188,110 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
             result[k] = u[k] - mean
         return result
 
-    @wp.kernel(module=diffusion.module(True))
+    @particle_kernel(module, "chi w", [over(spread, "total", **of_c)], numbers=["strength"])
     def potential(
-        s: neighbourhood,
+        total: fractions,
         strength: real,
-        interface_width: wp.array(dtype=real),
-        mobility: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        c: wp.array(dtype=fractions),
-        # out
-        chi: wp.array(dtype=fractions),
-        w: wp.array(dtype=real),
-    ):
-        """``w``: m M of a particle."""
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = spread(i, x, n, m, c, s)
-        if lane() > 0:
-            return
-        stiffness = interface_width[member] * interface_width[member] * s.volume / m[i]
-        chi[i] = strength * project(energy_gradient(c[i])) - stiffness * total
-        w[i] = m[i] * mobility[member] * mobile(c[i])
+        interface_width: real,
+        mobility: real,
+        m_i: real,
+        c_i: fractions,
+        s: neighbourhood,
+    ) -> tuple[fractions, real]:
+        """chi, and m M as ``w``."""
+        stiffness = interface_width * interface_width * s.volume / m_i
+        return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
 
-    @wp.kernel(module=diffusion.module(True))
+    @particle_kernel(module, "c_new", [over(spread, "total", **of_chi)], numbers=["substeps"])
     def flux(
-        s: neighbourhood,
-        substeps: int,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        chi: wp.array(dtype=fractions),
-        c: wp.array(dtype=fractions),
-        # out
-        c_new: wp.array(dtype=fractions),
-    ):
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = spread(i, x, n, w, chi, s)
-        if lane() > 0:
-            return
-        c_new[i] = c[i] + (time_step[member] / real(substeps) * s.volume / m[i]) * total
+        total: fractions, substeps: int, time_step: real, m_i: real, c_i: fractions, s: neighbourhood
+    ) -> fractions:
+        return c_i + (time_step / real(substeps) * s.volume / m_i) * total
 
-    @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
+    both = [over(spread, "total", **of_c), over(spread_tangent, "total_dot", **of_c, **dotted(of_c))]
+
+    @particle_kernel(tangent_module, "chi_dot w_dot", both, numbers=["strength"])
     def potential_tangent(
-        s: neighbourhood,
+        total: fractions,
+        total_dot: fractions,
         strength: real,
-        interface_width: wp.array(dtype=real),
-        interface_width_dot: wp.array(dtype=real),
-        mobility: wp.array(dtype=real),
-        mobility_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        c: wp.array(dtype=fractions),
-        dot: potential_changes,
-        # out
-        chi_dot: wp.array(dtype=fractions),
-        w_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = spread(i, x, n, m, c, s)
-        total_dot = spread_tangent(i, x, dot.x, n, dot.n, m, dot.m, c, dot.c, s)
-        if lane() > 0:
-            return
-        width = interface_width[member]
-        scale = s.volume / m[i]
-        stiffness = width * width * scale
-        stiffness_dot = real(2.0) * width * interface_width_dot[member] * scale - stiffness * dot.m[i] / m[i]
-        chi_dot[i] = (
-            strength * project(energy_hessian_product(c[i], dot.c[i])) - stiffness * total_dot - stiffness_dot * total
+        interface_width: real,
+        interface_width_dot: real,
+        mobility: real,
+        mobility_dot: real,
+        m_i: real,
+        m_dot_i: real,
+        c_i: fractions,
+        c_dot_i: fractions,
+        s: neighbourhood,
+    ) -> tuple[fractions, real]:
+        scale = s.volume / m_i
+        stiffness = interface_width * interface_width * scale
+        stiffness_dot = real(2.0) * interface_width * interface_width_dot * scale - stiffness * m_dot_i / m_i
+        chi_dot = (
+            strength * project(energy_hessian_product(c_i, c_dot_i)) - stiffness * total_dot - stiffness_dot * total
         )
-        m_0 = mobility[member]
-        w_dot[i] = (dot.m[i] * m_0 + m[i] * mobility_dot[member]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
-            mobile_gradient(c[i]), dot.c[i]
-        )
+        by_m = (m_dot_i * mobility + m_i * mobility_dot) * mobile(c_i)
+        return chi_dot, by_m + m_i * mobility * wp.dot(mobile_gradient(c_i), c_dot_i)
 
-    @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
+    both = [over(spread, "total", **of_chi), over(spread_tangent, "total_dot", **of_chi, **dotted(of_chi))]
+
+    @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"])
     def flux_tangent(
-        s: neighbourhood,
+        total: fractions,
+        total_dot: fractions,
         substeps: int,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        chi: wp.array(dtype=fractions),
-        dot: flux_changes,
-        c_dot: wp.array(dtype=fractions),
-        # out
-        c_new_dot: wp.array(dtype=fractions),
-    ):
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = spread(i, x, n, w, chi, s)
-        total_dot = spread_tangent(i, x, dot.x, n, dot.n, w, dot.w, chi, dot.chi, s)
-        if lane() > 0:
-            return
-        scale = time_step[member] / real(substeps) * s.volume / m[i]
-        change = time_step_dot[member] / time_step[member] - dot.m[i] / m[i]
-        c_new_dot[i] = c_dot[i] + scale * (total_dot + change * total)
-
-    @wp.kernel(module=diffusion.module(False), enable_backward=False)
-    def scale_adjoint(
+        time_step: real,
+        time_step_dot: real,
+        m_i: real,
+        m_dot_i: real,
+        c_dot_i: fractions,
         s: neighbourhood,
-        substeps: int,
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        c_bar: wp.array(dtype=fractions),
-        # out
-        y: wp.array(dtype=fractions),
-    ):
-        """``y``: the adjoint of the flux's raw sum."""
-        i = s.first + wp.tid()
-        member = i // s.particles
-        y[i] = (time_step[member] / real(substeps) * s.volume / m[i]) * c_bar[i]
+    ) -> fractions:
+        scale = time_step / real(substeps) * s.volume / m_i
+        return c_dot_i + scale * (total_dot + (time_step_dot / time_step - m_dot_i / m_i) * total)
 
-    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    @particle_kernel(adjoint_module, "y", numbers=["substeps"])
+    def scale_adjoint(substeps: int, time_step: real, m_i: real, c_bar_i: fractions, s: neighbourhood) -> fractions:
+        """The adjoint y of the flux's raw sum."""
+        return (time_step / real(substeps) * s.volume / m_i) * c_bar_i
+
+    @particle_kernel(
+        adjoint_module,
+        "+x_bar +n_bar +m_bar +c_bar +time_step_bar +mobility_bar z",
+        [over(spread_adjoint, "x_sum n_sum w_bar chi_bar own", **of_chi)],
+        numbers=["strength"],
+    )
     def flux_adjoint(
-        s: neighbourhood,
+        x_sum: vector,
+        n_sum: real,
+        w_bar: real,
+        chi_bar: fractions,
+        own: real,
         strength: real,
-        time_step: wp.array(dtype=real),
-        interface_width: wp.array(dtype=real),
-        mobility: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        chi: wp.array(dtype=fractions),
-        c: wp.array(dtype=fractions),
-        y: wp.array(dtype=fractions),
-        # in and out
-        bar: flux_adjoints,
-        # out
-        z: wp.array(dtype=fractions),
-    ):
-        """``z``: the adjoint of the potential's raw sum."""
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        x_sum, n_sum, w_bar, chi_bar, own = spread_adjoint(i, x, n, w, chi, y, s)
-        if lane() > 0:
-            return
-        m_i = m[i]
-        m_0 = mobility[member]
-        mobile_i = mobile(c[i])
-        bar.x[i] = bar.x[i] + x_sum
-        bar.n[i] = bar.n[i] + n_sum
-        bar.m[i] = bar.m[i] + w_bar * m_0 * mobile_i - own / m_i
-        straight = project(chi_bar)
-        bar.c[i] = (
-            bar.c[i] + (w_bar * m_i * m_0) * mobile_gradient(c[i]) + strength * energy_hessian_product(c[i], straight)
-        )
-        bar.time_step[i] = bar.time_step[i] + own / time_step[member]
-        bar.mobility[i] = bar.mobility[i] + w_bar * m_i * mobile_i
-        z[i] = (-interface_width[member] * interface_width[member] * s.volume / m_i) * chi_bar
-
-    @wp.kernel(module=diffusion.module(False), enable_backward=False)
-    def potential_adjoint(
+        time_step: real,
+        interface_width: real,
+        mobility: real,
+        m_i: real,
+        c_i: fractions,
         s: neighbourhood,
-        interface_width: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        c: wp.array(dtype=fractions),
-        z: wp.array(dtype=fractions),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        c_bar: wp.array(dtype=fractions),
-        interface_width_bar: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        x_sum, n_sum, m_sum, c_sum, own = spread_adjoint(i, x, n, m, c, z, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_sum
-        n_bar[i] = n_bar[i] + n_sum
-        m_bar[i] = m_bar[i] + m_sum - own / m[i]
-        c_bar[i] = c_bar[i] + c_sum
-        interface_width_bar[i] = interface_width_bar[i] + real(2.0) * own / interface_width[member]
+    ) -> tuple[vector, real, real, fractions, real, real, fractions]:
+        """Goes on to the adjoint z of the potential's raw sum."""
+        m_part = w_bar * mobility * mobile(c_i) - own / m_i
+        c_part = (w_bar * m_i * mobility) * mobile_gradient(c_i)
+        c_part += strength * energy_hessian_product(c_i, project(chi_bar))
+        z = (-interface_width * interface_width * s.volume / m_i) * chi_bar
+        return x_sum, n_sum, m_part, c_part, own / time_step, w_bar * m_i * mobile(c_i), z
+
+    @particle_kernel(
+        adjoint_module,
+        "+x_bar +n_bar +m_bar +c_bar +interface_width_bar",
+        [over(spread_adjoint, "x_sum n_sum m_sum c_sum own", y="z", **of_c)],
+    )
+    def potential_adjoint(
+        x_sum: vector, n_sum: real, m_sum: real, c_sum: fractions, own: real, interface_width: real, m_i: real
+    ) -> tuple[vector, real, real, fractions, real]:
+        return x_sum, n_sum, m_sum - own / m_i, c_sum, real(2.0) * own / interface_width
 
     return DiffusionKernels(
         Kernels(potential, potential_tangent, potential_adjoint),

@@ -329,36 +329,3 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
     exec(source, scope)
     made: Any = scope["applied"]
     return wp.Function(func=made, key="applied", namespace="", module=module, source=source)
-
-
-def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """The Warp function f . bar, whose gradient a user's function f is differentiated by."""
-    vector, theta_type = precision.vector, theta_of(precision, ranks)
-    force = applied(text, precision, ranks, dimension, module)
-
-    @wp.func(module=module)
-    def work(x: vector, v: vector, theta: theta_type, bar: vector):
-        return wp.dot(force(x, v, theta), bar)
-
-    return work
-
-
-def change_along(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """The Warp function that is the derivative of a user's function along a direction, put together of the gradients of
-    its components."""
-    real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
-    work = work_of(text, precision, ranks, dimension, module)
-
-    @wp.func(module=module)
-    def change_of(
-        x: vector, v: vector, theta: theta_type, x_dot: vector, v_dot: vector, theta_dot: theta_type
-    ) -> vector:
-        change = vector()
-        for axis in range(3):
-            along = vector()
-            along[axis] = real(1.0)
-            x_bar, v_bar, theta_bar, _along_bar = wp.grad(work)(x, v, theta, along)
-            change[axis] = wp.dot(x_bar, x_dot) + wp.dot(v_bar, v_dot) + wp.dot(theta_bar, theta_dot)
-        return change
-
-    return change_of

@@ -24,16 +24,16 @@ import warp as wp
 
 from cortado.arrays import read_only
 from cortado.calls import fixed
-from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.errors import InputError, shown
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.particle_kernels import pointwise_kernels, sum_kernels
 from cortado.scene.motions import Course
 from cortado.scene.parameter_values import TIME
 from cortado.scene.parameters import Axis, Parameter, Source
-from cortado.sph.formula import Formula, Packed, applied, change_along, compiled, formula, theta_of, work_of
+from cortado.sph.formula import Formula, Packed, applied, compiled, formula, theta_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
@@ -223,69 +223,18 @@ def _length(source: Source, value: np.ndarray) -> float:
 @cache
 def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
     """Of a function whose parameters are numbers (rank 0) and vectors (rank 1), in a scene of 2 or 3 dimensions."""
-    vector = discretisation.precision.vector
-    theta_type = theta_of(discretisation.precision, ranks)
-    neighbourhood = neighbourhood_type(discretisation.precision)
-    name = topic("body", text, ranks, dimension)
-    module = discretisation.module(True, name)
-    tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
-    force = applied(text, discretisation.precision, ranks, dimension, module)
-    change_of = change_along(text, discretisation.precision, ranks, dimension, tangent_module)
-    work = work_of(text, discretisation.precision, ranks, dimension, adjoint_module)
+    precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
+    vector, theta_type = precision.vector, theta_of(precision, ranks)
 
-    @wp.kernel(module=module)
-    def body(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid()
-        acceleration[i] = acceleration_in[i] + force(x[i], v[i], theta[i // s.particles])
+    def make(module: Any) -> Callable[..., Any]:
+        force = applied(text, precision, ranks, dimension, module)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def body_tangent(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        theta_dot: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid()
-        member = i // s.particles
-        change = change_of(x[i], v[i], theta[member], x_dot[i], v_dot[i], theta_dot[member])
-        acceleration_dot[i] = acceleration_in_dot[i] + change
+        def body(x_i: vector, v_i: vector, theta: theta_type) -> vector:
+            return force(x_i, v_i, theta)
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def body_adjoint(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        # out
-        theta_bar: wp.array(dtype=theta_type),
-    ):
-        i = s.first + wp.tid()
-        own_x_bar, own_v_bar, own_theta_bar, _bar_bar = wp.grad(work)(
-            x[i], v[i], theta[i // s.particles], acceleration_bar[i]
-        )
-        x_bar[i] = x_bar[i] + own_x_bar
-        v_bar[i] = v_bar[i] + own_v_bar
-        theta_bar[i] = own_theta_bar
+        return body
 
-    return Kernels(body, body_tangent, body_adjoint)
+    return pointwise_kernels(precision, modules, make, ["acceleration:acceleration_in"], written=["theta"])
 
 
 class Body(OwnForce):
@@ -319,86 +268,21 @@ def term(
 @cache
 def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
     """Of a function as that of `body_kernels`."""
-    precision = discretisation.precision
-    real, vector = precision.real, precision.vector
-    theta_type = theta_of(precision, ranks)
-    neighbourhood = neighbourhood_type(precision)
-    name, own = topic("pair", text, ranks, dimension), (text, ranks, dimension)
-    module = discretisation.module(True, name)
-    tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
+    own, modules = (text, ranks, dimension), discretisation.modules(topic("pair", text, ranks, dimension))
+    module, tangent_module, adjoint_module = modules
     accelerations = fluid_sum(discretisation, module=module)(term(discretisation, *own, module))
     tangents = made_tangent(discretisation, lambda taped: term(taped, *own, tangent_module), tangent_module)
     adjoints = made_adjoint(discretisation, lambda taped: term(taped, *own, adjoint_module), adjoint_module)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
-
-    @wp.kernel(module=module)
-    def pair_force(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        cell: real,
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = accelerations(i, x, v, m, theta[i // s.particles], s)
-        if lane() > 0:
-            return
-        acceleration[i] = acceleration_in[i] + total / cell
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def pair_tangent(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        theta_dot: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        cell: real,
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = tangents(i, x, x_dot, v, v_dot, m, m_dot, theta[member], theta_dot[member], s)
-        if lane() > 0:
-            return
-        acceleration_dot[i] = acceleration_in_dot[i] + total / cell
-
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def pair_adjoint(
-        s: neighbourhood,
-        theta: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        cell: real,
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-        # out
-        theta_bar: wp.array(dtype=theta_type),
-    ):
-        i = s.first + wp.tid() // LANES
-        x_sum, v_sum, m_sum, theta_sum = adjoints(i, x, v, m, acceleration_bar, theta[i // s.particles], s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_sum / cell
-        v_bar[i] = v_bar[i] + v_sum / cell
-        m_bar[i] = m_bar[i] + m_sum / cell
-        theta_bar[i] = theta_sum / cell
-
-    return Kernels(pair_force, pair_tangent, pair_adjoint)
+    return sum_kernels(
+        "pair_force",
+        modules,
+        (accelerations, tangents, adjoints),
+        "acceleration",
+        before="acceleration_in",
+        per="cell",
+        numbers=["cell"],
+        written=["theta"],
+    )
 
 
 class Pair(OwnForce):

@@ -18,10 +18,10 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import sum_kernels
 
 PART = 2.0 / 3.0
 """How much less of the stress acts across the surface than along it; see above."""
@@ -88,8 +88,6 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     functions = tension_functions(discretisation)
     pull, pull_derivative = functions.pull, functions.pull_derivative
     stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
 
     @fluid_sum(discretisation)
     def tension(
@@ -148,72 +146,13 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         work = g * wp.dot(both, w_i)
         return sigma * x_part, (sigma * g) * stress_derivative(normals_i, w_ij, x_ij), -sigma * work / m_i, work
 
-    @wp.kernel(module=discretisation.module(True, "surface_tension"))
-    def accelerate(
-        s: neighbourhood,
-        scale: real,
-        surface_tension: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        normals: wp.array(dtype=vector),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = tension(i, x, normals, m, surface_tension[i // s.particles], scale, s)
-        if lane() > 0:
-            return
-        acceleration[i] = acceleration_in[i] + total
-
-    @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
-    def accelerate_tangent(
-        s: neighbourhood,
-        scale: real,
-        surface_tension: wp.array(dtype=real),
-        surface_tension_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        normals: wp.array(dtype=vector),
-        normals_dot: wp.array(dtype=vector),
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        b = i // s.particles
-        sigma, sigma_dot = surface_tension[b], surface_tension_dot[b]
-        total = tension_tangent(i, x, x_dot, normals, normals_dot, m, m_dot, sigma, sigma_dot, scale, s)
-        if lane() > 0:
-            return
-        acceleration_dot[i] = acceleration_in_dot[i] + total
-
-    @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
-    def accelerate_adjoint(
-        s: neighbourhood,
-        scale: real,
-        surface_tension: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        normals: wp.array(dtype=vector),
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-        surface_tension_bar: wp.array(dtype=real),
-        # out
-        normals_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        sigma = surface_tension[i // s.particles]
-        x_sum, n_sum, m_sum, sigma_sum = tension_adjoint(i, x, normals, m, acceleration_bar, sigma, scale, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_sum
-        m_bar[i] = m_bar[i] + m_sum
-        surface_tension_bar[i] = surface_tension_bar[i] + sigma_sum
-        normals_bar[i] = n_sum
-
-    return Kernels(accelerate, accelerate_tangent, accelerate_adjoint)
+    return sum_kernels(
+        "accelerate",
+        discretisation.modules("surface_tension"),
+        (tension, tension_tangent, tension_adjoint),
+        "acceleration",
+        before="acceleration_in",
+        numbers=["scale"],
+        written=["normals"],
+        sigma="surface_tension",
+    )

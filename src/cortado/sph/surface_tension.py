@@ -12,16 +12,17 @@ meets them at 180 degrees.
 
 from functools import cache
 from math import pi, sqrt
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import sum_kernel
 from cortado.particles.state import Layout, zeros
 from cortado.scene.scene import Scene
 from cortado.sph.curvature import CurvatureConstants
@@ -36,8 +37,6 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     one = wp.constant(real(1.0))
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
 
     @fluid_sum(discretisation)
     def arrows(x_ij: vector, s: neighbourhood) -> vector:
@@ -55,51 +54,13 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
         d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
         return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
 
-    @wp.kernel(module=discretisation.module(True, "surface_tension"))
-    def normal(
-        s: neighbourhood,
-        inverse: real,
-        x: wp.array(dtype=vector),
-        # out
-        normals: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = arrows(i, x, s)
-        if lane() > 0:
-            return
-        normals[i] = inverse * total
-
-    @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
-    def normal_tangent(
-        s: neighbourhood,
-        inverse: real,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        # out
-        normals_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = change(i, x, x_dot, s)
-        if lane() > 0:
-            return
-        normals_dot[i] = inverse * total
-
-    @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
-    def normal_adjoint(
-        s: neighbourhood,
-        inverse: real,
-        x: wp.array(dtype=vector),
-        normals_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = change(i, x, normals_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + inverse * total
-
-    return Kernels(normal, normal_tangent, normal_adjoint)
+    module, tangent_module, adjoint_module = discretisation.modules("surface_tension")
+    scaled: dict[str, Any] = {"times": "inverse", "numbers": ["inverse"]}
+    return Kernels(
+        sum_kernel("normal", module, "normals", arrows, **scaled),
+        sum_kernel("normal_tangent", tangent_module, "normals_dot", change, **scaled, v="x_dot"),
+        sum_kernel("normal_adjoint", adjoint_module, "+x_bar", change, **scaled, v="normals_bar"),
+    )
 
 
 class CurvatureTension:

@@ -14,12 +14,11 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import arithmetic
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, rubbing_sum, tangent_of
+from cortado.particles.particle_kernels import sum_kernels
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.wall_terms import WallTerm
 from cortado.sph.implicit_viscosity import stress_of
@@ -82,9 +81,6 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
-    changes = bundle(x=vector, v=vector, n=real, m=real, mu=real)
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     tiny = wp.constant(real(discretisation.precision.tiny))
     summed = rubbing_sum(discretisation, sticks)
@@ -220,73 +216,10 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         mu_part = per_volume * pair_viscosity_derivative(mu_i, mu_j) * work
         return x_part, v_part, -weight * work * reciprocal(n_i), m_part, mu_part
 
-    @wp.kernel(module=discretisation.module(True, name))
-    def viscosity(
-        s: neighbourhood,
-        kappa: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = force(i, x, v, n, m, mu, kappa, s)
-        if lane() > 0:
-            return
-        acceleration[i] = acceleration_in[i] + total
-
-    @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
-    def viscosity_tangent(
-        s: neighbourhood,
-        kappa: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        dot: changes,
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = force_tangent(i, x, dot.x, v, dot.v, n, dot.n, m, dot.m, mu, dot.mu, kappa, s)
-        if lane() > 0:
-            return
-        acceleration_dot[i] = acceleration_in_dot[i] + total
-
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
-    def viscosity_adjoint(
-        s: neighbourhood,
-        kappa: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        mu_bar: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        x_sum, v_sum, n_sum, m_sum, mu_sum = force_adjoint(i, x, v, n, m, mu, acceleration_bar, kappa, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_sum
-        v_bar[i] = v_bar[i] + v_sum
-        n_bar[i] = n_bar[i] + n_sum
-        m_bar[i] = m_bar[i] + m_sum
-        mu_bar[i] = mu_bar[i] + mu_sum
-
-    return Kernels(viscosity, viscosity_tangent, viscosity_adjoint)
+    sums = force, force_tangent, force_adjoint
+    return sum_kernels(
+        "viscosity", discretisation.modules(name), sums, "acceleration", before="acceleration_in", numbers=["kappa"]
+    )
 
 
 @cache

@@ -32,6 +32,7 @@ from cortado.device.lanes import lane_functions
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
+from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.walls import wall_slope_sums
 
 SOFTNESS = 0.2
@@ -53,8 +54,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
-    LANES = discretisation.lanes
-    lane = lane_functions(discretisation.precision, LANES).lane
+    module, tangent_module, adjoint_module = discretisation.modules("density_ratio")
     a = wp.constant(real(SOFTNESS))
 
     @fluid_sum(discretisation)
@@ -94,76 +94,24 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
             return real(0.5) * t * (t + real(2.0) * a) / ((t + a) * (t + a))
         return real(0.0)
 
-    @wp.kernel(module=discretisation.module(True, "density_ratio"))
-    def density_ratio(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        wall_y: wp.array(dtype=real),
-        # out
-        t: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = density_ratio_sum(i, x, m, s)
-        if lane() > 0:
-            return
-        t[i] = s.volume * total
-        y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
+    @particle_kernel(module, "t y", [over(density_ratio_sum, "total")])
+    def density_ratio(total: real, wall_y_i: real, s: neighbourhood) -> tuple[real, real]:
+        return s.volume * total, wall_y_i / (real(1.0) + excess(s.volume * total))
 
-    @wp.kernel(module=discretisation.tangent_module("density_ratio"), enable_backward=False)
-    def density_ratio_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        t: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        wall_y_dot: wp.array(dtype=real),
-        # out
-        y_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        t_dot = density_ratio_sum_tangent(i, x, x_dot, m, m_dot, s)
-        if lane() > 0:
-            return
-        part = real(1.0) / (real(1.0) + excess(t[i]))
-        y_dot[i] = part * (wall_y_dot[i] - y[i] * excess_derivative(t[i]) * s.volume * t_dot)
+    @particle_kernel(tangent_module, "y_dot", [over(density_ratio_sum_tangent, "total_dot")])
+    def density_ratio_tangent(total_dot: real, t_i: real, y_i: real, wall_y_dot_i: real, s: neighbourhood) -> real:
+        part = real(1.0) / (real(1.0) + excess(t_i))
+        return part * (wall_y_dot_i - y_i * excess_derivative(t_i) * s.volume * total_dot)
 
-    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
-    def factor_adjoint(
-        s: neighbourhood,
-        t: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        # in and out
-        y_bar: wp.array(dtype=real),
-        # out
-        t_bar: wp.array(dtype=real),
-    ):
-        """``y_bar`` becomes the adjoint of the pressure relaxation beside walls."""
-        i = s.first + wp.tid()
-        part = real(1.0) / (real(1.0) + excess(t[i]))
-        t_bar[i] = -y_bar[i] * y[i] * part * excess_derivative(t[i])
-        y_bar[i] = y_bar[i] * part
+    @particle_kernel(adjoint_module, "y_bar t_bar")
+    def factor_adjoint(t_i: real, y_i: real, y_bar_i: real) -> tuple[real, real]:
+        """That of the pressure relaxation beside walls takes the place of that of y."""
+        part = real(1.0) / (real(1.0) + excess(t_i))
+        return y_bar_i * part, -y_bar_i * y_i * part * excess_derivative(t_i)
 
-    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
-    def density_ratio_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        t_bar: wp.array(dtype=real),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        x_sum, m_sum = density_ratio_sum_adjoint(i, x, m, t_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + s.volume * x_sum
-        m_bar[i] = m_bar[i] + s.volume * m_sum
-
+    density_ratio_adjoint = sum_kernel(
+        "density_ratio_adjoint", adjoint_module, "+x_bar +m_bar", density_ratio_sum_adjoint, times="s.volume"
+    )
     return DensityRatioKernels(density_ratio, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)
 
 
@@ -173,40 +121,21 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = wall_slope_sums(discretisation)
-    slope, change, slope_tangent = sums.slope, sums.change, sums.tangent
-    LANES = discretisation.lanes
+    slope, change, LANES = sums.slope, sums.change, discretisation.lanes
+    module, tangent_module, adjoint_module = discretisation.modules("pcisph")
     lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True, "pcisph"))
-    def wall_relaxation(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        # out
-        y: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = s.response_scale * slope(i, x, s)
-        if lane() > 0:
-            return
-        y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
+    @particle_kernel(module, "y", [over(slope, "total")])
+    def wall_relaxation(total: vector, s: neighbourhood) -> real:
+        scaled = s.response_scale * total
+        return real(1.0) / (real(1.0) + wp.dot(scaled, scaled))
 
-    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
-    def wall_relaxation_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        y: wp.array(dtype=real),
-        # out
-        y_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = s.response_scale * slope(i, x, s)
-        total_dot = s.response_scale * slope_tangent(i, x, x_dot, s)
-        if lane() > 0:
-            return
-        y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
+    @particle_kernel(tangent_module, "y_dot", [over(slope, "total"), over(sums.tangent, "total_dot")])
+    def wall_relaxation_tangent(total: vector, total_dot: vector, y_i: real, s: neighbourhood) -> real:
+        along = wp.dot(s.response_scale * total, s.response_scale * total_dot)
+        return real(-2.0) * y_i * y_i * along
 
-    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    @wp.kernel(module=adjoint_module, enable_backward=False)
     def wall_relaxation_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -34,8 +34,8 @@ import warp as wp
 
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
-from cortado.particles.made_derivatives import pointwise_kernels
 from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
 from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type
@@ -126,62 +126,27 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 def moving_kernels(precision: Precision) -> Kernels:
     """The kernels of the positions before the first repair; that of the adjoint leaves the adjoint of delta, which is
     that of these positions."""
-    real, vector = precision.real, precision.vector
+    real, vector, derivatives = precision.real, precision.vector, integration_module(precision, False)
 
-    @wp.kernel(module=integration_module(precision, True))
-    def move(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
-        delta: wp.array(dtype=vector),
-        # out
-        x_moved: wp.array(dtype=vector),
-        x_now: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        moved = x[i] + time_step[i // particles] * v_new[i] + delta[i]
-        x_moved[i] = moved
-        x_now[i] = moved
-        c[i] = real(0.0)
+    @particle_kernel(integration_module(precision, True), "x_moved x_now c")
+    def move(time_step: real, x_i: vector, v_new_i: vector, delta_i: vector) -> tuple[vector, vector, real]:
+        moved = x_i + time_step * v_new_i + delta_i
+        return moved, moved, real(0.0)
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    @particle_kernel(derivatives, "x_moved_dot x_now_dot c_dot")
     def move_tangent(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        v_new: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v_new_dot: wp.array(dtype=vector),
-        delta_dot: wp.array(dtype=vector),
-        # out
-        x_moved_dot: wp.array(dtype=vector),
-        x_now_dot: wp.array(dtype=vector),
-        c_dot: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        member = i // particles
-        moved = x_dot[i] + time_step[member] * v_new_dot[i] + time_step_dot[member] * v_new[i] + delta_dot[i]
-        x_moved_dot[i] = moved
-        x_now_dot[i] = moved
-        c_dot[i] = real(0.0)
+        time_step: real,
+        time_step_dot: real,
+        v_new_i: vector,
+        x_dot_i: vector,
+        v_new_dot_i: vector,
+        delta_dot_i: vector,
+    ) -> tuple[vector, vector, real]:
+        moved = x_dot_i + time_step * v_new_dot_i + time_step_dot * v_new_i + delta_dot_i
+        return moved, moved, real(0.0)
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def move_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        v_new: wp.array(dtype=vector),
-        x_moved_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_new_bar: wp.array(dtype=vector),
-        time_step_bar: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        moved = x_moved_bar[i]
-        x_bar[i] = x_bar[i] + moved
-        v_new_bar[i] = v_new_bar[i] + time_step[i // particles] * moved
-        time_step_bar[i] = time_step_bar[i] + wp.dot(moved, v_new[i])
+    @particle_kernel(derivatives, "+x_bar +v_new_bar +time_step_bar")
+    def move_adjoint(time_step: real, v_new_i: vector, x_moved_bar_i: vector) -> tuple[vector, vector, real]:
+        return x_moved_bar_i, time_step * x_moved_bar_i, wp.dot(x_moved_bar_i, v_new_i)
 
     return Kernels(move, move_tangent, move_adjoint)
