@@ -318,7 +318,6 @@ ELSEWHERE = {
     "repair_kernels": "of the projection again: whole steps in tests/test_projection.py",
     "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
     "mean_stress_kernels": "of a quantity: tests/test_energy_budget.py",
-    "stress_wall_kernels": "of loads, which are quantities: tests/test_solid_loads.py",
     "environment_kernels": "of rewards: tests/test_environments.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
     "colour_field_kernels": "the same",
@@ -339,7 +338,8 @@ def test_every_family_with_an_adjoint_is_checked():
 
 
 def of_an_adjoint(function):
-    is_kernel = any("wp.kernel" in ast.unparse(one) for one in function.decorator_list)
+    decorators = [ast.unparse(one) for one in function.decorator_list]
+    is_kernel = any("wp.kernel" in one or one.startswith("particle_kernel(") for one in decorators)
     return is_kernel and "adjoint" in function.name.split("_")
 
 

@@ -348,7 +348,7 @@ class Stress(Viscosity):
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, newtonian_law(), self.sticks)
+        self.kernels = stress_kernels(DISCRETISATION, cloud.dimension, newtonian_law(), self.sticks)
         self.given = {
             "s": self.s,
             "control": 1.3,
@@ -359,29 +359,43 @@ class Stress(Viscosity):
         self.room = {name: np.zeros((N, 3, 3)) for name in "MAT"} | {name: np.zeros(N) for name in ("R", "eta")}
 
     def known(self, values):
-        """Arguments of all kernels after the first."""
-        found = launch(self.stress.forward, **self.given, **values, **self.room)
-        return {**self.given, **values, **{name: found[name] for name in self.room}}
+        """Arguments of all kernels after the first two."""
+        known = {**self.given, **values, **self.room}
+        known |= launch(self.kernels.moments.forward, **known)
+        known["A_u"] = known["A"]
+        return known | launch(self.kernels.stress.forward, **known)
 
     def forward(self, values):
-        return launch(self.force.forward, **self.known(values), acceleration=np.zeros((N, 3)))
+        return launch(self.kernels.force.forward, **self.known(values), acceleration=np.zeros((N, 3)))
 
     def tangent(self, values, dots):
-        known = {**self.known(values), **dotted(dots)}
-        change = {"T_dot": np.zeros((N, 3, 3)), "eta_dot": np.zeros(N)}
-        found = launch(self.stress.tangent, **known, **change)
-        known |= {name: found[name] for name in change} | {"acceleration_dot": np.zeros((N, 3))}
-        return {"acceleration": launch(self.force.tangent, **known)["acceleration_dot"]}
+        known = {**self.known(values), **dotted(dots), **{f"{name}_dot": value for name, value in self.room.items()}}
+        known |= launch(self.kernels.moments.tangent, **known)
+        known |= launch(self.kernels.stress.tangent, **known, A_u_dot=known["A_dot"])
+        return {
+            "acceleration": launch(self.kernels.force.tangent, **known, acceleration_dot=np.zeros((N, 3)))[
+                "acceleration_dot"
+            ]
+        }
 
     def adjoint(self, values, bars):
-        known = {**self.known(values), "acceleration_bar": bars["acceleration"]}
-        change = {"M_bar": np.zeros((N, 3, 3)), "A_bar": np.zeros((N, 3, 3)), "R_bar": np.zeros(N)}
-        change["theta_bar"] = np.zeros((N, 1))
-        names = ("x", "v", "m", "mu")
-        found = launch(self.stress.adjoint, **known, **change, **zeros("mu_bar"))
-        known |= {name: found[name] for name in (*change, "mu_bar")} | zeros("x_bar", "v_bar", "m_bar")
-        found = launch(self.force.adjoint, **known)
-        return {**{name: found[f"{name}_bar"] for name in names}, "acceleration_in": bars["acceleration"]}
+        known = {**self.known(values), **{f"{name}_bar": value for name, value in self.room.items()}}
+        known |= {
+            "acceleration_bar": bars["acceleration"],
+            "theta_bar": np.zeros((N, 1)),
+            "A_u_bar": np.zeros((N, 3, 3)),
+        }
+        known |= zeros("x_bar", "v_bar", "m_bar", "mu_bar")
+        of_stress, of_particles = self.kernels.force.adjoint
+        known |= launch(of_stress, **known)
+        known |= launch(self.kernels.stress.adjoint, **known)
+        known["A_bar"] = known["A_bar"] + known["A_u_bar"]
+        for kernel in self.kernels.moments.adjoint, of_particles:
+            known |= launch(kernel, **known)
+        return {
+            **{name: known[f"{name}_bar"] for name in ("x", "v", "m", "mu")},
+            "acceleration_in": bars["acceleration"],
+        }
 
 
 class StressWithoutSlip(Stress):

@@ -202,7 +202,7 @@ def test_copies_have_the_same_lanes():
 
 def kernels_of(discretisation):
     """Every kernel that is made for lanes; mixtures of two and of three phases."""
-    curved = curvature_kernels(discretisation, 3)
+    curved, viscous = curvature_kernels(discretisation, 3), stress_kernels(discretisation, 3, newtonian_law(), True)
     mixtures = [
         diffusion_kernels(Diffusion(discretisation, *kinds))
         for kinds in ((2, DOUBLE_WELL, DEGENERATE), (3, MISCIBLE, CONSTANT))
@@ -214,7 +214,7 @@ def kernels_of(discretisation):
         pressure_force_kernels(discretisation),
         wall_kernels(discretisation),
         viscosity_kernels(discretisation, True),
-        *stress_kernels(discretisation, 3, newtonian_law(), True),
+        viscous.moments,
         density_ratio_kernels(discretisation),
         normal_kernels(discretisation),
         surface_tension_kernels(discretisation),
@@ -228,6 +228,7 @@ def kernels_of(discretisation):
         filters.strength,
         filters.viscosity,
     ]
+    alone += [viscous.force.forward, viscous.force.tangent, *viscous.force.adjoint]
     return [*alone, *kernels, curved.mean.forward, curved.mean.tangent, curved.mean.adjoint[1]]
 
 

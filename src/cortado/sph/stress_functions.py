@@ -16,6 +16,7 @@ inverse needs no guard of its own.
 M, A and R are sums over the neighbours of a particle (`cortado.sph.stress_kernels`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -38,26 +39,6 @@ EMPTY, FULL = 0.2, 0.5
 """H below which a particle takes no part in the stress, and above which it takes part in all of it."""
 
 
-@dataclass(frozen=True)
-class StressFunctions:
-    """Warp functions of one particle."""
-
-    matrix: Any
-    """The Warp type of 3 x 3 matrices."""
-    moment: Any
-    """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
-    moment_change: Any
-    """The same of a tangent of M."""
-    viscosity: Any
-    """mu of M, A, R, mu_i and theta, the parameters of the law."""
-    traction: Any
-    """T of M, A, mu and C."""
-    change: Any
-    """The tangents of T and mu, of those of the sums, of mu_i and of theta."""
-    back: Any
-    """The adjoints of the sums, of mu_i and of theta, for those of T and mu."""
-
-
 @cache
 def fluidity_function(precision: Precision) -> Any:
     """1 / mu as a Warp function, see `LEAST_VISCOSITY`."""
@@ -72,15 +53,11 @@ def fluidity_function(precision: Precision) -> Any:
 
 
 @cache
-def stress_functions(precision: Precision, dimension: int, law: Law, module: Any) -> StressFunctions:
-    """Of a precision in 2 or 3 dimensions, with a law of viscosity, in a Warp module; ``control`` is C."""
-    real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
-    moments = moment_functions(precision, dimension)
-    fullness, inverse, smoothstep = moments.fullness, moments.inverse, moments.smoothstep
-    plane = wp.constant(real(float(dimension == 2)))
+def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
+    """S of M, and M where S is not 0, as Warp functions."""
+    real, matrix, moments = precision.real, matrix_type(precision), moment_functions(precision, dimension)
+    fullness, smoothstep = moments.fullness, moments.smoothstep
     empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
-    tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
-    theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
 
     @wp.func
     def part(M: matrix) -> real:
@@ -97,13 +74,14 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
             )
         return result
 
-    @wp.func(module=module)
-    def viscosity(M: matrix, A: matrix, R: real, mu: real, theta: theta_type) -> real:
-        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
-        mean = real(1.0) / (real(0.5) * fluidity(mu) + real(0.5) * R / (trace + tiny))
-        G = A * inverse(regular(M))
-        D = G + wp.transpose(G)
-        return part(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
+    return part, regular
+
+
+@cache
+def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
+    """T of M, A, mu and C as a Warp function in a Warp module."""
+    real, matrix, regular = precision.real, matrix_type(precision), part_functions(precision, dimension)[1]
+    inverse = moment_functions(precision, dimension).inverse
 
     @wp.func(module=module)
     def traction(M: matrix, A: matrix, mu: real, control: real) -> matrix:
@@ -111,65 +89,31 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
         G = A * K
         return mu * ((G + wp.transpose(G)) * K - control * G)
 
-    @wp.func(module=module)
-    def viscosity_work(M: matrix, A: matrix, R: real, mu: real, theta: theta_type, bar: real) -> real:
-        return viscosity(M, A, R, mu, theta) * bar
+    return traction
 
-    @wp.func(module=module)
-    def traction_work(M: matrix, A: matrix, mu: real, control: real, bar: matrix) -> real:
-        return wp.ddot(traction(M, A, mu, control), bar)
 
-    @wp.func(module=module)
-    def change(
-        M: matrix,
-        A: matrix,
-        A_u: matrix,
-        R: real,
-        mu_i: real,
-        theta: theta_type,
-        mu: real,
-        control: real,
-        M_dot: matrix,
-        A_dot: matrix,
-        A_u_dot: matrix,
-        R_dot: real,
-        mu_i_dot: real,
-        theta_dot: theta_type,
-    ):
-        """A is of the velocities that mu follows from, A_u of those that are resisted. Put together of the gradients of
-        mu and of each entry of T."""
-        by_M, by_A, by_R, by_mu, by_theta, _by_bar = wp.grad(viscosity_work)(M, A, R, mu_i, theta, real(1.0))
-        mu_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * R_dot + by_mu * mu_i_dot
-        mu_dot += wp.dot(by_theta, theta_dot)
-        T_dot = matrix()
-        count = int(9)  # not a number: Warp would write the gradient out for each
-        for k in range(count):
-            entry = matrix()
-            entry[k // 3, k % 3] = real(1.0)
-            for_M, for_A, for_mu, _for_C, _for_entry = wp.grad(traction_work)(M, A_u, mu, control, entry)
-            T_dot[k // 3, k % 3] = wp.ddot(for_M, M_dot) + wp.ddot(for_A, A_u_dot) + for_mu * mu_dot
-        return T_dot, mu_dot
+def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
+    """T and mu, in 2 or 3 dimensions, with a law of viscosity. mu follows from A, and T from ``A_u``, that of the
+    velocities which are resisted; ``control`` is C."""
+    real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
+    part, regular = part_functions(precision, dimension)
+    inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
+    plane = wp.constant(real(float(dimension == 2)))
+    tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
+    theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
 
-    @wp.func(module=module)
-    def back(
-        M: matrix,
-        A: matrix,
-        A_u: matrix,
-        R: real,
-        mu_i: real,
-        theta: theta_type,
-        mu: real,
-        control: real,
-        T_bar: matrix,
-        mu_bar: real,
-    ):
-        """For A and A_u as in `change`: the adjoints of M, A, A_u, R, mu_i and theta."""
-        by_M, by_A_u, by_mu, _by_C, _by_T = wp.grad(traction_work)(M, A_u, mu, control, T_bar)
-        for_M, for_A, for_R, for_mu, for_theta, _for_mu = wp.grad(viscosity_work)(M, A, R, mu_i, theta, mu_bar + by_mu)
-        M_bar = by_M + for_M
-        return real(0.5) * (M_bar + wp.transpose(M_bar)), for_A, by_A_u, for_R, for_mu, for_theta
+    def stress(
+        control: real, theta: theta_type, M_i: matrix, A_i: matrix, A_u_i: matrix, R_i: real, mu_i: real
+    ) -> tuple[matrix, real]:
+        M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
+        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
+        mean = real(1.0) / (real(0.5) * fluidity(mu_i) + real(0.5) * R_i / (trace + tiny))
+        G = A_i * inverse(regular(M))
+        D = G + wp.transpose(G)
+        mu = part(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
+        return traction(M, A_u_i, mu, control), mu
 
-    return StressFunctions(matrix, moments.whole, moments.change, viscosity, traction, change, back)
+    return stress
 
 
 @dataclass(frozen=True)

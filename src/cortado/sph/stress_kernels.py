@@ -23,223 +23,89 @@ Walls without slip: `cortado.sph.stress_forces`.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
 from cortado.particles.solid_shares import solid_kernel
-from cortado.sph.formula import theta_of
+from cortado.sph.moment_functions import matrix_type, moment_functions
 from cortado.sph.stress_forces import stress_sums, stress_work
-from cortado.sph.stress_functions import moment_sums, moments_work, stress_functions
+from cortado.sph.stress_functions import moment_sums, moments_work, stress_of_particle
 from cortado.sph.viscosity_law import Law
 
 
+@dataclass(frozen=True)
+class StressKernels:
+    """The kernels of viscosity as a stress, in the order in which a step needs them."""
+
+    moments: Kernels
+    """M, A and R."""
+    stress: Kernels
+    """T and mu of them, where mu follows from A, and the velocities of ``A_u`` are resisted, which may be others."""
+    force: Kernels
+    """The acceleration. Its adjoint are two kernels: that of T and mu, and that of particles."""
+
+
 @cache
-def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Kernels, Kernels]:
-    """The kernels of M, A, R and what follows from them for each particle, and those of the acceleration, in 2 or 3
-    dimensions, with a law of viscosity; with ``sticks`` walls have no slip. Their argument ``control`` is C, and
-    ``theta`` are the parameters of the law."""
+def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> StressKernels:
+    """In 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have no slip. The argument ``control`` of
+    kernels is C, ``eta`` the viscosity of the stress, and ``theta`` are the parameters of the law."""
     precision = discretisation.precision
-    real, vector = precision.real, precision.vector
-    neighbourhood = neighbourhood_type(precision)
-    name = f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks
-    module = discretisation.module(True, name)
-    tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
-    own = stress_functions(precision, dimension, law, module)
-    matrix, moment_of, viscosity_of, traction_of = own.matrix, own.moment, own.viscosity, own.traction
-    along = stress_functions(precision, dimension, law, tangent_module)
-    change_of_moment, change_of = along.moment_change, along.change
-    stress_back = stress_functions(precision, dimension, law, adjoint_module).back
-    theta_type = theta_of(precision, law.ranks)
-    sums_of, force_of = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
-    moments, moments_tangent, moments_back = sums_of.sums, sums_of.tangent, sums_of.back
-    force, force_tangent = force_of.force, force_of.tangent
-    traction_back, force_back = force_of.traction_back, force_of.back
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
-    of_all, of_one = bundle(M=matrix, A=matrix, R=real, eta=real), bundle(T=matrix, eta=real)
-    seen, of_particles = bundle(x=vector, v=vector, m=real), bundle(x=vector, v=vector, mu=real)
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)
+    sums, forces = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
+    known = moment_functions(precision, dimension)
+    given: dict[str, Any] = {
+        "numbers": ["control", "least"],
+        "mu": "eta",
+        "mu_dot": "eta_dot",
+        "bar": "acceleration_bar",
+    }
 
-    @wp.kernel(module=module)
-    def stress(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        theta: wp.array(dtype=theta_type),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        mu: wp.array(dtype=real),
-        # out
-        M: wp.array(dtype=matrix),
-        A: wp.array(dtype=matrix),
-        R: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
-        eta: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        diagonal, others, row_x, row_y, row_z, thin = moments(i, x, v, mu, least, s)
-        if lane() > 0:
-            return
-        M_i, A_i = moment_of(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
-        eta_i = viscosity_of(M_i, A_i, thin, mu[i], theta[i // s.particles])
-        M[i] = M_i
-        A[i] = A_i
-        R[i] = thin
-        T[i] = traction_of(M_i, A_i, eta_i, control)
-        eta[i] = eta_i
+    def moments_of(name: str, module: Any, results: str, total: Any, symmetric: Any) -> Any:
+        names = "diagonal others row_x row_y row_z thin"
 
-    @wp.kernel(module=module)
-    def acceleration_of(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
-        eta: wp.array(dtype=real),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = force(i, x, v, m, T, eta, control, least, s)
-        if lane() > 0:
-            return
-        acceleration[i] = acceleration_in[i] + total
+        @particle_kernel(module, results, [over(total, names)], numbers=["least"], name=name)
+        def moments(
+            diagonal: vector, others: vector, row_x: vector, row_y: vector, row_z: vector, thin: real
+        ) -> tuple[matrix, matrix, real]:
+            return symmetric(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z), thin
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def stress_tangent(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        theta: wp.array(dtype=theta_type),
-        theta_dot: wp.array(dtype=theta_type),
-        now: of_particles,
-        dot: of_particles,
-        of: of_all,
-        # out
-        T_dot: wp.array(dtype=matrix),
-        eta_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        diagonal, others, row_x, row_y, row_z, thin = moments_tangent(
-            i, now.x, dot.x, now.v, dot.v, now.mu, dot.mu, least, s
-        )
-        if lane() > 0:
-            return
-        M_dot, A_dot = change_of_moment(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
-        b = i // s.particles
-        T_i_dot, eta_i_dot = change_of(
-            of.M[i],
-            of.A[i],
-            of.A[i],
-            of.R[i],
-            now.mu[i],
-            theta[b],
-            of.eta[i],
-            control,
-            M_dot,
-            A_dot,
-            A_dot,
-            thin,
-            dot.mu[i],
-            theta_dot[b],
-        )
-        T_dot[i] = T_i_dot
-        eta_dot[i] = eta_i_dot
+        return moments
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def acceleration_tangent(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        now: seen,
-        dot: seen,
-        of: of_one,
-        T_dot: wp.array(dtype=matrix),
-        eta_dot: wp.array(dtype=real),
-        acceleration_in_dot: wp.array(dtype=vector),
-        # out
-        acceleration_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = force_tangent(
-            i, now.x, dot.x, now.v, dot.v, now.m, dot.m, of.T, T_dot, of.eta, eta_dot, control, least, s
-        )
-        if lane() > 0:
-            return
-        acceleration_dot[i] = acceleration_in_dot[i] + total
+    back = over(forces.traction_back, "row_x row_y row_z mu_bar", bar="acceleration_bar")
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def stress_adjoint(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        theta: wp.array(dtype=theta_type),
-        now: seen,
-        mu: wp.array(dtype=real),
-        of: of_all,
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        mu_bar: wp.array(dtype=real),
-        # out
-        M_bar: wp.array(dtype=matrix),
-        A_bar: wp.array(dtype=matrix),
-        R_bar: wp.array(dtype=real),
-        theta_bar: wp.array(dtype=theta_type),
-    ):
-        """From the adjoint of the acceleration to those of the sums and of the law."""
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, eta_bar = traction_back(i, now.x, now.v, now.m, acceleration_bar, control, least, s)
-        if lane() > 0:
-            return
-        T_bar, member = wp.matrix_from_rows(row_x, row_y, row_z), i // s.particles
-        by_M, by_A, by_A_u, by_R, by_mu, by_theta = stress_back(
-            of.M[i], of.A[i], of.A[i], of.R[i], mu[i], theta[member], of.eta[i], control, T_bar, eta_bar
-        )
-        M_bar[i] = by_M
-        A_bar[i] = by_A_u + by_A
-        R_bar[i] = by_R
-        mu_bar[i] = mu_bar[i] + by_mu
-        theta_bar[i] = by_theta
+    @particle_kernel(modules[2], "T_bar eta_bar", [back], numbers=["control", "least"])
+    def traction_adjoint(row_x: vector, row_y: vector, row_z: vector, mu_bar: real) -> tuple[matrix, real]:
+        return wp.matrix_from_rows(row_x, row_y, row_z), mu_bar
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def acceleration_adjoint(
-        s: neighbourhood,
-        control: real,
-        least: real,
-        now: seen,
-        mu: wp.array(dtype=real),
-        of: of_one,
-        M_bar: wp.array(dtype=matrix),
-        A_bar: wp.array(dtype=matrix),
-        R_bar: wp.array(dtype=real),
-        acceleration_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-        mu_bar: wp.array(dtype=real),
-    ):
-        """From the adjoints of the acceleration and of the sums to those of particles."""
-        i = s.first + wp.tid() // LANES
-        x_part, v_part, m_part = force_back(i, now.x, now.v, now.m, of.T, of.eta, acceleration_bar, control, least, s)
-        x_sum, v_sum, mu_sum = moments_back(i, now.x, now.v, mu, M_bar, A_bar, R_bar, least, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_part + x_sum
-        v_bar[i] = v_bar[i] + v_part + v_sum
-        m_bar[i] = m_bar[i] + m_part
-        mu_bar[i] = mu_bar[i] + mu_sum
-
-    return Kernels(stress, stress_tangent, stress_adjoint), Kernels(
-        acceleration_of, acceleration_tangent, acceleration_adjoint
+    return StressKernels(
+        Kernels(
+            moments_of("moments", modules[0], "M A R", sums.sums, known.whole),
+            moments_of("moments_tangent", modules[1], "M_dot A_dot R_dot", sums.tangent, known.change),
+            sum_kernel("moments_adjoint", modules[2], "+x_bar +v_bar +mu_bar", sums.back, numbers=["least"]),
+        ),
+        pointwise_kernels(
+            precision,
+            modules,
+            partial(stress_of_particle, precision, dimension, law),
+            ["T", "eta"],
+            numbers=["control"],
+            written=["M", "A", "A_u", "R", "theta"],
+        ),
+        Kernels(
+            sum_kernel("force", modules[0], "acceleration:acceleration_in", forces.force, **given),
+            sum_kernel("force_tangent", modules[1], "acceleration_dot:acceleration_in_dot", forces.tangent, **given),
+            (
+                traction_adjoint,
+                sum_kernel("force_adjoint", modules[2], "+x_bar +v_bar +m_bar", forces.back, **given),
+            ),
+        ),
     )
 
 
