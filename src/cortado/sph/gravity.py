@@ -7,6 +7,7 @@ import warp as wp
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -17,18 +18,9 @@ def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
     """The kernels; the tangent is the acceleration itself, of another table."""
     vector = precision.vector
 
-    @wp.kernel(module=integration_module(precision, True, taped))
-    def accelerate(
-        particles: int,
-        gravity: wp.array2d(dtype=vector),
-        step: wp.array(dtype=wp.int32),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        member = i // particles
-        acceleration[i] = acceleration_in[i] + gravity[member, step[member]]
+    @particle_kernel(integration_module(precision, True, taped), "acceleration:acceleration_in")
+    def accelerate(member: int, gravity: wp.array2d(dtype=vector), step: wp.int32) -> vector:
+        return gravity[member, step]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def adjoint(

@@ -8,6 +8,7 @@ import warp as wp
 
 from cortado.device.modules import kernel_module, kind_of
 from cortado.device.precision import Precision
+from cortado.particles.particle_kernels import particle_kernel
 
 
 @dataclass(frozen=True)
@@ -124,56 +125,28 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         x_scene[order[i]] = x[i]
         v_scene[order[i]] = v[i]
 
-    @wp.kernel(module=integration_module(precision, True, taped))
-    def predict(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration: wp.array(dtype=vector),
-        # out
-        x_star: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        member = i // particles
-        velocity = v[i] + time_step[member] * acceleration[i]
-        v_star[i] = velocity
-        x_star[i] = x[i] + time_step[member] * velocity
+    @particle_kernel(integration_module(precision, True, taped), "x_star v_star")
+    def predict(time_step: real, x_i: vector, v_i: vector, acceleration_i: vector) -> tuple[vector, vector]:
+        velocity = v_i + time_step * acceleration_i
+        return x_i + time_step * velocity, velocity
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    @particle_kernel(integration_module(precision, False), "x_star_dot v_star_dot")
     def predict_tangent(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x_dot: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        acceleration: wp.array(dtype=vector),
-        acceleration_dot: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-        # out
-        x_star_dot: wp.array(dtype=vector),
-        v_star_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        member = i // particles
-        dt = time_step[member]
-        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[member] * acceleration[i]
-        v_star_dot[i] = velocity_dot
-        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
+        time_step: real,
+        time_step_dot: real,
+        x_dot_i: vector,
+        v_dot_i: vector,
+        acceleration_i: vector,
+        acceleration_dot_i: vector,
+        v_star_i: vector,
+    ) -> tuple[vector, vector]:
+        velocity_dot = v_dot_i + time_step * acceleration_dot_i + time_step_dot * acceleration_i
+        return x_dot_i + time_step * velocity_dot + time_step_dot * v_star_i, velocity_dot
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def acceleration_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        v_bar: wp.array(dtype=vector),
-        # out
-        acceleration_bar: wp.array(dtype=vector),
-    ):
+    @particle_kernel(integration_module(precision, False), "acceleration_bar")
+    def acceleration_adjoint(time_step: real, v_bar_i: vector) -> vector:
         """Every prediction of the step used v + dt a, so that one adjoint is dt times the other."""
-        i = wp.tid()
-        member = i // particles
-        acceleration_bar[i] = time_step[member] * v_bar[i]
+        return time_step * v_bar_i
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def collect_masses(

@@ -20,6 +20,7 @@ import warp as wp
 from cortado.device.modules import Kernels, kernel_module, kind_of
 from cortado.device.precision import Precision
 from cortado.particles.fields import Entry, StateField
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout, State
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import FREE_ENERGIES
@@ -46,93 +47,65 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
     """The kernels for a number of phases; their materials are arrays (members, phases). A tape can differentiate
     ``taped`` ones."""
     real, fractions = precision.real, precision.fractions(phases)
-    tiny = wp.constant(real(precision.tiny))
+    tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
         """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
         return wp.log(viscosity + tiny)
 
-    @wp.kernel(module=mixture_module(precision, phases, True, taped))
-    def blend(
-        particles: int,
-        c: wp.array(dtype=fractions),
-        rest_density: wp.array2d(dtype=real),
-        viscosity: wp.array2d(dtype=real),
-        # out
-        rho_0: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        member = i // particles
+    @particle_kernel(mixture_module(precision, phases, True, taped), "rho_0 mu")
+    def blend(member: int, c_i: fractions, rest_density: numbers, viscosity: numbers) -> tuple[real, real]:
         specific_volume = real(0.0)
         power = real(0.0)
         for k in range(wp.static(phases)):
-            specific_volume += c[i][k] / rest_density[member, k]
-            power += c[i][k] * logarithm(viscosity[member, k])
-        rho_0[i] = real(1.0) / specific_volume
-        mu[i] = wp.exp(power)
+            specific_volume += c_i[k] / rest_density[member, k]
+            power += c_i[k] * logarithm(viscosity[member, k])
+        return real(1.0) / specific_volume, wp.exp(power)
 
-    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    @particle_kernel(mixture_module(precision, phases, False), "rho_0_dot mu_dot")
     def blend_tangent(
-        particles: int,
-        c: wp.array(dtype=fractions),
-        c_dot: wp.array(dtype=fractions),
-        rest_density: wp.array2d(dtype=real),
-        rest_density_dot: wp.array2d(dtype=real),
-        viscosity: wp.array2d(dtype=real),
-        viscosity_dot: wp.array2d(dtype=real),
-        rho_0: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        # out
-        rho_0_dot: wp.array(dtype=real),
-        mu_dot: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        member = i // particles
+        member: int,
+        c_i: fractions,
+        c_dot_i: fractions,
+        rest_density: numbers,
+        rest_density_dot: numbers,
+        viscosity: numbers,
+        viscosity_dot: numbers,
+        rho_0_i: real,
+        mu_i: real,
+    ) -> tuple[real, real]:
         change = real(0.0)
         power_dot = real(0.0)
         for k in range(wp.static(phases)):
             rho_k = rest_density[member, k]
             mu_k = viscosity[member, k]
-            change += (c_dot[i][k] - c[i][k] * rest_density_dot[member, k] / rho_k) / rho_k
-            power_dot += c_dot[i][k] * logarithm(mu_k) + c[i][k] * viscosity_dot[member, k] / (mu_k + tiny)
-        rho_0_dot[i] = -rho_0[i] * rho_0[i] * change
-        mu_dot[i] = mu[i] * power_dot
+            change += (c_dot_i[k] - c_i[k] * rest_density_dot[member, k] / rho_k) / rho_k
+            power_dot += c_dot_i[k] * logarithm(mu_k) + c_i[k] * viscosity_dot[member, k] / (mu_k + tiny)
+        return -rho_0_i * rho_0_i * change, mu_i * power_dot
 
-    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar c_bar")
     def blend_adjoint(
-        particles: int,
-        order: wp.array(dtype=wp.int32),
-        c: wp.array(dtype=fractions),
-        rest_density: wp.array2d(dtype=real),
-        viscosity: wp.array2d(dtype=real),
-        rho_0: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        rho_0_bar: wp.array(dtype=real),
-        mu_bar: wp.array(dtype=real),
+        member: int,
+        order_i: wp.int32,
+        c_i: fractions,
+        rest_density: numbers,
+        viscosity: numbers,
+        rho_0_i: real,
+        mu_i: real,
+        rho_0_bar_i: real,
+        mu_bar_i: real,
         c_scene_bar: wp.array(dtype=fractions),
-        # in and out
-        rest_density_bar: wp.array(dtype=fractions),
-        viscosity_bar: wp.array(dtype=fractions),
-        # out
-        c_bar: wp.array(dtype=fractions),
-    ):
+    ) -> tuple[fractions, fractions, fractions]:
         """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
-        i = wp.tid()
-        member = i // particles
-        c_bar_i = c_scene_bar[order[i]]
-        rest_density_bar_i = rest_density_bar[i]
-        viscosity_bar_i = viscosity_bar[i]
-        power_bar = mu_bar[i] * mu[i]
+        c_bar, rest_density_bar, viscosity_bar = c_scene_bar[order_i], fractions(), fractions()
+        power_bar = mu_bar_i * mu_i
         for k in range(wp.static(phases)):
-            by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[member, k]
-            c_bar_i[k] = c_bar_i[k] - by_volume + power_bar * logarithm(viscosity[member, k])
-            rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[member, k]
-            viscosity_bar_i[k] = viscosity_bar_i[k] + power_bar * c[i][k] / (viscosity[member, k] + tiny)
-        rest_density_bar[i] = rest_density_bar_i
-        viscosity_bar[i] = viscosity_bar_i
-        c_bar[i] = c_bar_i
+            by_volume = rho_0_bar_i * rho_0_i * rho_0_i / rest_density[member, k]
+            c_bar[k] = c_bar[k] - by_volume + power_bar * logarithm(viscosity[member, k])
+            rest_density_bar[k] = by_volume * c_i[k] / rest_density[member, k]
+            viscosity_bar[k] = power_bar * c_i[k] / (viscosity[member, k] + tiny)
+        return rest_density_bar, viscosity_bar, c_bar
 
     order = order_kernels(fractions, mixture_module(precision, phases, True, taped))
     return MixtureKernels(order, Kernels(blend, blend_tangent, blend_adjoint))

@@ -12,9 +12,9 @@ from typing import Any
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
@@ -29,42 +29,27 @@ from cortado.sph.parts import StepContext
 def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
     """Does in one launch what that of `cortado.sph.begin_adjoint` does, and begins the adjoints of PCISPH's own."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    from_zero = bundle(n=real, m=real, rho_0=real, mu=real, y=real, p=real)
-    adjoin_new_state = new_state_adjoint(discretisation.precision)
+    adjoin_new_state, vectors = new_state_adjoint(discretisation.precision), wp.array(dtype=vector)
 
-    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    @particle_kernel(
+        discretisation.module(False, "pcisph"),
+        "x_bar v_bar time_step_bar scaled_bar n_bar m_bar rho_0_bar mu_bar y_bar p_bar",
+    )
     def begin_adjoint(
-        particles: int,
-        order: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        v: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-        x_scene_bar: wp.array(dtype=vector),
-        v_scene_bar: wp.array(dtype=vector),
-        # in and out
-        time_step_bar: wp.array(dtype=real),
-        # out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        scaled_bar: wp.array(dtype=vector),
-        bar: from_zero,
-    ):
-        i = wp.tid()
-        dt = time_step[i // particles]
-        x_i_bar, v_i_bar, dt_bar = adjoin_new_state(
-            x_scene_bar[order[i]], v_scene_bar[order[i]], time_step_bar[i], v[i], v_star[i], dt
+        order_i: wp.int32,
+        time_step: real,
+        m_i: real,
+        v_i: vector,
+        v_star_i: vector,
+        x_scene_bar: vectors,
+        v_scene_bar: vectors,
+        time_step_bar_i: real,
+    ) -> tuple[vector, vector, real, vector, real, real, real, real, real, real]:
+        x_bar, v_bar, dt_bar = adjoin_new_state(
+            x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step
         )
-        x_bar[i] = x_i_bar
-        v_bar[i] = v_i_bar
-        scaled_bar[i] = (dt / m[i]) * v_i_bar
-        bar.n[i] = real(0.0)
-        bar.m[i] = real(0.0)
-        bar.rho_0[i] = real(0.0)
-        bar.mu[i] = real(0.0)
-        bar.y[i] = real(0.0)
-        bar.p[i] = real(0.0)
-        time_step_bar[i] = dt_bar
+        no = real(0.0)
+        return x_bar, v_bar, dt_bar, (time_step / m_i) * v_bar, no, no, no, no, no, no
 
     return begin_adjoint
 

@@ -20,11 +20,10 @@ from functools import cache
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import solid_sum
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.walls import normal_part
 
 
@@ -50,11 +49,6 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     normal = normal_part(discretisation)
     topic = "projection_bodies"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
-    held = bundle(gamma_of=vector, arm=vector)
-    held_dots = bundle(gamma_of_dot=vector, arm_dot=vector)
-    held_bars = bundle(gamma_of_bar=vector, arm_bar=vector)
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
@@ -97,149 +91,84 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
             found = a / size
         return found
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "gamma_of arm sizes", [over(push, "total")], numbers=["solid"])
     def hold(
-        s: neighbourhood,
-        solid: int,
-        after: wp.array2d(dtype=vector),
-        x: wp.array(dtype=vector),
-        edge: wp.array(dtype=real),
-        # out
-        gamma_of: wp.array(dtype=vector),
-        arm: wp.array(dtype=vector),
-        sizes: wp.array(dtype=pair_of),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = push(i, x, edge, solid, s)
-        if lane() > 0:
-            return
-        r = separation(x[i], after[i // s.particles, solid], s)
-        gamma_of[i] = total
-        arm[i] = r
-        sizes[i] = pair_of(wp.length(total), wp.length(wp.cross(r, total)))
+        member: int, solid: int, total: vector, after: wp.array2d(dtype=vector), x_i: vector, s: neighbourhood
+    ) -> tuple[vector, vector, pair_of]:
+        r = separation(x_i, after[member, solid], s)
+        return total, r, pair_of(wp.length(total), wp.length(wp.cross(r, total)))
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "gamma_of_dot arm_dot sizes_dot", [over(push_tangent, "total")], numbers=["solid"])
     def hold_tangent(
-        s: neighbourhood,
+        member: int,
         solid: int,
+        total: vector,
         after_dot: wp.array2d(dtype=vector),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        edge: wp.array(dtype=real),
-        edge_dot: wp.array(dtype=real),
-        of: held,
-        # out
-        gamma_of_dot: wp.array(dtype=vector),
-        arm_dot: wp.array(dtype=vector),
-        sizes_dot: wp.array(dtype=pair_of),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = push_tangent(i, x, x_dot, edge, edge_dot, solid, s)
-        if lane() > 0:
-            return
-        r, r_dot, gamma = of.arm[i], x_dot[i] - after_dot[i // s.particles, solid], of.gamma_of[i]
-        torque, torque_dot = wp.cross(r, gamma), wp.cross(r_dot, gamma) + wp.cross(r, total)
-        gamma_of_dot[i] = total
-        arm_dot[i] = r_dot
-        sizes_dot[i] = pair_of(wp.dot(direction(gamma), total), wp.dot(direction(torque), torque_dot))
+        x_dot_i: vector,
+        gamma_of_i: vector,
+        arm_i: vector,
+    ) -> tuple[vector, vector, pair_of]:
+        r_dot = x_dot_i - after_dot[member, solid]
+        torque, torque_dot = wp.cross(arm_i, gamma_of_i), wp.cross(r_dot, gamma_of_i) + wp.cross(arm_i, total)
+        return total, r_dot, pair_of(wp.dot(direction(gamma_of_i), total), wp.dot(direction(torque), torque_dot))
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    back = over(push_back, "total edge_part", bar="gamma_of_bar")
+
+    @particle_kernel(adjoint_module, "+edge_bar +x_bar +force_bar +torque_bar", [back], numbers=["solid"])
     def hold_adjoint(
-        s: neighbourhood,
-        solid: int,
-        x: wp.array(dtype=vector),
-        edge: wp.array(dtype=real),
-        of: held,
-        own: held_bars,
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        edge_bar: wp.array(dtype=real),
-        force_bar: wp.array(dtype=vector),
-        torque_bar: wp.array(dtype=vector),
-    ):
-        """Of gamma, whose sizes have given to ``own``; a further turn of the body turns gamma and takes it along."""
-        i = s.first + wp.tid() // LANES
-        bar = own.gamma_of_bar[i]
-        total, edge_part = push_back(i, x, edge, own.gamma_of_bar, solid, s)
-        if lane() > 0:
-            return
-        edge_bar[i] = edge_bar[i] + edge_part
-        x_bar[i] = x_bar[i] + total + own.arm_bar[i]
-        force_bar[i] = force_bar[i] - total - own.arm_bar[i]
-        torque_bar[i] = torque_bar[i] + wp.cross(of.gamma_of[i], bar) - wp.cross(of.arm[i], total)
+        total: vector, edge_part: real, gamma_of_i: vector, arm_i: vector, gamma_of_bar_i: vector, arm_bar_i: vector
+    ) -> tuple[real, vector, vector, vector]:
+        """Of gamma, whose sizes have given to its adjoint; a further turn of the body turns gamma and takes it
+        along."""
+        torque = wp.cross(gamma_of_i, gamma_of_bar_i) - wp.cross(arm_i, total)
+        return edge_part, total + arm_bar_i, -total - arm_bar_i, torque
 
     @wp.func
     def stiff(density: real, volume: real, greatest: real, whole: pair_of) -> pair_of:
         return pair_of(whole[0] / (density * volume), greatest * whole[1] / density)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def weigh(
-        particles: int,
-        density: wp.array(dtype=real),
-        volume: real,
-        greatest: real,
-        sizes: wp.array(dtype=pair_of),
-        whole: wp.array(dtype=pair_of),
-        # in and out
-        a: wp.array(dtype=real),
-    ):
+    numbers = ["volume", "greatest"]
+
+    @particle_kernel(module, "+a", numbers=numbers)
+    def weigh(density: real, volume: real, greatest: real, sizes_i: pair_of, whole: pair_of) -> real:
         """``whole`` has the sums of the sizes."""
-        i = wp.tid()
-        b = i // particles
-        a[i] = a[i] + wp.dot(sizes[i], stiff(density[b], volume, greatest, whole[b]))
+        return wp.dot(sizes_i, stiff(density, volume, greatest, whole))
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "+a_dot", numbers=numbers)
     def weigh_tangent(
-        particles: int,
-        density: wp.array(dtype=real),
-        density_dot: wp.array(dtype=real),
+        density: real,
+        density_dot: real,
         volume: real,
         greatest: real,
-        sizes: wp.array(dtype=pair_of),
-        sizes_dot: wp.array(dtype=pair_of),
-        whole: wp.array(dtype=pair_of),
-        whole_dot: wp.array(dtype=pair_of),
-        # in and out
-        a_dot: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        b = i // particles
-        by = stiff(density[b], volume, greatest, whole[b])
-        by_dot = stiff(density[b], volume, greatest, whole_dot[b]) - (density_dot[b] / density[b]) * by
-        a_dot[i] = a_dot[i] + wp.dot(sizes_dot[i], by) + wp.dot(sizes[i], by_dot)
+        sizes_i: pair_of,
+        sizes_dot_i: pair_of,
+        whole: pair_of,
+        whole_dot: pair_of,
+    ) -> real:
+        by = stiff(density, volume, greatest, whole)
+        by_dot = stiff(density, volume, greatest, whole_dot) - (density_dot / density) * by
+        return wp.dot(sizes_dot_i, by) + wp.dot(sizes_i, by_dot)
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def weigh_begin_adjoint(
-        sizes: wp.array(dtype=pair_of),
-        a_bar: wp.array(dtype=real),
-        # out
-        sizes_share: wp.array(dtype=pair_of),
-    ):
-        i = wp.tid()
-        sizes_share[i] = a_bar[i] * sizes[i]
+    @particle_kernel(adjoint_module, "sizes_share")
+    def weigh_begin_adjoint(sizes_i: pair_of, a_bar_i: real) -> pair_of:
+        return a_bar_i * sizes_i
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @particle_kernel(adjoint_module, "+gamma_of_bar +arm_bar", numbers=numbers)
     def weigh_adjoint(
-        particles: int,
-        density: wp.array(dtype=real),
+        density: real,
         volume: real,
         greatest: real,
-        of: held,
-        whole: wp.array(dtype=pair_of),
-        weighed: wp.array(dtype=pair_of),
-        a_bar: wp.array(dtype=real),
-        # in and out
-        bar: held,
-    ):
+        gamma_of_i: vector,
+        arm_i: vector,
+        whole: pair_of,
+        weighed: pair_of,
+        a_bar_i: real,
+    ) -> tuple[vector, vector]:
         """``weighed`` is the sum of a_bar times the sizes."""
-        i = wp.tid()
-        b = i // particles
-        by = a_bar[i] * whole[b] + weighed[b]
-        own = stiff(density[b], volume, greatest, by)
-        r, gamma = of.arm[i], of.gamma_of[i]
-        torque_bar = own[1] * direction(wp.cross(r, gamma))
-        bar.gamma_of[i] = bar.gamma_of[i] + own[0] * direction(gamma) + wp.cross(torque_bar, r)
-        bar.arm[i] = bar.arm[i] + wp.cross(gamma, torque_bar)
+        own = stiff(density, volume, greatest, a_bar_i * whole + weighed)
+        torque_bar = own[1] * direction(wp.cross(arm_i, gamma_of_i))
+        gamma_part = own[0] * direction(gamma_of_i) + wp.cross(torque_bar, arm_i)
+        return gamma_part, wp.cross(gamma_of_i, torque_bar)
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def weigh_end_adjoint(
@@ -255,50 +184,25 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         by = stiff(density[b], volume, greatest, whole[b])
         density_bar[b] = density_bar[b] - wp.dot(weighed[b], by) / density[b]
 
-    @wp.kernel(module=module, enable_backward=False)
-    def pull(
-        y: wp.array(dtype=real),
-        of: held,
-        # out
-        pulled: wp.array(dtype=vector),
-        twisted: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        pulled[i] = y[i] * of.gamma_of[i]
-        twisted[i] = y[i] * wp.cross(of.arm[i], of.gamma_of[i])
+    @particle_kernel(module, "pulled twisted")
+    def pull(y_i: real, gamma_of_i: vector, arm_i: vector) -> tuple[vector, vector]:
+        return y_i * gamma_of_i, y_i * wp.cross(arm_i, gamma_of_i)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "pulled_dot twisted_dot")
     def pull_tangent(
-        y: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        of: held,
-        dots: held_dots,
-        # out
-        pulled_dot: wp.array(dtype=vector),
-        twisted_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        gamma, r, gamma_dot, r_dot = of.gamma_of[i], of.arm[i], dots.gamma_of_dot[i], dots.arm_dot[i]
-        pulled_dot[i] = y_dot[i] * gamma + y[i] * gamma_dot
-        twisted_dot[i] = y_dot[i] * wp.cross(r, gamma) + y[i] * (wp.cross(r_dot, gamma) + wp.cross(r, gamma_dot))
+        y_i: real, y_dot_i: real, gamma_of_i: vector, gamma_of_dot_i: vector, arm_i: vector, arm_dot_i: vector
+    ) -> tuple[vector, vector]:
+        turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
+        return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @particle_kernel(adjoint_module, "+y_bar +gamma_of_bar +arm_bar")
     def pull_adjoint(
-        particles: int,
-        y: wp.array(dtype=real),
-        of: held,
-        total_bar: bundle(pulled_sum_bar=vector, twisted_sum_bar=vector),
-        # in and out
-        y_bar: wp.array(dtype=real),
-        bar: held,
-    ):
+        y_i: real, gamma_of_i: vector, arm_i: vector, pulled_sum_bar: vector, twisted_sum_bar: vector
+    ) -> tuple[real, vector, vector]:
         """From the adjoints (members,) of the sums."""
-        i = wp.tid()
-        b = i // particles
-        gamma, r, f, t = of.gamma_of[i], of.arm[i], total_bar.pulled_sum_bar[b], total_bar.twisted_sum_bar[b]
-        y_bar[i] = y_bar[i] + wp.dot(gamma, f) + wp.dot(wp.cross(r, gamma), t)
-        bar.gamma_of[i] = bar.gamma_of[i] + y[i] * (f + wp.cross(t, r))
-        bar.arm[i] = bar.arm[i] + y[i] * wp.cross(gamma, t)
+        by_y = wp.dot(gamma_of_i, pulled_sum_bar) + wp.dot(wp.cross(arm_i, gamma_of_i), twisted_sum_bar)
+        by_gamma = pulled_sum_bar + wp.cross(twisted_sum_bar, arm_i)
+        return by_y, y_i * by_gamma, y_i * wp.cross(gamma_of_i, twisted_sum_bar)
 
     return BodyKernels(
         Kernels(hold, hold_tangent, hold_adjoint),

@@ -10,6 +10,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.moving_walls import matrix_of
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.sph.free_kernels import free_module, rate_function
 
 
@@ -28,7 +29,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
     """In a precision."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module, rate = free_module(precision), rate_function(precision)
-    held, moving = bundle(gamma_of=vector, arm=vector), bundle(V=vector, W=vector, L=vector)
+    moving = bundle(V=vector, W=vector, L=vector)
     begun, sums = bundle(V_0=vector, W_0=vector, L_0=vector), bundle(pulled_sum=vector, twisted_sum=vector)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -114,71 +115,47 @@ def motion_kernels(precision: Precision) -> MotionKernels:
         bar.pulled_sum[b] = V_bar / (rho * volume)
         bar.twisted_sum[b] = L_bar
 
-    @wp.kernel(module=module, enable_backward=False)
-    def carry(
-        particles: int,
-        of: held,
-        at: begun,
-        later: moving,
-        drift_in: wp.array(dtype=real),
-        # out
-        drift: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        b = i // particles
-        faster = later.V[b] - at.V_0[b] + wp.cross(later.W[b] - at.W_0[b], of.arm[i])
-        drift[i] = drift_in[i] + wp.dot(of.gamma_of[i], faster)
+    @particle_kernel(module, "drift:drift_in")
+    def carry(V: vector, V_0: vector, W: vector, W_0: vector, gamma_of_i: vector, arm_i: vector) -> real:
+        return wp.dot(gamma_of_i, V - V_0 + wp.cross(W - W_0, arm_i))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "drift_dot:drift_in_dot")
     def carry_tangent(
-        particles: int,
-        of: held,
-        at: begun,
-        later: moving,
-        dot: bundle(gamma_of=vector, arm=vector, V=vector, W=vector, V_0=vector, W_0=vector, drift_in=real, drift=real),
-    ):
-        """The last of ``dot`` is written."""
-        i = wp.tid()
-        b = i // particles
-        turning, turning_dot, r = later.W[b] - at.W_0[b], dot.W[b] - dot.W_0[b], of.arm[i]
-        faster = later.V[b] - at.V_0[b] + wp.cross(turning, r)
-        faster_dot = dot.V[b] - dot.V_0[b] + wp.cross(turning_dot, r) + wp.cross(turning, dot.arm[i])
-        dot.drift[i] = dot.drift_in[i] + wp.dot(dot.gamma_of[i], faster) + wp.dot(of.gamma_of[i], faster_dot)
+        V: vector,
+        V_dot: vector,
+        V_0: vector,
+        V_0_dot: vector,
+        W: vector,
+        W_dot: vector,
+        W_0: vector,
+        W_0_dot: vector,
+        gamma_of_i: vector,
+        gamma_of_dot_i: vector,
+        arm_i: vector,
+        arm_dot_i: vector,
+    ) -> real:
+        faster = V - V_0 + wp.cross(W - W_0, arm_i)
+        turned = wp.cross(W_dot - W_0_dot, arm_i) + wp.cross(W - W_0, arm_dot_i)
+        return wp.dot(gamma_of_dot_i, faster) + wp.dot(gamma_of_i, V_dot - V_0_dot + turned)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+gamma_of_bar +arm_bar pulled twisted")
     def carry_adjoint(
-        particles: int,
-        of: held,
-        at: begun,
-        later: moving,
-        carried_bar: wp.array(dtype=real),
-        # in and out
-        bar: held,
-        # out
-        pulled: wp.array(dtype=vector),
-        twisted: wp.array(dtype=vector),
-    ):
+        V: vector, V_0: vector, W: vector, W_0: vector, gamma_of_i: vector, arm_i: vector, carried_bar_i: real
+    ) -> tuple[vector, vector, vector, vector]:
         """For the adjoint of the drift; ``pulled`` and ``twisted`` are the shares of those of V and W."""
-        i = wp.tid()
-        b = i // particles
-        d, turning, r, gamma = carried_bar[i], later.W[b] - at.W_0[b], of.arm[i], of.gamma_of[i]
-        bar.gamma_of[i] = bar.gamma_of[i] + d * (later.V[b] - at.V_0[b] + wp.cross(turning, r))
-        bar.arm[i] = bar.arm[i] + d * wp.cross(gamma, turning)
-        pulled[i] = d * gamma
-        twisted[i] = d * wp.cross(r, gamma)
+        faster = V - V_0 + wp.cross(W - W_0, arm_i)
+        by_arm = wp.cross(gamma_of_i, W - W_0)
+        return (
+            carried_bar_i * faster,
+            carried_bar_i * by_arm,
+            carried_bar_i * gamma_of_i,
+            carried_bar_i * wp.cross(arm_i, gamma_of_i),
+        )
 
-    @wp.kernel(module=module, enable_backward=False)
-    def slower(
-        V_bar: wp.array(dtype=vector),
-        W_bar: wp.array(dtype=vector),
-        # in and out
-        V_0_bar: wp.array(dtype=vector),
-        W_0_bar: wp.array(dtype=vector),
-    ):
-        """Of the velocities that walls have, which the drift does without."""
-        b = wp.tid()
-        V_0_bar[b] = V_0_bar[b] - V_bar[b]
-        W_0_bar[b] = W_0_bar[b] - W_bar[b]
+    @particle_kernel(module, "+V_0_bar +W_0_bar")
+    def slower(V_bar_i: vector, W_bar_i: vector) -> tuple[vector, vector]:
+        """Of the velocities that walls have, which the drift does without; a thread is a scene."""
+        return -V_bar_i, -W_bar_i
 
     return MotionKernels(
         Kernels(move, move_tangent, move_adjoint), Kernels(carry, carry_tangent, (carry_adjoint, slower))

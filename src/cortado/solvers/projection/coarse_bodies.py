@@ -21,6 +21,7 @@ from cortado.device.cells import cell_grid_type
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_nodes import hat_functions, node_functions
@@ -91,68 +92,49 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
             for axis in range(3):
                 B[first + 3 + axis, node] = torque[axis]
 
-    @wp.kernel(module=module, enable_backward=False)
-    def lift(
-        grid: grid_type,
-        particles: int,
-        factor: real,
-        x: wp.array(dtype=vector),
-        coarse: wp.array(dtype=real),
-        e: wp.array(dtype=real),
-        # out
-        lifted: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        lifted[i] = factor * coarse[i] * at(i, particles, x[i], e, grid).value
+    numbers, values = ["grid", "particles"], wp.array(dtype=real)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "lifted", numbers=[*numbers, "factor"])
+    def lift(i: int, grid: grid_type, particles: int, factor: real, x_i: vector, coarse_i: real, e: values) -> real:
+        return factor * coarse_i * at(i, particles, x_i, e, grid).value
+
+    @particle_kernel(module, "lifted_dot", numbers=numbers)
     def lift_tangent(
+        i: int,
         grid: grid_type,
         particles: int,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        coarse: wp.array(dtype=real),
-        coarse_dot: wp.array(dtype=real),
-        e: wp.array(dtype=real),
-        # out
-        lifted_dot: wp.array(dtype=real),
-    ):
+        x_i: vector,
+        x_dot_i: vector,
+        coarse_i: real,
+        coarse_dot_i: real,
+        e: values,
+    ) -> real:
         """Of c E, with e as it is."""
-        i = wp.tid()
-        f = at(i, particles, x[i], e, grid)
-        lifted_dot[i] = coarse_dot[i] * f.value + coarse[i] * wp.dot(f.slope, x_dot[i])
+        f = at(i, particles, x_i, e, grid)
+        return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+s_value +s_slope")
     def source_tangent(
-        x_dot: wp.array(dtype=vector),
-        of: bundle(coarse=real, carried=real),
-        dot: bundle(coarse=real, carried=real),
-        # in and out
-        s_value: wp.array(dtype=real),
-        s_slope: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        s_value[i] = s_value[i] - dot.coarse[i] * of.carried[i] - of.coarse[i] * dot.carried[i]
-        s_slope[i] = s_slope[i] - (of.coarse[i] * of.carried[i]) * x_dot[i]
+        x_dot_i: vector, coarse_i: real, coarse_dot_i: real, carried_i: real, carried_dot_i: real
+    ) -> tuple[real, vector]:
+        return -coarse_dot_i * carried_i - coarse_i * carried_dot_i, -(coarse_i * carried_i) * x_dot_i
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+coarse_bar +x_bar", numbers=numbers)
     def source_adjoint(
+        i: int,
         grid: grid_type,
         particles: int,
-        x: wp.array(dtype=vector),
-        coarse: wp.array(dtype=real),
-        e: wp.array(dtype=real),
-        multiplier: wp.array(dtype=real),
-        carried: wp.array(dtype=real),
-        lifted_bar: wp.array(dtype=real),
-        # in and out
-        bar: bundle(x=vector, coarse=real),
-    ):
+        x_i: vector,
+        coarse_i: real,
+        e: values,
+        multiplier: values,
+        carried_i: real,
+        lifted_bar_i: real,
+    ) -> tuple[real, vector]:
         """``multiplier`` is lambda, and ``carried`` G c E."""
-        i = wp.tid()
-        f, g = at(i, particles, x[i], e, grid), at(i, particles, x[i], multiplier, grid)
-        bar.coarse[i] = bar.coarse[i] + lifted_bar[i] * f.value - carried[i] * g.value
-        bar.x[i] = bar.x[i] + coarse[i] * (lifted_bar[i] * f.slope - carried[i] * g.slope)
+        f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
+        slope = lifted_bar_i * f.slope - carried_i * g.slope
+        return lifted_bar_i * f.value - carried_i * g.value, coarse_i * slope
 
     return CoarseBodyKernels(gather, lift, lift_tangent, source_tangent, source_adjoint)
 

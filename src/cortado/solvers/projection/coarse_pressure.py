@@ -30,10 +30,10 @@ from typing import Any
 import warp as wp
 
 from cortado.device.cells import cell_grid_type
-from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions, source_type
+from cortado.particles.particle_kernels import particle_kernel
+from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
@@ -64,144 +64,141 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
     six, pack, parts = packed.kind, packed.pack, clamp_functions(precision).parts
     module = kernel_module(f"coarse_pressure_{dimension}d_{precision.name}")
 
-    @wp.kernel(module=module, enable_backward=False)
+    numbers, values = ["grid", "particles"], wp.array(dtype=real)
+
+    @particle_kernel(module, "change T", numbers=numbers)
     def correct(
+        i: int,
         grid: grid_type,
         particles: int,
-        x: wp.array(dtype=vector),
-        L: wp.array(dtype=matrix),
-        coarse: wp.array(dtype=real),
-        weights: wp.array(dtype=weights4),
-        y: wp.array(dtype=real),
-        e: wp.array(dtype=real),
-        # out
-        change: wp.array(dtype=real),
-        T: wp.array(dtype=six),
-    ):
+        x_i: vector,
+        L_i: matrix,
+        coarse_i: real,
+        weights_i: weights4,
+        y_i: real,
+        e: values,
+    ) -> tuple[real, six]:
         """T is d L."""
-        i = wp.tid()
-        z, least = y[i] + coarse[i] * at(i, particles, x[i], e, grid).value, wp.min(y[i], real(0.0))
+        z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
         new = z
         if z < least:
-            new = least + weights[i][0] * (z - least)
-        change[i] = new - y[i]
-        T[i] = (new - y[i]) * pack(L[i])
+            new = least + weights_i[0] * (z - least)
+        return new - y_i, (new - y_i) * pack(L_i)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "s_value s_own s_slope s_bent", numbers=[*numbers, "eps"])
     def source_tangent(
+        i: int,
         grid: grid_type,
         particles: int,
         eps: real,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        of: bundle(coarse=real, coarse_dot=real, h=vector, h_dot=vector, N=matrix, N_dot=matrix, r=real, r_dot=real),
-        e: wp.array(dtype=real),
-        # out
-        out: source_type(precision),
-    ):
-        i = wp.tid()
-        f = at(i, particles, x[i], e, grid)
-        N, h, N_dot, h_dot, v = of.N[i], of.h[i], of.N_dot[i], of.h_dot[i], x_dot[i]
-        along = wp.dot(f.slope, v)
-        w = (N * f.slope + f.value * h) / m[i]
-        w_dot = (N_dot * f.slope + N * bend(f.bent, v) + along * h + f.value * h_dot - m_dot[i] * w) / m[i]
-        p, cr = wp.transpose(N) * w, of.coarse[i] * of.r[i]
-        out.s_value[i] = of.coarse_dot[i] * of.r[i] + of.coarse[i] * of.r_dot[i] - wp.dot(h_dot, w) - wp.dot(h, w_dot)
-        out.s_own[i] = (held(eps, h) * m_dot[i] / m[i] - alone * wp.dot(h, h_dot)) / m[i]
-        out.s_slope[i] = (cr - wp.dot(h, w)) * v - wp.transpose(N_dot) * w - wp.transpose(N) * w_dot
-        out.s_bent[i] = -(cross_terms(p, v) + cross_terms(v, p))
+        x_i: vector,
+        x_dot_i: vector,
+        m_i: real,
+        m_dot_i: real,
+        coarse_i: real,
+        coarse_dot_i: real,
+        h_i: vector,
+        h_dot_i: vector,
+        N_i: matrix,
+        N_dot_i: matrix,
+        r_i: real,
+        r_dot_i: real,
+        e: values,
+    ) -> tuple[real, real, vector, vector]:
+        f = at(i, particles, x_i, e, grid)
+        along = wp.dot(f.slope, x_dot_i)
+        w = (N_i * f.slope + f.value * h_i) / m_i
+        w_dot = N_dot_i * f.slope + N_i * bend(f.bent, x_dot_i) + along * h_i + f.value * h_dot_i
+        w_dot = (w_dot - m_dot_i * w) / m_i
+        p, cr = wp.transpose(N_i) * w, coarse_i * r_i
+        value = coarse_dot_i * r_i + coarse_i * r_dot_i - wp.dot(h_dot_i, w) - wp.dot(h_i, w_dot)
+        own = (held(eps, h_i) * m_dot_i / m_i - alone * wp.dot(h_i, h_dot_i)) / m_i
+        slope = (cr - wp.dot(h_i, w)) * x_dot_i - wp.transpose(N_dot_i) * w - wp.transpose(N_i) * w_dot
+        return value, own, slope, -(cross_terms(p, x_dot_i) + cross_terms(x_dot_i, p))
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "change_dot", numbers=numbers)
     def correct_tangent(
+        i: int,
         grid: grid_type,
         particles: int,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        of: bundle(coarse=real, coarse_dot=real, weights=weights4, weights_dot=weights4, y=real, y_dot=real),
-        e: wp.array(dtype=real),
-        e_dot: wp.array(dtype=real),
-        # out
-        change_dot: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        f, f_dot = at(i, particles, x[i], e, grid), at(i, particles, x[i], e_dot, grid)
-        z = of.y[i] + of.coarse[i] * f.value
-        z_dot = of.y_dot[i] + of.coarse_dot[i] * f.value
-        z_dot += of.coarse[i] * (wp.dot(f.slope, x_dot[i]) + f_dot.value)
-        below, below_dot, sigma = z - wp.min(of.y[i], real(0.0)), z_dot, of.weights[i][0]
-        if of.y[i] < real(0.0):
-            below_dot -= of.y_dot[i]
+        x_i: vector,
+        x_dot_i: vector,
+        coarse_i: real,
+        coarse_dot_i: real,
+        weights_i: weights4,
+        weights_dot_i: weights4,
+        y_i: real,
+        y_dot_i: real,
+        e: values,
+        e_dot: values,
+    ) -> real:
+        f, f_dot = at(i, particles, x_i, e, grid), at(i, particles, x_i, e_dot, grid)
+        z = y_i + coarse_i * f.value
+        z_dot = y_dot_i + coarse_dot_i * f.value
+        z_dot += coarse_i * (wp.dot(f.slope, x_dot_i) + f_dot.value)
+        below, below_dot, sigma = z - wp.min(y_i, real(0.0)), z_dot, weights_i[0]
+        if y_i < real(0.0):
+            below_dot -= y_dot_i
         rise, fall = parts(below, below)
-        new_dot = rise * z_dot + fall * (z_dot - below_dot + of.weights_dot[i][0] * below + sigma * below_dot)
-        change_dot[i] = new_dot - of.y_dot[i]
+        return rise * z_dot + fall * (z_dot - below_dot + weights_dot_i[0] * below + sigma * below_dot) - y_dot_i
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+weights_bar +coarse_bar +x_bar +y_bar s_value s_slope s_bent s_own", numbers=numbers)
     def correct_adjoint(
+        i: int,
         grid: grid_type,
         particles: int,
-        x: wp.array(dtype=vector),
-        of: bundle(coarse=real, weights=weights4, y=real),
-        e: wp.array(dtype=real),
-        change_bar: wp.array(dtype=real),
-        # in and out
-        y_bar: wp.array(dtype=real),
-        x_bar: wp.array(dtype=vector),
-        coarse_bar: wp.array(dtype=real),
-        weights_bar: wp.array(dtype=weights4),
-        # out
-        s_value: wp.array(dtype=real),
-        s_slope: wp.array(dtype=vector),
-        s_bent: wp.array(dtype=vector),
-        s_own: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        no, c = real(0.0), of.coarse[i]
-        f = at(i, particles, x[i], e, grid)
-        z = of.y[i] + c * f.value
-        below, sigma, new_bar, least_bar = z - wp.min(of.y[i], no), of.weights[i][0], change_bar[i], no
+        x_i: vector,
+        coarse_i: real,
+        weights_i: weights4,
+        y_i: real,
+        e: values,
+        change_bar_i: real,
+    ) -> tuple[weights4, real, vector, real, real, vector, vector, real]:
+        no, f = real(0.0), at(i, particles, x_i, e, grid)
+        z = y_i + coarse_i * f.value
+        below, sigma, least_bar = z - wp.min(y_i, no), weights_i[0], no
         rise, fall = parts(below, below)
-        z_bar = (rise + fall * sigma) * new_bar
-        if of.y[i] < no:
-            least_bar = fall * (real(1.0) - sigma) * new_bar
-        weights_bar[i] = weights_bar[i] + weights4(fall * below * new_bar, no, no, no)
-        coarse_bar[i] = coarse_bar[i] + z_bar * f.value
-        x_bar[i] = x_bar[i] + (z_bar * c) * f.slope
-        y_bar[i] = y_bar[i] + z_bar + least_bar - new_bar
-        s_value[i] = c * z_bar
-        s_slope[i] = vector()
-        s_bent[i] = vector()
-        s_own[i] = real(0.0)
+        z_bar = (rise + fall * sigma) * change_bar_i
+        if y_i < no:
+            least_bar = fall * (real(1.0) - sigma) * change_bar_i
+        tension_bar, y_part = fall * below * change_bar_i, z_bar + least_bar - change_bar_i
+        source = coarse_i * z_bar
+        return (
+            weights4(tension_bar, no, no, no),
+            z_bar * f.value,
+            source * f.slope,
+            y_part,
+            source,
+            vector(),
+            vector(),
+            real(0.0),
+        )
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "+r_bar +coarse_bar +h_bar +N_bar +m_bar +x_bar", numbers=[*numbers, "eps"])
     def source_adjoint(
+        i: int,
         grid: grid_type,
         particles: int,
         eps: real,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        of: bundle(coarse=real, h=vector, N=matrix, r=real),
-        e: wp.array(dtype=real),
-        multiplier: wp.array(dtype=real),
-        # in and out
-        bar: bundle(x=vector, m=real, coarse=real, h=vector, N=matrix),
-        r_bar: wp.array(dtype=real),
-    ):
+        x_i: vector,
+        m_i: real,
+        coarse_i: real,
+        h_i: vector,
+        N_i: matrix,
+        r_i: real,
+        e: values,
+        multiplier: values,
+    ) -> tuple[real, real, vector, matrix, real, vector]:
         """``multiplier`` is lambda."""
-        i = wp.tid()
-        f, g = at(i, particles, x[i], e, grid), at(i, particles, x[i], multiplier, grid)
-        N, h, c, r = of.N[i], of.h[i], of.coarse[i], of.r[i]
-        w, u = (N * f.slope + f.value * h) / m[i], (N * g.slope + g.value * h) / m[i]
-        r_bar[i] = r_bar[i] + c * g.value
-        bar.coarse[i] = bar.coarse[i] + g.value * r
-        both = products(i, particles, x[i], e, multiplier, grid)
-        bar.h[i] = bar.h[i] - g.value * w - f.value * u - (alone * both / m[i]) * h
-        bar.N[i] = bar.N[i] - wp.outer(w, g.slope) - wp.outer(u, f.slope)
-        bar.m[i] = bar.m[i] + wp.dot(u, w) + held(eps, h) * both / (m[i] * m[i])
-        x_part = (c * r - wp.dot(h, w)) * g.slope - wp.dot(h, u) * f.slope
-        x_part -= bend(g.bent, wp.transpose(N) * w) + bend(f.bent, wp.transpose(N) * u)
-        bar.x[i] = bar.x[i] + x_part
+        f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
+        w, u = (N_i * f.slope + f.value * h_i) / m_i, (N_i * g.slope + g.value * h_i) / m_i
+        both = products(i, particles, x_i, e, multiplier, grid)
+        h_part = -g.value * w - f.value * u - (alone * both / m_i) * h_i
+        N_part = -wp.outer(w, g.slope) - wp.outer(u, f.slope)
+        x_part = (coarse_i * r_i - wp.dot(h_i, w)) * g.slope - wp.dot(h_i, u) * f.slope
+        x_part -= bend(g.bent, wp.transpose(N_i) * w) + bend(f.bent, wp.transpose(N_i) * u)
+        m_part = wp.dot(u, w) + held(eps, h_i) * both / (m_i * m_i)
+        return coarse_i * g.value, g.value * r_i, h_part, N_part, m_part, x_part
 
     return CoarsePressureKernels(correct, correct_tangent, source_tangent, correct_adjoint, source_adjoint)
 
@@ -259,140 +256,112 @@ def length_kernels(precision: Precision) -> LengthKernels:
         v = small * spacing / dt
         return m * v * v
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "parts", numbers=["first", "spacing"])
     def share(
-        particles: int,
         first: int,
         spacing: real,
-        stays: wp.array(dtype=int),
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        r: wp.array(dtype=real),
-        change: wp.array(dtype=real),
-        carried: wp.array(dtype=real),
-        thrust: wp.array(dtype=vector),
-        # out
-        parts: wp.array(dtype=pair_of),
-    ):
+        stays: int,
+        time_step: real,
+        m_i: real,
+        r_i: real,
+        change_i: real,
+        carried_i: real,
+        thrust_i: vector,
+    ) -> pair_of:
         """In a scene that ``stays`` as it is alpha is 0."""
-        i = wp.tid()
-        if stays[i // particles] != 0:
-            parts[i] = pair_of(real(0.0), m[i])
-            return
-        d, own = change[i], least(m[i], spacing, time_step[i // particles])
-        parts[i] = pair_of(r[i] * d + real(1 - first) * own, m[i] * wp.dot(thrust[i], thrust[i]) + d * carried[i] + own)
+        if stays != 0:
+            return pair_of(real(0.0), m_i)
+        own = least(m_i, spacing, time_step)
+        energy = m_i * wp.dot(thrust_i, thrust_i) + change_i * carried_i + own
+        return pair_of(r_i * change_i + real(1 - first) * own, energy)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def apply(
-        particles: int,
-        sums: wp.array(dtype=pair_of),
-        y: wp.array(dtype=real),
-        u: wp.array(dtype=vector),
-        change: wp.array(dtype=real),
-        thrust: wp.array(dtype=vector),
-        # out
-        k_out: wp.array(dtype=real),
-        y_out: wp.array(dtype=real),
-        u_out: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        alpha = length(sums[i // particles])
-        new = y[i] + alpha * change[i]
-        k_out[i] = new
-        y_out[i] = new
-        u_out[i] = u[i] + alpha * thrust[i]
+    @particle_kernel(module, "k_out y_out u_out")
+    def apply(sums: pair_of, y_i: real, u_i: vector, change_i: real, thrust_i: vector) -> tuple[real, real, vector]:
+        alpha = length(sums)
+        new = y_i + alpha * change_i
+        return new, new, u_i + alpha * thrust_i
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "parts", numbers=["first", "spacing"])
     def share_tangent(
-        particles: int,
         first: int,
         spacing: real,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        of: bundle(r=real, change=real, carried=real, thrust=vector),
-        dot: bundle(r=real, change=real, carried=real, thrust=vector),
-        # out
-        parts: wp.array(dtype=pair_of),
-    ):
-        i = wp.tid()
-        along = dot.r[i] * of.change[i] + of.r[i] * dot.change[i]
-        f, f_dot = of.thrust[i], dot.thrust[i]
-        energy = m_dot[i] * wp.dot(f, f) + real(2.0) * m[i] * wp.dot(f, f_dot)
-        energy += dot.change[i] * of.carried[i] + of.change[i] * dot.carried[i]
-        dt, dt_dot = time_step[i // particles], time_step_dot[i // particles]
-        own_dot = least(m_dot[i], spacing, dt) - real(2.0) * least(m[i], spacing, dt) * dt_dot / dt
-        parts[i] = pair_of(along + real(1 - first) * own_dot, energy + own_dot)
+        time_step: real,
+        time_step_dot: real,
+        m_i: real,
+        m_dot_i: real,
+        r_i: real,
+        r_dot_i: real,
+        change_i: real,
+        change_dot_i: real,
+        carried_i: real,
+        carried_dot_i: real,
+        thrust_i: vector,
+        thrust_dot_i: vector,
+    ) -> pair_of:
+        along = r_dot_i * change_i + r_i * change_dot_i
+        energy = m_dot_i * wp.dot(thrust_i, thrust_i) + real(2.0) * m_i * wp.dot(thrust_i, thrust_dot_i)
+        energy += change_dot_i * carried_i + change_i * carried_dot_i
+        longer = real(2.0) * least(m_i, spacing, time_step) * time_step_dot / time_step
+        own_dot = least(m_dot_i, spacing, time_step) - longer
+        return pair_of(along + real(1 - first) * own_dot, energy + own_dot)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "k_dot y_dot u_dot")
     def apply_tangent(
-        particles: int,
-        sums: wp.array(dtype=pair_of),
-        sums_dot: wp.array(dtype=pair_of),
-        of: bundle(change=real, change_dot=real, thrust=vector, thrust_dot=vector),
-        # in and out
-        k_dot: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        u_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        both, both_dot = sums[i // particles], sums_dot[i // particles]
-        alpha, alpha_dot = length(both), real(0.0)
-        if bends(both):
-            alpha_dot = (both_dot[0] - alpha * both_dot[1]) / both[1]
-        new = y_dot[i] + alpha_dot * of.change[i] + alpha * of.change_dot[i]
-        k_dot[i] = new
-        y_dot[i] = new
-        u_dot[i] = u_dot[i] + alpha_dot * of.thrust[i] + alpha * of.thrust_dot[i]
+        sums: pair_of,
+        sums_dot: pair_of,
+        y_dot_i: real,
+        u_dot_i: vector,
+        change_i: real,
+        change_dot_i: real,
+        thrust_i: vector,
+        thrust_dot_i: vector,
+    ) -> tuple[real, real, vector]:
+        alpha, alpha_dot = length(sums), real(0.0)
+        if bends(sums):
+            alpha_dot = (sums_dot[0] - alpha * sums_dot[1]) / sums[1]
+        new = y_dot_i + alpha_dot * change_i + alpha * change_dot_i
+        return new, new, u_dot_i + alpha_dot * thrust_i + alpha * thrust_dot_i
 
-    @wp.kernel(module=module, enable_backward=False)
-    def along_adjoint(
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        u_bar: wp.array(dtype=vector),
-        change: wp.array(dtype=real),
-        thrust: wp.array(dtype=vector),
-        # out
-        alpha_bar: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        alpha_bar[i] = (k_bar[i] + y_bar[i]) * change[i] + wp.dot(u_bar[i], thrust[i])
+    @particle_kernel(module, "alpha_bar")
+    def along_adjoint(k_bar_i: real, y_bar_i: real, u_bar_i: vector, change_i: real, thrust_i: vector) -> real:
+        return (k_bar_i + y_bar_i) * change_i + wp.dot(u_bar_i, thrust_i)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(
+        module,
+        "k_bar y_bar +m_bar +time_step_bar change_bar carried_bar thrust_bar r_bar",
+        numbers=["first", "spacing"],
+    )
     def apply_adjoint(
-        particles: int,
         first: int,
         spacing: real,
-        time_step: wp.array(dtype=real),
-        sums: wp.array(dtype=pair_of),
-        alpha_bar: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        of: bundle(r=real, change=real, carried=real, thrust=vector),
-        u_bar: wp.array(dtype=vector),
-        # in and out: at first those of k' and y', at last those of k and y
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        bar: bundle(m=real, time_step=real),
-        # out
-        out: bundle(change_bar=real, carried_bar=real, thrust_bar=vector, r_bar=real),
-    ):
-        """``alpha_bar`` is that of each scene. The adjoint of u' is that of u, too."""
-        i = wp.tid()
-        both = sums[i // particles]
-        alpha, along_bar, energy_bar = length(both), real(0.0), real(0.0)
-        if bends(both):
-            along_bar = alpha_bar[i // particles] / both[1]
+        time_step: real,
+        sums: pair_of,
+        alpha_bar: real,
+        m_i: real,
+        r_i: real,
+        change_i: real,
+        carried_i: real,
+        thrust_i: vector,
+        u_bar_i: vector,
+        k_bar_i: real,
+        y_bar_i: real,
+    ) -> tuple[real, real, real, real, real, real, vector, real]:
+        """``alpha_bar`` is that of each scene. The adjoints of k' and y' become those of k and y; that of u' is that of
+        u, too."""
+        alpha, along_bar, energy_bar = length(sums), real(0.0), real(0.0)
+        if bends(sums):
+            along_bar = alpha_bar / sums[1]
             energy_bar = -alpha * along_bar
-        new_bar, f = k_bar[i] + y_bar[i], of.thrust[i]
-        k_bar[i] = real(0.0)
-        y_bar[i] = new_bar
-        dt, own_bar = time_step[i // particles], real(1 - first) * along_bar + energy_bar
-        bar.m[i] = bar.m[i] + energy_bar * wp.dot(f, f) + own_bar * least(real(1.0), spacing, dt)
-        bar.time_step[i] = bar.time_step[i] - real(2.0) * own_bar * least(m[i], spacing, dt) / dt
-        out.change_bar[i] = alpha * new_bar + along_bar * of.r[i] + energy_bar * of.carried[i]
-        out.carried_bar[i] = energy_bar * of.change[i]
-        out.thrust_bar[i] = alpha * u_bar[i] + (real(2.0) * m[i] * energy_bar) * f
-        out.r_bar[i] = along_bar * of.change[i]
+        new_bar, own_bar = k_bar_i + y_bar_i, real(1 - first) * along_bar + energy_bar
+        return (
+            real(0.0),
+            new_bar,
+            energy_bar * wp.dot(thrust_i, thrust_i) + own_bar * least(real(1.0), spacing, time_step),
+            -real(2.0) * own_bar * least(m_i, spacing, time_step) / time_step,
+            alpha * new_bar + along_bar * r_i + energy_bar * carried_i,
+            energy_bar * change_i,
+            alpha * u_bar_i + (real(2.0) * m_i * energy_bar) * thrust_i,
+            along_bar * change_i,
+        )
 
     return LengthKernels(share, share_tangent, apply, apply_tangent, apply_adjoint, along_adjoint, every)

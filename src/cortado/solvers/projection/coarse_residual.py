@@ -18,17 +18,14 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
-from cortado.solvers.projection.coarse_nodes import source_type
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric
 
 
@@ -94,88 +91,69 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     """The kernels of h and N in 2 or 3 dimensions: each time that of T comes first."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, sums, packed = neighbourhood_type(precision), coarse_sums(discretisation), symmetric(precision)
+    sums, packed = coarse_sums(discretisation), symmetric(precision)
     push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
     six, pack, times = packed.kind, packed.pack, packed.times
     whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module, adjoint_module = discretisation.modules(topic)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "g", "beside", "coarse")}
-    seen, bars = bundle(**own), bundle(x=vector, **own)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
 
-    @wp.kernel(module=module)
-    def pull(of: seen, T: wp.array(dtype=six)):
-        i = wp.tid()
-        T[i] = of.coarse[i] * pack(of.L[i])
+    @particle_kernel(module, "T")
+    def pull(coarse_i: real, L_i: matrix) -> six:
+        return coarse_i * pack(L_i)
 
-    @wp.kernel(module=module)
+    @particle_kernel(module, "h N", [over(push, "total row_x row_y row_z")])
     def coarse_push(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        of: seen,
-        T: wp.array(dtype=six),
-        # out
-        h: wp.array(dtype=vector),
-        N: wp.array(dtype=matrix),
-    ):
-        i = s.first + wp.tid() // LANES
-        total, row_x, row_y, row_z = push(i, x, T, s)
-        if lane() > 0:
-            return
-        h[i] = total + times(T[i], of.g[i]) + of.coarse[i] * of.beside[i]
-        N[i] = wp.matrix_from_rows(row_x, row_y, row_z)
+        total: vector,
+        row_x: vector,
+        row_y: vector,
+        row_z: vector,
+        T_i: six,
+        g_i: vector,
+        coarse_i: real,
+        beside_i: vector,
+    ) -> tuple[vector, matrix]:
+        return total + times(T_i, g_i) + coarse_i * beside_i, wp.matrix_from_rows(row_x, row_y, row_z)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def pull_tangent(of: seen, dot: seen, T: wp.array(dtype=six), T_dot: wp.array(dtype=six)):
-        i = wp.tid()
-        T[i] = of.coarse[i] * pack(of.L[i])
-        T_dot[i] = dot.coarse[i] * pack(of.L[i]) + of.coarse[i] * pack(dot.L[i])
+    @particle_kernel(tangent_module, "T T_dot")
+    def pull_tangent(coarse_i: real, coarse_dot_i: real, L_i: matrix, L_dot_i: matrix) -> tuple[six, six]:
+        return coarse_i * pack(L_i), coarse_dot_i * pack(L_i) + coarse_i * pack(L_dot_i)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "h_dot N_dot", [over(push_tangent, "total row_x row_y row_z")])
     def coarse_push_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        of: seen,
-        dot: seen,
-        T: wp.array(dtype=six),
-        T_dot: wp.array(dtype=six),
-        # out
-        h_dot: wp.array(dtype=vector),
-        N_dot: wp.array(dtype=matrix),
-    ):
-        i = s.first + wp.tid() // LANES
-        total, row_x, row_y, row_z = push_tangent(i, x, x_dot, T, T_dot, s)
-        if lane() > 0:
-            return
-        own_part = times(T_dot[i], of.g[i]) + times(T[i], dot.g[i])
-        own_part += dot.coarse[i] * of.beside[i] + of.coarse[i] * dot.beside[i]
-        h_dot[i] = total + own_part
-        N_dot[i] = wp.matrix_from_rows(row_x, row_y, row_z)
+        total: vector,
+        row_x: vector,
+        row_y: vector,
+        row_z: vector,
+        T_i: six,
+        T_dot_i: six,
+        g_i: vector,
+        g_dot_i: vector,
+        coarse_i: real,
+        coarse_dot_i: real,
+        beside_i: vector,
+        beside_dot_i: vector,
+    ) -> tuple[vector, matrix]:
+        own_part = times(T_dot_i, g_i) + times(T_i, g_dot_i)
+        own_part += coarse_dot_i * beside_i + coarse_i * beside_dot_i
+        return total + own_part, wp.matrix_from_rows(row_x, row_y, row_z)
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    back = over(push_back, "diagonal others x_part")
+
+    @particle_kernel(adjoint_module, "+x_bar +L_bar +coarse_bar +g_bar +beside_bar", [back])
     def coarse_push_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        of: seen,
-        T: wp.array(dtype=six),
-        h_bar: wp.array(dtype=vector),
-        N_bar: wp.array(dtype=matrix),
-        # in and out
-        bar: bars,
-    ):
-        i = s.first + wp.tid() // LANES
-        diagonal, others, x_part = push_back(i, x, T, h_bar, N_bar, s)
-        if lane() > 0:
-            return
-        c, g, f = of.coarse[i], of.g[i], h_bar[i]
-        T_bar = whole(diagonal, others) + real(0.5) * (wp.outer(f, g) + wp.outer(g, f))
-        bar.x[i] = bar.x[i] + x_part
-        bar.L[i] = bar.L[i] + c * T_bar
-        bar.coarse[i] = bar.coarse[i] + wp.ddot(of.L[i], T_bar) + wp.dot(of.beside[i], f)
-        bar.g[i] = bar.g[i] + times(T[i], f)
-        bar.beside[i] = bar.beside[i] + c * f
+        diagonal: vector,
+        others: vector,
+        x_part: vector,
+        L_i: matrix,
+        T_i: six,
+        g_i: vector,
+        coarse_i: real,
+        beside_i: vector,
+        h_bar_i: vector,
+    ) -> tuple[vector, matrix, real, vector, vector]:
+        T_bar = whole(diagonal, others) + real(0.5) * (wp.outer(h_bar_i, g_i) + wp.outer(g_i, h_bar_i))
+        coarse_part = wp.ddot(L_i, T_bar) + wp.dot(beside_i, h_bar_i)
+        return x_part, coarse_i * T_bar, coarse_part, times(T_i, h_bar_i), coarse_i * h_bar_i
 
     return Kernels((pull, coarse_push), (pull_tangent, coarse_push_tangent), (pull, coarse_push_adjoint))
 
@@ -195,18 +173,13 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
     """In 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    sums = projection_sums(discretisation)
     spread, spread_tangent = image_sums(discretisation).spread, image_sums(discretisation).spread_tangent
     gradient, gradient_tangent = sums.velocity_gradient, sums.velocity_gradient_tangent
     packed, clamp = symmetric(precision), clamp_functions(precision)
     wanted, wanted_tangent = clamp.wanted, clamp.wanted_tangent
-    six, pack, topic = packed.kind, packed.pack, f"projection_{dimension}d"
-    own = {
-        name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "weights", "image")
-    }
-    seen = bundle(**own, coarse=real)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    six, pack = packed.kind, packed.pack
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
     @wp.func
     def counts(y: real, tension: real, left: real) -> real:
@@ -217,90 +190,83 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
             return real(1.0)
         return wp.where(left == real(0.0), real(0.5), real(0.0))
 
-    @wp.kernel(module=discretisation.module(True, topic))
+    both = [over(gradient, "row_x row_y row_z", v="u"), over(spread, "widened")]
+
+    @particle_kernel(module, "A d r s_value s_slope s_bent s_own", both)
     def residual(
-        s: neighbourhood,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        of: seen,
-        at: bundle(u=vector, A=matrix, d=real, y=real),
-        # out
-        r: wp.array(dtype=real),
-        out: source_type(precision),
-    ):
-        """A and the divergence are written to ``at``."""
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = gradient(i, x, at.u, s)
-        widened = spread(i, x, at.u, s)
-        if lane() > 0:
-            return
+        row_x: vector,
+        row_y: vector,
+        row_z: vector,
+        widened: real,
+        time_step: real,
+        n_i: real,
+        L_i: matrix,
+        gamma_i: vector,
+        drift_i: real,
+        weights_i: weights4,
+        image_i: real,
+        coarse_i: real,
+        u_i: vector,
+        y_i: real,
+    ) -> tuple[matrix, real, real, real, vector, vector, real]:
+        """Writes A and the divergence too."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)
-        D = wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i] + of.image[i] * widened
-        left = D - wanted(n[i], of.weights[i][1], time_step[i // s.particles])
-        left *= counts(at.y[i], of.weights[i][0], left)
-        at.A[i] = A
-        at.d[i] = D
-        r[i] = left
-        out.s_value[i] = of.coarse[i] * left
-        out.s_slope[i] = vector()
-        out.s_bent[i] = vector()
-        out.s_own[i] = real(0.0)
+        D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
+        left = D - wanted(n_i, weights_i[1], time_step)
+        left *= counts(y_i, weights_i[0], left)
+        return A, D, left, coarse_i * left, vector(), vector(), real(0.0)
 
-    @wp.kernel(module=discretisation.tangent_module(topic), enable_backward=False)
+    both = [
+        over(gradient_tangent, "row_x row_y row_z", v="u", v_dot="u_dot"),
+        over(spread, "widened"),
+        over(spread_tangent, "widened_dot"),
+    ]
+
+    @particle_kernel(tangent_module, "r_dot", both)
     def residual_tangent(
-        s: neighbourhood,
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
-        of: seen,
-        at: bundle(u=vector, A=matrix, d=real, y=real),
-        dot: bundle(u=vector, **own),
-        # out
-        r_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = gradient_tangent(i, x, x_dot, at.u, dot.u, s)
-        widened, widened_dot = spread(i, x, at.u, s), spread_tangent(i, x, x_dot, at.u, dot.u, s)
-        if lane() > 0:
-            return
-        member = i // s.particles
-        D_dot = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + wp.ddot(dot.L[i], at.A[i]) - dot.drift[i]
-        D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
-        D_dot += of.image[i] * widened_dot + dot.image[i] * widened
-        dt, full = time_step[member], of.weights[i][1]
-        b = wanted(n[i], full, dt)
-        b_dot = wanted_tangent(n[i], n_dot[i], full, dot.weights[i][1], dt, time_step_dot[member])
-        r_dot[i] = counts(at.y[i], of.weights[i][0], at.d[i] - b) * (D_dot - b_dot)
+        row_x: vector,
+        row_y: vector,
+        row_z: vector,
+        widened: real,
+        widened_dot: real,
+        time_step: real,
+        time_step_dot: real,
+        n_i: real,
+        n_dot_i: real,
+        L_i: matrix,
+        L_dot_i: matrix,
+        gamma_i: vector,
+        gamma_dot_i: vector,
+        drift_dot_i: real,
+        weights_i: weights4,
+        weights_dot_i: weights4,
+        image_i: real,
+        image_dot_i: real,
+        u_i: vector,
+        u_dot_i: vector,
+        A_i: matrix,
+        d_i: real,
+        y_i: real,
+    ) -> real:
+        D_dot = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + wp.ddot(L_dot_i, A_i) - drift_dot_i
+        D_dot += wp.dot(gamma_i, u_dot_i) + wp.dot(gamma_dot_i, u_i)
+        D_dot += image_i * widened_dot + image_dot_i * widened
+        full = weights_i[1]
+        b = wanted(n_i, full, time_step)
+        b_dot = wanted_tangent(n_i, n_dot_i, full, weights_dot_i[1], time_step, time_step_dot)
+        return counts(y_i, weights_i[0], d_i - b) * (D_dot - b_dot)
 
-    @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)
+    @particle_kernel(adjoint_module, "+n_bar +weights_bar +time_step_bar +drift_bar d_bar S")
     def residual_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        n: wp.array(dtype=real),
-        of: seen,
-        d: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        r_bar: wp.array(dtype=real),
-        # in and out
-        bar: bundle(n=real, time_step=real, drift=real, weights=weights4),
-        # out
-        d_bar: wp.array(dtype=real),
-        S: wp.array(dtype=six),
-    ):
-        i = wp.tid()
-        no, dt, full = real(0.0), time_step[i // particles], of.weights[i][1]
-        b = wanted(n[i], full, dt)
-        found = counts(y[i], of.weights[i][0], d[i] - b) * r_bar[i]
-        if n[i] < real(1.0):
-            bar.n[i] = bar.n[i] + (real(1.0) - full) / dt * found
-            bar.weights[i] = bar.weights[i] + weights4(no, (real(1.0) - n[i]) / dt * found, no, no)
-        bar.time_step[i] = bar.time_step[i] + b / dt * found
-        bar.drift[i] = bar.drift[i] - found
-        d_bar[i] = found
-        S[i] = found * pack(of.L[i])
+        time_step: real, n_i: real, L_i: matrix, weights_i: weights4, d_i: real, y_i: real, r_bar_i: real
+    ) -> tuple[real, weights4, real, real, real, six]:
+        no, full = real(0.0), weights_i[1]
+        b = wanted(n_i, full, time_step)
+        found = counts(y_i, weights_i[0], d_i - b) * r_bar_i
+        n_part, full_part = real(0.0), real(0.0)
+        if n_i < real(1.0):
+            n_part = (real(1.0) - full) / time_step * found
+            full_part = (real(1.0) - n_i) / time_step * found
+        return n_part, weights4(no, full_part, no, no), b / time_step * found, -found, found, found * pack(L_i)
 
     return ResidualKernels(residual, residual_tangent, residual_adjoint)

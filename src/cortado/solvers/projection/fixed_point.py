@@ -21,16 +21,16 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import Named, bundle
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.launching import Named
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Parameters, State
 from cortado.solvers.projection.derivatives import ProjectionAdjoint
+from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries
 from cortado.solvers.projection.velocity import velocity_gradient_kernels
 from cortado.solvers.solver import Counts
 from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
@@ -57,108 +57,73 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
     """The same in 2 and in 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, packed = neighbourhood_type(precision), symmetric(precision)
+    weights4, packed = weights_type(precision), symmetric(precision)
     six, pack = packed.kind, packed.pack
     spread = image_sums(discretisation).spread
     gradient, clamp = projection_sums(discretisation).velocity_gradient, clamp_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, "fixed_point")
-    used = ("L", "gamma", "drift", "a", "weights", "image")
-    seen = bundle(**{name: kind for name, kind in entries(precision).items() if name in used})
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
 
-    @wp.kernel(module=module, enable_backward=False)
-    def pull(
-        p: wp.array(dtype=real),
-        root: wp.array(dtype=real),
-        L: wp.array(dtype=matrix),
-        # out
-        y: wp.array(dtype=real),
-        T: wp.array(dtype=six),
-    ):
-        i = wp.tid()
-        pulled = root[i] * p[i]
-        y[i] = pulled
-        T[i] = pulled * pack(L[i])
+    @particle_kernel(module, "y T")
+    def pull(p_i: real, root_i: real, L_i: matrix) -> tuple[real, six]:
+        pulled = root_i * p_i
+        return pulled, pulled * pack(L_i)
 
-    @wp.kernel(module=module, enable_backward=False)
+    widened = over(spread, "widened")
+
+    @particle_kernel(module, "d root rest w r", [widened], numbers=["omega"])
     def linearise(
-        s: neighbourhood,
+        widened: real,
         omega: real,
-        time_step: wp.array(dtype=real),
-        n: wp.array(dtype=real),
-        of: seen,
-        x: wp.array(dtype=vector),
-        at: bundle(u=vector, A=matrix, y=real),
-        k_bar: wp.array(dtype=real),
-        # out
-        d: wp.array(dtype=real),
-        root: wp.array(dtype=real),
-        rest: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        r: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        widened = spread(i, x, at.u, s)
-        if lane() > 0:
-            return
-        a = of.a[i]
-        D = wp.ddot(of.L[i], at.A[i]) + wp.dot(of.gamma[i], at.u[i]) - of.drift[i] + of.image[i] * widened
-        b = wanted(n[i], of.weights[i][1], time_step[i // s.particles])
-        per = omega / a
-        rise, fall = parts(at.y[i] + per * (D - b), at.y[i] + per * D)
-        c = rise + fall * of.weights[i][0]
-        remainder = (real(1.0) - c) * a / omega
-        weight = c * a + remainder
-        d[i] = D
-        root[i] = wp.sqrt(c)
-        rest[i] = remainder
-        w[i] = weight
-        r[i] = wp.sqrt(c) * k_bar[i] / weight
+        time_step: real,
+        n_i: real,
+        L_i: matrix,
+        gamma_i: vector,
+        drift_i: real,
+        a_i: real,
+        weights_i: weights4,
+        image_i: real,
+        u_i: vector,
+        A_i: matrix,
+        y_i: real,
+        k_bar_i: real,
+    ) -> tuple[real, real, real, real, real]:
+        D = wp.ddot(L_i, A_i) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
+        b = wanted(n_i, weights_i[1], time_step)
+        per = omega / a_i
+        rise, fall = parts(y_i + per * (D - b), y_i + per * D)
+        c = rise + fall * weights_i[0]
+        rest = (real(1.0) - c) * a_i / omega
+        w = c * a_i + rest
+        return D, wp.sqrt(c), rest, w, wp.sqrt(c) * k_bar_i / w
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "product share", [over(gradient, "row_x row_y row_z", v="u"), widened])
     def multiply(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        of: seen,
-        u: wp.array(dtype=vector),
-        root: wp.array(dtype=real),
-        rest: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        p: wp.array(dtype=real),
-        # out
-        product: wp.array(dtype=real),
-        share: wp.array(dtype=real),
-    ):
+        row_x: vector,
+        row_y: vector,
+        row_z: vector,
+        widened: real,
+        L_i: matrix,
+        gamma_i: vector,
+        image_i: real,
+        u_i: vector,
+        root_i: real,
+        rest_i: real,
+        w_i: real,
+        p_i: real,
+    ) -> tuple[real, real]:
         """``u`` is -D^T y / m."""
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = gradient(i, x, u, s)
-        widened = spread(i, x, u, s)
-        if lane() > 0:
-            return
-        total = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + of.image[i] * widened
-        found = rest[i] * p[i] - root[i] * (total + wp.dot(of.gamma[i], u[i]))
-        product[i] = found / w[i]
-        share[i] = p[i] * found
+        total = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + image_i * widened
+        found = rest_i * p_i - root_i * (total + wp.dot(gamma_i, u_i))
+        return found / w_i, p_i * found
 
-    @wp.kernel(module=module, enable_backward=False)
-    def recover(
-        omega: real,
-        of: seen,
-        root: wp.array(dtype=real),
-        q: wp.array(dtype=real),
-        # out
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-    ):
+    @particle_kernel(module, "k_bar y_bar", numbers=["omega"])
+    def recover(omega: real, a_i: real, root_i: real, q_i: real) -> tuple[real, real]:
         """Where c is 0, so are sigma and its derivatives, and nothing depends on lambda."""
-        i = wp.tid()
         found = real(0.0)
-        if root[i] > real(0.0):
-            found = of.a[i] * q[i] / (omega * root[i])
-        k_bar[i] = found
-        y_bar[i] = real(0.0)
+        if root_i > real(0.0):
+            found = a_i * q_i / (omega * root_i)
+        return found, real(0.0)
 
     return FixedPointKernels(pull, linearise, multiply, recover)
 

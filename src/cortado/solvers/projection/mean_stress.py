@@ -20,13 +20,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.lanes import lane_functions
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import WallTerm
@@ -137,96 +137,40 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bent = hessian_product(x_ij, x_ij, s) + g
         return (bar * (image_i * k_i + image_j * k_j)) * bent, bar * wp.dot(g, x_ij)
 
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    @particle_kernel(module, "q", [over(spread, "fluid"), over(images, "mirrored")])
+    def mean_stress(fluid: real, mirrored: real, k_i: real, reach_i: vector, mirrors_i: vector) -> real:
+        return per * (fluid + mirrored - k_i * (reach_i[0] + mirrors_i[0]))
 
-    @wp.kernel(module=module)
-    def mean_stress(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        T: wp.array(dtype=six),
-        k: wp.array(dtype=real),
-        image: wp.array(dtype=real),
-        reach: wp.array(dtype=vector),
-        mirrors: wp.array(dtype=vector),
-        # out
-        q: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = spread(i, x, T, s) + images(i, x, k, image, s)
-        if lane() > 0:
-            return
-        q[i] = per * (total - k[i] * (reach[i][0] + mirrors[i][0]))
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "q_dot", [over(spread_tangent, "fluid"), over(images_tangent, "mirrored")])
     def mean_stress_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        T: wp.array(dtype=six),
-        T_dot: wp.array(dtype=six),
-        k: wp.array(dtype=real),
-        k_dot: wp.array(dtype=real),
-        reach: wp.array(dtype=vector),
-        reach_dot: wp.array(dtype=vector),
-        image: wp.array(dtype=real),
-        image_dot: wp.array(dtype=real),
-        mirrors: wp.array(dtype=vector),
-        mirrors_dot: wp.array(dtype=vector),
-        # out
-        q_dot: wp.array(dtype=real),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = spread_tangent(i, x, x_dot, T, T_dot, s) + images_tangent(i, x, x_dot, k, k_dot, image, image_dot, s)
-        if lane() > 0:
-            return
-        change = k_dot[i] * (reach[i][0] + mirrors[i][0]) + k[i] * (reach_dot[i][0] + mirrors_dot[i][0])
-        q_dot[i] = per * (total - change)
+        fluid: real,
+        mirrored: real,
+        k_i: real,
+        k_dot_i: real,
+        reach_i: vector,
+        reach_dot_i: vector,
+        mirrors_i: vector,
+        mirrors_dot_i: vector,
+    ) -> real:
+        change = k_dot_i * (reach_i[0] + mirrors_i[0]) + k_i * (reach_dot_i[0] + mirrors_dot_i[0])
+        return per * (fluid + mirrored - change)
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def own_adjoint(
-        k: wp.array(dtype=real),
-        reach: wp.array(dtype=vector),
-        mirrors: wp.array(dtype=vector),
-        # in and out: ``q_bar`` at first that of q, at last that of the sum over neighbours
-        q_bar: wp.array(dtype=real),
-        k_bar: wp.array(dtype=real),
-        # out
-        reach_bar: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        bar = per * q_bar[i]
-        k_bar[i] = k_bar[i] - bar * (reach[i][0] + mirrors[i][0])
-        reach_bar[i] = vector(-bar * k[i], real(0.0), real(0.0))
-        q_bar[i] = bar
+    @particle_kernel(adjoint_module, "q_bar +k_bar reach_bar")
+    def own_adjoint(k_i: real, reach_i: vector, mirrors_i: vector, q_bar_i: real) -> tuple[real, real, vector]:
+        """The adjoint of the sum over neighbours takes the place of that of q."""
+        bar = per * q_bar_i
+        return bar, -bar * (reach_i[0] + mirrors_i[0]), vector(-bar * k_i, real(0.0), real(0.0))
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    both = [over(spread_adjoint, "x_part T_part", _bar_0="q_bar"), over(images_back, "x_lift lifted")]
+
+    @particle_kernel(adjoint_module, "+x_bar +image_bar +k_bar +L_bar", both)
     def mean_stress_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        L: wp.array(dtype=matrix),
-        T: wp.array(dtype=six),
-        k: wp.array(dtype=real),
-        q_bar: wp.array(dtype=real),
-        image: wp.array(dtype=real),
-        # in and out
-        image_bar: wp.array(dtype=real),
-        x_bar: wp.array(dtype=vector),
-        L_bar: wp.array(dtype=matrix),
-        k_bar: wp.array(dtype=real),
-    ):
+        x_part: vector, T_part: six, x_lift: vector, lifted: real, k_i: real, L_i: matrix, image_i: real
+    ) -> tuple[vector, real, real, matrix]:
         """T is k L."""
-        i = s.first + wp.tid() // LANES
-        x_part, T_part = spread_adjoint(i, x, T, q_bar, s)
-        x_lift, lifted = images_back(i, x, k, image, q_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_part + x_lift
-        image_bar[i] = image_bar[i] + k[i] * lifted
-        k_bar[i] = k_bar[i] + wp.dot(T_part, pack(L[i])) + image[i] * lifted
-        L_bar[i] = L_bar[i] + k[i] * whole(
-            vector(T_part[0], T_part[1], T_part[2]), real(0.5) * vector(T_part[3], T_part[4], T_part[5])
-        )
+        diagonal, others = vector(T_part[0], T_part[1], T_part[2]), vector(T_part[3], T_part[4], T_part[5])
+        k_part = wp.dot(T_part, pack(L_i)) + image_i * lifted
+        return x_part + x_lift, k_i * lifted, k_part, k_i * whole(diagonal, real(0.5) * others)
 
     return Kernels(mean_stress, mean_stress_tangent, (own_adjoint, mean_stress_adjoint))
 
@@ -270,19 +214,8 @@ def pressed_adjoint_kernel(precision: Precision) -> Any:
     """From the adjoint of a pressure to those of its impulse and of dt."""
     real = precision.real
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def pressed_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        impulse: wp.array(dtype=real),
-        p_bar: wp.array(dtype=real),
-        # in and out
-        impulse_bar: wp.array(dtype=real),
-        time_step_bar: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        dt = time_step[i // particles]
-        impulse_bar[i] = impulse_bar[i] + p_bar[i] / dt
-        time_step_bar[i] = time_step_bar[i] - impulse[i] / (dt * dt) * p_bar[i]
+    @particle_kernel(integration_module(precision, False), "+impulse_bar +time_step_bar")
+    def pressed_adjoint(time_step: real, impulse_i: real, p_bar_i: real) -> tuple[real, real]:
+        return p_bar_i / time_step, -impulse_i / (time_step * time_step) * p_bar_i
 
     return pressed_adjoint

@@ -43,6 +43,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
@@ -266,15 +267,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         d_bar[i] = per * z_bar
         S[i] = (per * z_bar) * pack(of.L[i])
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def whole_adjoint(
-        L: wp.array(dtype=matrix),
-        d_bar: wp.array(dtype=real),
-        # in and out
-        A_bar: wp.array(dtype=matrix),
-    ):
-        i = wp.tid()
-        A_bar[i] = A_bar[i] + d_bar[i] * L[i]
+    @particle_kernel(adjoint_module, "+A_bar")
+    def whole_adjoint(L_i: matrix, d_bar_i: real) -> matrix:
+        return d_bar_i * L_i
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
         """From that of D, and of A where it is a whole matrix S, to that of u."""
@@ -371,62 +366,48 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         if not (first <= real(0.0)) and warm[i // particles] == 0:
             warm[i // particles] = 1
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    @particle_kernel(tangent_module, "weights_dot k_dot y_dot u_dot", numbers=["spacing"])
     def begin_tangent(
-        particles: int,
         spacing: real,
-        time_step: wp.array(dtype=real),
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
-        beside: wp.array(dtype=vector),
-        surfaced: wp.array(dtype=int),
-        dot: bundle(k_before=real, kick_before=vector, v_star=vector),
-        # in and out
-        weights_dot: wp.array(dtype=weights4),
-        # out
-        k_dot: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        u_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        if surfaced[i // particles] == 0:
-            weights_dot[i][0] = real(0.0)
-        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
-        full, full_dot = part * weights[i][1], part * weights_dot[i][1]
-        first = full_dot * k_before[i] + full * dot.k_before[i]
-        k_dot[i] = first
-        y_dot[i] = first
-        u_dot[i] = dot.v_star[i] + full_dot * kick_before[i] + full * dot.kick_before[i]
+        time_step: real,
+        k_before_i: real,
+        k_before_dot_i: real,
+        kick_before_i: vector,
+        kick_before_dot_i: vector,
+        weights_i: weights4,
+        weights_dot_i: weights4,
+        beside_i: vector,
+        surfaced: int,
+        v_star_dot_i: vector,
+    ) -> tuple[weights4, real, real, vector]:
+        part, kept = taken(kick_before_i, beside_i, time_step, spacing), weights_dot_i
+        if surfaced == 0:
+            kept[0] = real(0.0)
+        full, full_dot = part * weights_i[1], part * weights_dot_i[1]
+        first = full_dot * k_before_i + full * k_before_dot_i
+        return kept, first, first, v_star_dot_i + full_dot * kick_before_i + full * kick_before_dot_i
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @particle_kernel(adjoint_module, "weights_bar +v_bar k_before_bar kick_before_bar", numbers=["spacing"])
     def begin_adjoint(
-        particles: int,
         spacing: real,
-        time_step: wp.array(dtype=real),
-        k_before: wp.array(dtype=real),
-        kick_before: wp.array(dtype=vector),
-        weights: wp.array(dtype=weights4),
-        beside: wp.array(dtype=vector),
-        surfaced: wp.array(dtype=int),
-        bar: bundle(k=real, y=real, u=vector),
-        # in and out
-        weights_bar: wp.array(dtype=weights4),
-        v_bar: wp.array(dtype=vector),
-        # out
-        k_before_bar: wp.array(dtype=real),
-        kick_before_bar: wp.array(dtype=vector),
-    ):
+        time_step: real,
+        k_before_i: real,
+        kick_before_i: vector,
+        weights_i: weights4,
+        weights_bar_i: weights4,
+        beside_i: vector,
+        surfaced: int,
+        k_bar_i: real,
+        y_bar_i: real,
+        u_bar_i: vector,
+    ) -> tuple[weights4, vector, real, vector]:
         """``v_bar`` is the adjoint of v*."""
-        i = wp.tid()
-        part = taken(kick_before[i], beside[i], time_step[i // particles], spacing)
-        y_bar, full, no = bar.k[i] + bar.y[i], part * weights[i][1], real(0.0)
-        k_before_bar[i] = full * y_bar
-        kick_before_bar[i] = full * bar.u[i]
-        full_bar = part * (k_before[i] * y_bar + wp.dot(kick_before[i], bar.u[i]))
-        weights_bar[i] = weights_bar[i] + weights4(no, full_bar, no, no)
-        if surfaced[i // particles] == 0:
-            weights_bar[i][0] = real(0.0)
-        v_bar[i] = v_bar[i] + bar.u[i]
+        part = taken(kick_before_i, beside_i, time_step, spacing)
+        both, full, no = k_bar_i + y_bar_i, part * weights_i[1], real(0.0)
+        full_bar = part * (k_before_i * both + wp.dot(kick_before_i, u_bar_i))
+        found = weights_bar_i + weights4(no, full_bar, no, no)
+        if surfaced == 0:
+            found[0] = real(0.0)
+        return found, u_bar_i, full * both, full * u_bar_i
 
     return Kernels(begin, begin_tangent, begin_adjoint)

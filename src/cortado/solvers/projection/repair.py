@@ -23,6 +23,7 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import weights_type
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
@@ -155,76 +156,48 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         image_bar[i] = image_bar[i] + n_now_bar[i] * surplus
         x_now_bar[i] = s.volume * total + lifted - (image[i] * n_now_bar[i]) * walled
 
-    @wp.kernel(module=module)
+    both = [over(push, "pushed"), over(lift, "lifted", y="c")]
+
+    @particle_kernel(module, "held x_now", both, numbers=["spacing"])
     def move(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        gamma: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        x_moved: wp.array(dtype=vector),
-        spacing: real,
-        image: wp.array(dtype=real),
-        # out
-        x_now: wp.array(dtype=vector),
-        held: wp.array(dtype=real),
-    ):
+        pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
+    ) -> tuple[real, vector]:
         """``held`` is the part of its way that a particle goes."""
-        i = s.first + wp.tid() // LANES
-        total = push(i, x, c, s) + lift(i, x, c, image, s)
-        if lane() > 0:
-            return
-        back = (total + c[i] * gamma[i]) / m[i]
+        back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
             part = most / length
-        held[i] = part
-        x_now[i] = x_moved[i] - part * back
+        return part, x_moved_i - part * back
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    both = [over(push_tangent, "pushed"), over(lift_tangent, "lifted", y="c", y_dot="c_dot")]
+
+    @particle_kernel(tangent_module, "x_now_dot", both)
     def move_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        gamma: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        x_moved: wp.array(dtype=vector),
-        x_now: wp.array(dtype=vector),
-        held: wp.array(dtype=real),
-        image: wp.array(dtype=real),
-        dot: bundle(x=vector, m=real, gamma=vector, c=real, x_moved=vector, image=real),
-        # out
-        x_now_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = push_tangent(i, x, dot.x, c, dot.c, s)
-        total += lift_tangent(i, x, dot.x, c, dot.c, image, dot.image, s)
-        if lane() > 0:
-            return
-        change = total + dot.c[i] * gamma[i] + c[i] * dot.gamma[i]
-        back = (x_moved[i] - x_now[i]) / held[i]
-        x_now_dot[i] = dot.x_moved[i] - along((change - dot.m[i] * back) / m[i], back, held[i])
+        pushed: vector,
+        lifted: vector,
+        m_i: real,
+        m_dot_i: real,
+        gamma_i: vector,
+        gamma_dot_i: vector,
+        c_i: real,
+        c_dot_i: real,
+        x_moved_i: vector,
+        x_moved_dot_i: vector,
+        x_now_i: vector,
+        held_i: real,
+    ) -> vector:
+        change = pushed + lifted + c_dot_i * gamma_i + c_i * gamma_dot_i
+        back = (x_moved_i - x_now_i) / held_i
+        return x_moved_dot_i - along((change - m_dot_i * back) / m_i, back, held_i)
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @particle_kernel(adjoint_module, "+m_bar +x_moved_bar f")
     def begin_adjoint(
-        m: wp.array(dtype=real),
-        x_now: wp.array(dtype=vector),
-        x_moved: wp.array(dtype=vector),
-        held: wp.array(dtype=real),
-        x_now_bar: wp.array(dtype=vector),
-        # in and out
-        m_bar: wp.array(dtype=real),
-        x_moved_bar: wp.array(dtype=vector),
-        # out
-        f: wp.array(dtype=vector),
-    ):
+        m_i: real, x_now_i: vector, x_moved_i: vector, held_i: real, x_now_bar_i: vector
+    ) -> tuple[real, vector, vector]:
         """Of a particle's own part in x_k+1; f is the adjoint of the sum."""
-        i = wp.tid()
-        back = (x_moved[i] - x_now[i]) / held[i]
-        bar = along(x_now_bar[i], back, held[i])
-        x_moved_bar[i] = x_moved_bar[i] + x_now_bar[i]
-        m_bar[i] = m_bar[i] + wp.dot(bar, back) / m[i]
-        f[i] = -bar / m[i]
+        back = (x_moved_i - x_now_i) / held_i
+        bar = along(x_now_bar_i, back, held_i)
+        return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def move_adjoint(

@@ -5,16 +5,15 @@ A = sum_j v_ij g_ij^T has kernels of its own for the fixed point of the projecti
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from cortado.device.lanes import lane_functions
-from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.images import image_sums
 from cortado.solvers.projection.sums import projection_sums
-from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
 
@@ -37,145 +36,87 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     """In 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    force, force_tangent, force_back = sums.force, sums.force_tangent, sums.force_back
-    mirrors = image_sums(discretisation)
-    lift, lift_tangent, lift_back = mirrors.lift, mirrors.lift_tangent, mirrors.lift_back
-    packed = symmetric(precision)
+    sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
-    whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "image")}
-    seen, bars = bundle(**own), bundle(x=vector, **own)
-    pulled = bundle(y=real, T=six, g=vector, gamma=vector, image=real)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    whole = moment_functions(precision, dimension).change
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
-    @wp.kernel(module=module)
+    @particle_kernel(module, "kick u", [over(sums.force, "total"), over(mirrors.lift, "lifted")])
     def velocity(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        T: wp.array(dtype=six),
-        g: wp.array(dtype=vector),
-        gamma: wp.array(dtype=vector),
-        image: wp.array(dtype=real),
-        v_star: wp.array(dtype=vector),
-        # out
-        kick: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
-    ):
+        total: vector,
+        lifted: vector,
+        m_i: real,
+        y_i: real,
+        T_i: six,
+        g_i: vector,
+        gamma_i: vector,
+        v_star_i: vector,
+    ) -> tuple[vector, vector]:
         """T is y L, and ``kick`` -D^T y / m."""
-        i = s.first + wp.tid() // LANES
-        total = force(i, x, T, s) + lift(i, x, y, image, s)
-        if lane() > 0:
-            return
-        change = -(total + times(T[i], g[i]) + y[i] * gamma[i]) / m[i]
-        kick[i] = change
-        u[i] = v_star[i] + change
+        change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
+        return change, v_star_i + change
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def pull_tangent(
-        y: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        L: wp.array(dtype=matrix),
-        L_dot: wp.array(dtype=matrix),
-        # out
-        T: wp.array(dtype=six),
-        T_dot: wp.array(dtype=six),
-    ):
+    @particle_kernel(tangent_module, "T T_dot")
+    def pull_tangent(y_i: real, y_dot_i: real, L_i: matrix, L_dot_i: matrix) -> tuple[six, six]:
         """T = y L, and its tangent."""
-        i = wp.tid()
-        T[i] = y[i] * pack(L[i])
-        T_dot[i] = y_dot[i] * pack(L[i]) + y[i] * pack(L_dot[i])
+        return y_i * pack(L_i), y_dot_i * pack(L_i) + y_i * pack(L_dot_i)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
+    both = [over(sums.force_tangent, "total"), over(mirrors.lift_tangent, "lifted")]
+
+    @particle_kernel(tangent_module, "kick_dot u_dot", both)
     def velocity_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        of: pulled,
-        dot: pulled,
-        v_star: wp.array(dtype=vector),
-        v_star_dot: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
-        # out
-        kick_dot: wp.array(dtype=vector),
-        u_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        total = force_tangent(i, x, x_dot, of.T, dot.T, s)
-        total += lift_tangent(i, x, x_dot, of.y, dot.y, of.image, dot.image, s)
-        if lane() > 0:
-            return
-        change = total + times(dot.T[i], of.g[i]) + times(of.T[i], dot.g[i])
-        change += dot.y[i] * of.gamma[i] + of.y[i] * dot.gamma[i]
-        change = -(change + m_dot[i] * (u[i] - v_star[i])) / m[i]
-        kick_dot[i] = change
-        u_dot[i] = v_star_dot[i] + change
+        total: vector,
+        lifted: vector,
+        m_i: real,
+        m_dot_i: real,
+        y_i: real,
+        y_dot_i: real,
+        T_i: six,
+        T_dot_i: six,
+        g_i: vector,
+        g_dot_i: vector,
+        gamma_i: vector,
+        gamma_dot_i: vector,
+        v_star_i: vector,
+        v_star_dot_i: vector,
+        u_i: vector,
+    ) -> tuple[vector, vector]:
+        change = total + lifted + times(T_dot_i, g_i) + times(T_i, g_dot_i)
+        change += y_dot_i * gamma_i + y_i * gamma_dot_i
+        kick_dot = -(change + m_dot_i * (u_i - v_star_i)) / m_i
+        return kick_dot, v_star_dot_i + kick_dot
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    both = [over(sums.force_back, "diagonal others x_part"), over(mirrors.lift_back, "widened x_lift")]
+
+    @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both)
     def velocity_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        y: wp.array(dtype=real),
-        T: wp.array(dtype=six),
-        of: seen,
-        f: wp.array(dtype=vector),
-        # in and out
-        y_bar: wp.array(dtype=real),
-        bar: bars,
-    ):
+        diagonal: vector,
+        others: vector,
+        x_part: vector,
+        widened: real,
+        x_lift: vector,
+        y_i: real,
+        L_i: matrix,
+        gamma_i: vector,
+        image_i: real,
+        f_i: vector,
+    ) -> tuple[real, real, matrix, vector, vector]:
         """From f of all particles; T is y L."""
-        i = s.first + wp.tid() // LANES
-        diagonal, others, x_part = force_back(i, x, T, f, s)
-        widened, x_lift = lift_back(i, x, y, of.image, f, s)
-        if lane() > 0:
-            return
         A = whole(diagonal, others)
-        y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i]) + of.image[i] * widened
-        bar.image[i] = bar.image[i] + y[i] * widened
-        bar.L[i] = bar.L[i] + y[i] * A
-        bar.gamma[i] = bar.gamma[i] + y[i] * f[i]
-        bar.x[i] = bar.x[i] + x_part + x_lift
+        y_part = wp.ddot(L_i, A) + wp.dot(gamma_i, f_i) + image_i * widened
+        return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
+    @particle_kernel(adjoint_module, "+v_bar +m_bar T f kick_bar")
     def own_adjoint(
-        m: wp.array(dtype=real),
-        v_star: wp.array(dtype=vector),
-        y: wp.array(dtype=real),
-        L: wp.array(dtype=matrix),
-        u: wp.array(dtype=vector),
-        u_bar: wp.array(dtype=vector),
-        # in and out: the adjoint of the kick is 0 afterwards
-        kick_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-        # out
-        T: wp.array(dtype=six),
-        f: wp.array(dtype=vector),
-    ):
-        """f = -(u_bar + kick_bar) / m, and T is y L."""
-        i = wp.tid()
-        bar = u_bar[i] + kick_bar[i]
-        v_bar[i] = v_bar[i] + u_bar[i]
-        m_bar[i] = m_bar[i] + wp.dot(bar, v_star[i] - u[i]) / m[i]
-        T[i] = y[i] * pack(L[i])
-        f[i] = -bar / m[i]
-        kick_bar[i] = vector()
+        m_i: real, v_star_i: vector, y_i: real, L_i: matrix, u_i: vector, u_bar_i: vector, kick_bar_i: vector
+    ) -> tuple[vector, real, six, vector, vector]:
+        """f = -(u_bar + kick_bar) / m, and T is y L. The adjoint of the kick is 0 afterwards."""
+        bar = u_bar_i + kick_bar_i
+        return u_bar_i, wp.dot(bar, v_star_i - u_i) / m_i, y_i * pack(L_i), -bar / m_i, vector()
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def time_adjoint(
-        acceleration: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        # in and out
-        time_step_bar: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        time_step_bar[i] = time_step_bar[i] + wp.dot(v_bar[i], acceleration[i])
+    @particle_kernel(adjoint_module, "+time_step_bar")
+    def time_adjoint(acceleration_i: vector, v_bar_i: vector) -> real:
+        return wp.dot(v_bar_i, acceleration_i)
 
     return VelocityKernels(
         Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, own_adjoint, time_adjoint
@@ -185,59 +126,26 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
 @cache
 def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """In 2 or 3 dimensions; that of the adjoint needs g, the sum of g_ij."""
-    precision = discretisation.precision
-    vector, matrix, neighbourhood = precision.vector, matrix_type(precision), neighbourhood_type(precision)
-    sums, topic = projection_sums(discretisation), f"projection_{dimension}d"
-    rows, rows_tangent, rows_back = sums.velocity_gradient, sums.velocity_gradient_tangent, sums.velocity_gradient_back
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+    precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
+    vector, matrix, sums = precision.vector, matrix_type(precision), projection_sums(discretisation)
 
-    @wp.kernel(module=discretisation.module(True, topic))
-    def velocity_gradient(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        # out
-        A: wp.array(dtype=matrix),
-    ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = rows(i, x, v_flow, s)
-        if lane() > 0:
-            return
-        A[i] = wp.matrix_from_rows(row_x, row_y, row_z)
+    def gradient(name: str, module: Any, result: str, total: Any) -> Any:
+        @particle_kernel(module, result, [over(total, "row_x row_y row_z", v="v_flow", v_dot="v_flow_dot")], name=name)
+        def velocity_gradient(row_x: vector, row_y: vector, row_z: vector) -> matrix:
+            return wp.matrix_from_rows(row_x, row_y, row_z)
 
-    @wp.kernel(module=discretisation.tangent_module(topic), enable_backward=False)
-    def velocity_gradient_tangent(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        v_flow_dot: wp.array(dtype=vector),
-        # out
-        A_dot: wp.array(dtype=matrix),
-    ):
-        i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = rows_tangent(i, x, x_dot, v_flow, v_flow_dot, s)
-        if lane() > 0:
-            return
-        A_dot[i] = wp.matrix_from_rows(row_x, row_y, row_z)
+        return velocity_gradient
 
-    @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)
+    back = over(sums.velocity_gradient_back, "v_part x_part", v="v_flow")
+
+    @particle_kernel(modules[2], "+x_bar +v_flow_bar", [back])
     def velocity_gradient_adjoint(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        v_flow: wp.array(dtype=vector),
-        g: wp.array(dtype=vector),
-        A_bar: wp.array(dtype=matrix),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        v_flow_bar: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid() // LANES
-        v_part, x_part = rows_back(i, x, v_flow, A_bar, s)
-        if lane() > 0:
-            return
-        x_bar[i] = x_bar[i] + x_part
-        v_flow_bar[i] = v_flow_bar[i] + v_part + A_bar[i] * g[i]
+        v_part: vector, x_part: vector, g_i: vector, A_bar_i: matrix
+    ) -> tuple[vector, vector]:
+        return x_part, v_part + A_bar_i * g_i
 
-    return Kernels(velocity_gradient, velocity_gradient_tangent, velocity_gradient_adjoint)
+    return Kernels(
+        gradient("velocity_gradient", modules[0], "A", sums.velocity_gradient),
+        gradient("velocity_gradient_tangent", modules[1], "A_dot", sums.velocity_gradient_tangent),
+        velocity_gradient_adjoint,
+    )
