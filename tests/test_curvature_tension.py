@@ -16,7 +16,7 @@ from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.surface_tension import CurvatureTension, SurfaceTension
 from finite_differences import both_modes, central_difference, directional
 from oscillating_drops import C2, C4, CUBIC
-from reference_curvature import Curvature
+from reference_terms import Curvature
 from scenes import plane
 
 PROJECTION = {"kind": "projection", "time_step": 0.002}

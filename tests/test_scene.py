@@ -219,25 +219,41 @@ def test_a_key_of_another_table_is_told_where_it_stands(table, key, advice):
     assert str(caught.value).startswith(advice)
 
 
-@pytest.mark.parametrize("fluid", [np.zeros(2), date(2020, 1, 1), 3, MixtureTable()], ids=str)
-def test_a_fluid_that_is_no_table_is_a_sentence(fluid):
-    with pytest.raises(SceneError, match=r"^fluid\[0\] is .*, but must be a table\.$"):
-        Scene(**plane(fluid=[fluid]))
+CYLINDER = {"shape": "cylinder", "base": [0, 0], "radius": 1.0, "height": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        *(
+            ({"fluid": [fluid]}, r"^fluid\[0\] is .*, but must be a table\.$")
+            for fluid in (np.zeros(2), date(2020, 1, 1), 3, MixtureTable())
+        ),
+        ({"discretisation": {"spacing": -1}}, r"^discretisation\.spacing is -1, but must be greater than 0 m\.$"),
+        ({"fluid": [CYLINDER | {"phase": "water"}]}, "fluid.*shape is 'cylinder'.*2-D"),
+        ({"container": CYLINDER}, "container.*shape is 'cylinder'.*2-D"),
+        (
+            {"solver": {"time_step": 0.001, "minimum_iterations": 4}},
+            'iterations is 4, but must be left out, as only the solver "pcisph" has it',
+        ),
+        (
+            {"solver": {"time_step": 0.001, "kind": "pcisph", "iterations": 4}},
+            'iterations is 4, but must be left out, as only the solver "projection" has it',
+        ),
+        (
+            {"forces": {"viscosity": "pairwise"}, "solver": {"kind": "projection", "time_step": 0.001}},
+            '\'pairwise\', but must be "stress" or "none", as the solver is not "pcisph"',
+        ),
+    ],
+)
+def test_tables_that_do_not_go_together_are_a_sentence(changes, words):
+    with pytest.raises(SceneError, match=words):
+        Scene(**plane(**changes))
 
 
 def test_parts_built_in_python_raise_the_same_error():
     with pytest.raises(SceneError, match=r"^spacing is -1, but must be greater than 0 m\.$"):
         DiscretisationTable(spacing=-1)
-    with pytest.raises(SceneError, match=r"^discretisation\.spacing is -1, but must be greater than 0 m\.$"):
-        Scene(**plane(discretisation={"spacing": -1}))
-
-
-@pytest.mark.parametrize("shape", ["fluid", "container"])
-def test_a_cylinder_needs_space(shape):
-    cylinder = {"shape": "cylinder", "base": [0, 0], "radius": 1.0, "height": 1.0}
-    changes = {"fluid": [cylinder | {"phase": "water"}]} if shape == "fluid" else {"container": cylinder}
-    with pytest.raises(SceneError, match=rf"{shape}.*shape is 'cylinder'.*2-D"):
-        Scene(**plane(**changes))
 
 
 def test_unreadable_files_are_a_sentence(tmp_path):
@@ -459,17 +475,6 @@ def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
         speed(3.0 * limit)
 
 
-def test_a_scene_that_names_no_solver_has_the_projection_with_what_suits_it():
-    made = Scene(**plane(solver={"time_step": 0.001}))
-    assert made.solver.kind == "projection"
-    assert (made.discretisation.kernel, made.discretisation.support) == ("wendland_c2", 2.6)
-    given = {"spacing": 0.1, "kernel": "wendland_c4", "support": 3.0}
-    told = Scene(**plane(solver={"time_step": 0.001}, discretisation=given)).discretisation
-    assert (told.kernel, told.support) == ("wendland_c4", 3.0)
-    other = Scene(**plane(solver={"kind": "pcisph", "time_step": 0.001})).discretisation
-    assert (other.kernel, other.support) == ("cubic_spline", 2.0)
-
-
 @pytest.mark.parametrize(
     "kind, periodic, given, jitter",
     [
@@ -486,19 +491,6 @@ def test_fluid_without_walls_or_surface_is_jittered_with_the_projection(kind, pe
         **plane(solver=solver, container=full, discretisation={"spacing": 0.1, **given}, forces={"gravity": [0, 0]})
     )
     assert made.discretisation.jitter == jitter and Scene.from_json(made.to_json()) == made
-
-
-@pytest.mark.parametrize(
-    "given, kind", [({"minimum_iterations": 4}, "pcisph"), ({"kind": "pcisph", "iterations": 4}, "projection")]
-)
-def test_keys_of_another_solver_are_refused_by_its_name(given, kind):
-    with pytest.raises(SceneError, match=f'iterations is 4, but must be left out, as only the solver "{kind}" has it'):
-        Scene(**plane(solver={"time_step": 0.001, **given}))
-
-
-def test_the_pairwise_viscosity_is_of_pcisph_alone():
-    with pytest.raises(SceneError, match='\'pairwise\', but must be "stress" or "none", as the solver is not "pcisph"'):
-        Scene(**plane(forces={"viscosity": "pairwise"}, solver={"kind": "projection", "time_step": 0.001}))
 
 
 @pytest.mark.parametrize("form, told", [("stress", 0), ("pairwise", 1)])
@@ -536,23 +528,21 @@ def test_divergence_is_a_sentence():
 
 
 @pytest.mark.parametrize(
-    ("kind", "given", "kernel", "support"),
+    ("solver", "given", "kernel", "support"),
     [
-        ("pcisph", {}, "cubic_spline", 2.0),
-        ("projection", {}, "wendland_c2", 2.6),
-        ("projection", {"support": 2.5}, "cubic_spline", 2.5),
-        ("projection", {"kernel": "cubic_spline"}, "cubic_spline", 2.0),
+        ({"kind": "pcisph"}, {}, "cubic_spline", 2.0),
+        ({"kind": "projection"}, {}, "wendland_c2", 2.6),
+        ({}, {}, "wendland_c2", 2.6),
+        ({}, {"kernel": "wendland_c4", "support": 3.0}, "wendland_c4", 3.0),
+        ({"kind": "projection"}, {"support": 2.5}, "cubic_spline", 2.5),
+        ({"kind": "projection"}, {"kernel": "cubic_spline"}, "cubic_spline", 2.0),
     ],
 )
-def test_a_scene_that_names_no_kernel_has_that_of_its_solver(kind, given, kernel, support):
+def test_a_scene_that_names_no_kernel_has_that_of_its_solver(solver, given, kernel, support):
+    """And one that names no solver the projection."""
     cut = {"spacing": 0.1, **given}
     for discretisation in (cut, DiscretisationTable(**cut)):
-        scene = Scene(
-            **{
-                **plane(),
-                "discretisation": discretisation,
-                "solver": {"kind": kind, "time_step": 0.001},
-            }
-        )
+        scene = Scene(**plane(discretisation=discretisation, solver={"time_step": 0.001, **solver}))
+        assert scene.solver.kind == solver.get("kind", "projection")
         assert (scene.discretisation.kernel, scene.discretisation.support) == (kernel, support)
         assert Scene.from_json(scene.to_json()) == scene

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import reference
-import reference_mixture
+import reference_terms
 from cortado import Simulation
 from cortado.discretise.smoothing import KERNELS
 from cortado.gradients import Exact
@@ -91,7 +91,7 @@ def twins_steps(simulation, substeps):
     phases, iterations = len(simulation.scene.phase), ITERATIONS if simulation.scene.forces.pressure else 0
 
     def mix(x, c, mass, time_step, mobility, width):
-        slow_mixture = reference_mixture.Mixture(
+        slow_mixture = reference_terms.Mixture(
             simulation.smoothing,
             simulation.dimension,
             lattice.support,

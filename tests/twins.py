@@ -8,8 +8,7 @@ from cortado.sph.curvature import CurvatureConstants
 from cortado.sph.emitter import Nozzle
 from cortado.sph.surface_tension import CurvatureTension, SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
-from reference_curvature import Curvature
-from reference_stress import Stress
+from reference_terms import Curvature, Stress
 
 
 def twin(simulation):
