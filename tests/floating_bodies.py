@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from cortado import Scene, Simulation
+from scenes import box
 
 STEP = 0.001
 """Of the time in which a sphere gets faster [s]."""
@@ -23,16 +24,7 @@ def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
-        solid=[
-            {
-                "name": "box",
-                "shape": "box",
-                "lower": [0.3, 0.4 - wanted],
-                "upper": [0.7, 0.4 - wanted + sides[1]],
-                "motion": "free",
-                "density": density,
-            }
-        ],
+        solid=[box([0.3, 0.4 - wanted], [0.7, 0.4 - wanted + sides[1]], name="box", motion="free", density=density)],
         solver={"kind": "projection", "time_step": step},
     )
     simulation = Simulation(scene)
@@ -89,12 +81,7 @@ def added_mass(across: int, deep: int, settling: int, iterations: int, steps: in
         discretisation={"spacing": spacing},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
         fluid=[{"shape": "box", "lower": [0.0] * 3, "upper": [side] * 3, "phase": "water"}],
-        container={
-            "shape": "box",
-            "lower": [0.0] * 3,
-            "upper": [side, side + 6.0 * spacing, side],
-            "periodic": [True, False, True],
-        },
+        container=box([0.0] * 3, [side, side + 6.0 * spacing, side], periodic=[True, False, True]),
         solid=[
             {
                 "name": "ball",

@@ -10,6 +10,7 @@ import trimesh
 from cortado import Scene, Simulation
 from cortado.scene.fields import rotation_matrix
 from cortado.scene.solids import BoxSolid, CupSolid, MeshSolid, SolidTable
+from scenes import box
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}
 GRAVITY = 9.81
@@ -54,14 +55,13 @@ def stirred(across: int, steps: int, thickness: float = 0.08) -> dict[str, float
     spacings."""
     spacing, half = 1.0 / across, np.array([0.25, 0.5 * thickness])
     middle = np.array([0.5, 0.45])
-    paddle = {
-        "name": "paddle",
-        "shape": "box",
-        "lower": list(middle - half),
-        "upper": list(middle + half),
-        "motion": "path",
-        "angular_velocity": float(1.0 / np.linalg.norm(half)),
-    }
+    paddle = box(
+        list(middle - half),
+        list(middle + half),
+        name="paddle",
+        motion="path",
+        angular_velocity=float(1.0 / np.linalg.norm(half)),
+    )
     run = simulated(
         *(2, spacing, 0.045 * spacing, steps, 20),
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "phase": "water"}],

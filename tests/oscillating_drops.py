@@ -8,6 +8,7 @@ from scipy.special import ive
 
 from cortado import Scene, Simulation
 from cortado.rollout.parameter_space import ParameterSpace
+from scenes import box
 
 C2 = {"kernel": "wendland_c2", "support": 2.6}
 CUBIC = {"kernel": "cubic_spline", "support": 2.0}
@@ -107,14 +108,7 @@ class Drop:
                 dimension=d,
                 discretisation={"spacing": spacing, **discretisation},
                 phase=[{"name": "water", "rest_density": 1.0, "viscosity": ohnesorge * sqrt(self.radius)}],
-                fluid=[
-                    {
-                        "shape": "box",
-                        "lower": [0.0] * d,
-                        "upper": [len(x) * spacing] + [spacing] * (d - 1),
-                        "phase": "water",
-                    }
-                ],
+                fluid=[box([0.0] * d, [len(x) * spacing] + [spacing] * (d - 1), phase="water")],
                 forces={"gravity": [0.0] * d, "surface_tension": 1.0, **forces},
                 solver={**solver, "time_step": time_step},
             ),

@@ -4,6 +4,7 @@ Engineers and Scientists, section 6.3."""
 import numpy as np
 
 from cortado import Scene, Simulation
+from scenes import box
 
 GRAVITY = 9.81
 SOONER = 1.3
@@ -35,15 +36,14 @@ def piston(deep: int, depth_times_wavenumber: float, steepness: float, device: s
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [long, 1.0], "phase": "water"}],
         container={"shape": "box", "lower": [-1.0, 0.0], "upper": [long, 2.0]},
         solid=[
-            {
-                "name": "piston",
-                "shape": "box",
-                "lower": [-0.5, -edge],
-                "upper": [0.0, 1.5 + edge],
-                "motion": "path",
-                "times": times.tolist(),
-                "positions": [[middle[0] + x, middle[1]] for x in places],
-            }
+            box(
+                [-0.5, -edge],
+                [0.0, 1.5 + edge],
+                name="piston",
+                motion="path",
+                times=times.tolist(),
+                positions=[[middle[0] + x, middle[1]] for x in places],
+            )
         ],
         solver={"kind": "projection", "time_step": step},
     )

@@ -1,11 +1,17 @@
 """Scenes that the tests share."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from cortado import Scene
 from cortado.scene.stability import stability_limits
+
+
+def box(lower: Sequence[float], upper: Sequence[float], **more: Any) -> dict[str, Any]:
+    """The table of a box: of fluid, of a container, or of a solid, by what else it says."""
+    return {"shape": "box", "lower": lower, "upper": upper, **more}
 
 
 def splash(**solver: Any) -> Scene:

@@ -12,7 +12,7 @@ from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import sum_and_maximum, sum_of
 from cortado.pictures.painter import painter
 from cortado.scene.motions import told
-from scenes import HONEY, plane, plane_of_three, scene, splash, thrown, two_layers
+from scenes import HONEY, box, plane, plane_of_three, scene, splash, thrown, two_layers
 from test_neighbours import CLOUDS, check_same, lists
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
@@ -91,31 +91,22 @@ SCENES = {
     "solids in space": scene(
         solid=[
             {"name": "ball", "shape": "sphere", "centre": [0.3, 0.1, 0.12], "radius": 0.08},
-            {
-                "name": "paddle",
-                "shape": "box",
-                "lower": [0.05, 0.1, 0.05],
-                "upper": [0.15, 0.25, 0.2],
-                "rotation": [0.1, 0.2, 0.0],
-                "motion": "path",
-                "velocity": [0.2, 0.1, 0.0],
-                "angular_velocity": [0.0, 3.0, 1.0],
-                "slip": "no",
-            },
+            box(
+                [0.05, 0.1, 0.05],
+                [0.15, 0.25, 0.2],
+                name="paddle",
+                rotation=[0.1, 0.2, 0.0],
+                motion="path",
+                velocity=[0.2, 0.1, 0.0],
+                angular_velocity=[0.0, 3.0, 1.0],
+                slip="no",
+            ),
         ],
         solver={"kind": "projection", "time_step": 0.0021},
     ),
     "free bodies in the plane": plane(
         solid=[
-            {
-                "name": "raft",
-                "shape": "box",
-                "lower": [0.1, 0.42],
-                "upper": [0.3, 0.56],
-                "rotation": 0.1,
-                "motion": "free",
-                "density": 500.0,
-            },
+            box([0.1, 0.42], [0.3, 0.56], name="raft", rotation=0.1, motion="free", density=500.0),
             {
                 "name": "ball",
                 "shape": "sphere",
@@ -130,17 +121,16 @@ SCENES = {
     ),
     "a free body in space": scene(
         solid=[
-            {
-                "name": "brick",
-                "shape": "box",
-                "lower": [0.05, 0.1, 0.05],
-                "upper": [0.15, 0.25, 0.2],
-                "rotation": [0.1, 0.2, 0.0],
-                "motion": "free",
-                "density": 500.0,
-                "velocity": [0.2, 0.1, 0.0],
-                "angular_velocity": [0.0, 3.0, 1.0],
-            }
+            box(
+                [0.05, 0.1, 0.05],
+                [0.15, 0.25, 0.2],
+                name="brick",
+                rotation=[0.1, 0.2, 0.0],
+                motion="free",
+                density=500.0,
+                velocity=[0.2, 0.1, 0.0],
+                angular_velocity=[0.0, 3.0, 1.0],
+            )
         ],
         solver={"kind": "projection", "time_step": 0.0021},
     ),

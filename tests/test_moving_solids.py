@@ -15,19 +15,10 @@ from cortado.scene.motions import greatest_speed
 from cortado.scene.scene_warnings import standing_sentences
 from cortado.scene.stability import stability_limits
 from finite_differences import both_modes, central_difference
-from scenes import jet
+from scenes import box, jet
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
-ROTOR = {
-    "name": "rotor",
-    "shape": "box",
-    "lower": [0.2, 0.15],
-    "upper": [0.4, 0.25],
-    "motion": "path",
-    "angular_velocity": 6.0,
-    "velocity": [0.2, 0.1],
-    "slip": "no",
-}
+ROTOR = box([0.2, 0.15], [0.4, 0.25], name="rotor", motion="path", angular_velocity=6.0, velocity=[0.2, 0.1], slip="no")
 PADDLE = {
     "name": "paddle",
     "shape": "capsule",
@@ -134,15 +125,9 @@ def sliding_plate(across, thickness, dt):
     spacing = 1.0 / across
     width = 10.0 * spacing
     return plane(
-        {
-            "name": "plate",
-            "shape": "box",
-            "lower": [0.0, 1.0],
-            "upper": [width, 1.0 + thickness * spacing],
-            "motion": "path",
-            "velocity": [1.0, 0.0],
-            "slip": "no",
-        },
+        box(
+            [0.0, 1.0], [width, 1.0 + thickness * spacing], name="plate", motion="path", velocity=[1.0, 0.0], slip="no"
+        ),
         discretisation={"spacing": spacing},
         phase=[{**WATER, "viscosity": 1000.0}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
@@ -267,15 +252,14 @@ def test_steps_that_are_chosen_know_how_fast_solids_are():
     assert np.diff(run.times).max() <= 0.2 * 0.05 / speed * (1.0 + 1e-5)
 
 
-RESTING = {
-    "name": "block",
-    "shape": "box",
-    "lower": [0.2, 0.55],
-    "upper": [0.4, 0.75],
-    "motion": "path",
-    "times": [0.0, 0.3, 0.302],
-    "positions": [[0.3, 0.65], [0.3, 0.65], [0.5, 0.65]],
-}
+RESTING = box(
+    [0.2, 0.55],
+    [0.4, 0.75],
+    name="block",
+    motion="path",
+    times=[0.0, 0.3, 0.302],
+    positions=[[0.3, 0.65], [0.3, 0.65], [0.5, 0.65]],
+)
 """At rest, and then at 100 m/s."""
 
 

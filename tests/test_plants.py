@@ -13,7 +13,7 @@ import pytest
 import cortado
 from cortado.particles.particle_kernels import MADE
 from planting import adjoints, plant_all
-from scenes import HONEY, MIXING, OIL, plane, scene
+from scenes import HONEY, MIXING, OIL, box, plane, scene
 
 ROOT = Path(cortado.__file__).parent
 
@@ -104,29 +104,27 @@ BALL = {
     "angular_velocity": 3.0,
     "slip": "no",
 }
-PLATE = {
-    "name": "plate",
-    "shape": "box",
-    "lower": [0.12, 0.02, 0.02],
-    "upper": [0.18, 0.12, 0.14],
-    "rotation": [0.2, -0.3, 0.1],
-    "motion": "path",
-    "velocity": [-0.5, 0.2, 0.1],
-    "angular_velocity": [2.0, -1.0, 3.0],
-    "surface_velocity": [0.3, -0.2, 0.5],
-    "slip": "no",
-}
-RAFT = {
-    "name": "raft",
-    "shape": "box",
-    "lower": [0.2, -0.002],
-    "upper": [0.45, 0.18],
-    "rotation": 0.01,
-    "motion": "free",
-    "density": 500.0,
-    "velocity": [0.1, -0.3],
-    "angular_velocity": 0.5,
-}
+PLATE = box(
+    [0.12, 0.02, 0.02],
+    [0.18, 0.12, 0.14],
+    name="plate",
+    rotation=[0.2, -0.3, 0.1],
+    motion="path",
+    velocity=[-0.5, 0.2, 0.1],
+    angular_velocity=[2.0, -1.0, 3.0],
+    surface_velocity=[0.3, -0.2, 0.5],
+    slip="no",
+)
+RAFT = box(
+    [0.2, -0.002],
+    [0.45, 0.18],
+    name="raft",
+    rotation=0.01,
+    motion="free",
+    density=500.0,
+    velocity=[0.1, -0.3],
+    angular_velocity=0.5,
+)
 BUOY = {
     "name": "buoy",
     "shape": "sphere",
@@ -137,14 +135,7 @@ BUOY = {
     "velocity": [-0.3, 0.1],
     "angular_velocity": -1.0,
 }
-ARM = {
-    "name": "arm",
-    "shape": "box",
-    "lower": [0.3, 0.175],
-    "upper": [0.36, 0.3],
-    "motion": "path",
-    "velocity": [0.0, -0.2],
-}
+ARM = box([0.3, 0.175], [0.36, 0.3], name="arm", motion="path", velocity=[0.0, -0.2])
 """They touch: the raft the floor, the buoy the raft, and the arm, which has a path, the raft."""
 IN_SPACE = {
     "raft": {"lower": [0.1, -0.002, 0.05], "upper": [0.25, 0.12, 0.2], "velocity": [0.1, -0.3, 0.1]},

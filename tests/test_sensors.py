@@ -21,7 +21,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
 from finite_differences import both_modes, distance
-from scenes import jet, plane, scene
+from scenes import box, jet, plane, scene
 
 IN_THE_PLANE = {
     "probe": PressureProbe([0.21, 0.13], 0.12),
@@ -431,13 +431,7 @@ def channel(dimension):
     tables = {
         "container": {"shape": "box", "lower": [0.0] * dimension, "upper": long},
         "fluid": [
-            {
-                "shape": "box",
-                "lower": [0.0] * dimension,
-                "upper": [long[0], 0.2, *long[2:]],
-                "velocity": [2.0, 0.0, 0.5][:dimension],
-                "phase": "water",
-            }
+            box([0.0] * dimension, [long[0], 0.2, *long[2:]], velocity=[2.0, 0.0, 0.5][:dimension], phase="water")
         ],
         "discretisation": {"spacing": 0.025 if dimension == 2 else 0.05},
     }

@@ -11,6 +11,7 @@ import cortado
 from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
 from cortado.optimisation.optimisers import Adam
 from cortado.render.scene_renderer import scene_renderer
+from scenes import box
 
 SIGMA, DENSITY, RADIUS = 0.07, 1000.0, 0.05
 
@@ -183,12 +184,7 @@ def test_a_drop_across_a_periodic_boundary():
     """Moves as one in free space does."""
     centre = [0.0, 2.0 * RADIUS]
     body = {"shape": "sphere", "centre": centre, "radius": RADIUS, "phase": "water", "velocity": [0.0, 0.0]}
-    room = {
-        "shape": "box",
-        "lower": [-2.0 * RADIUS, 0.0],
-        "upper": [2.0 * RADIUS, 4.0 * RADIUS],
-        "periodic": [True, False],
-    }
+    room = box([-2.0 * RADIUS, 0.0], [2.0 * RADIUS, 4.0 * RADIUS], periodic=[True, False])
     free, across = (
         Simulation(drop(2, 12, fluid=[body], **change), precision="float64") for change in ({}, {"container": room})
     )

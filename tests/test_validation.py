@@ -16,6 +16,7 @@ import potential_flow
 from cortado import Scene, Simulation
 from cortado.discretise.calibration import rest_volume
 from cortado.discretise.smoothing import smoothing_kernel
+from scenes import box
 
 DATA = Path(__file__).parent / "data"
 GRAVITY = 9.81
@@ -276,13 +277,7 @@ def poiseuille(times: np.ndarray, across: int, kernel: str = "cubic_spline", sup
             discretisation={"spacing": spacing, "support": support, "kernel": kernel},
             phase=[{**WATER, "viscosity": 1000.0 * KINEMATIC}],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [length, CHANNEL], "phase": "water"}],
-            container={
-                "shape": "box",
-                "lower": [0.0, 0.0],
-                "upper": [length, CHANNEL],
-                "periodic": [True, False],
-                "slip": "no",
-            },
+            container=box([0.0, 0.0], [length, CHANNEL], periodic=[True, False], slip="no"),
             forces={"gravity": [PUSH, 0.0]},
             solver={"kind": "pcisph", "time_step": time_step, "density_tolerance": 0.001},
         ),

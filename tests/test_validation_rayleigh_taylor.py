@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 from cortado import Scene, Simulation
 from cortado.discretise.calibration import lattice_offsets
 from cortado.discretise.smoothing import smoothing_kernel
+from scenes import box
 
 GRAVITY = 1.0
 HEAVY, LIGHT = 1800.0, 1000.0
@@ -210,12 +211,7 @@ def rayleigh_taylor(
                 {"shape": "box", "lower": [0.0, -depth], "upper": [1.0, 0.0], "phase": "light"},
                 {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, depth], "phase": "heavy"},
             ],
-            container={
-                "shape": "box",
-                "lower": [0.0, -depth],
-                "upper": [1.0, depth + spacing],
-                "periodic": [True, False],
-            },
+            container=box([0.0, -depth], [1.0, depth + spacing], periodic=[True, False]),
             forces={"gravity": [0.0, -GRAVITY]},
             solver={
                 "kind": "pcisph",
