@@ -33,6 +33,8 @@ from cortado.runs.run_folder import FIGURES
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
+SCENES, TASKS = BAD_SCENES[::8], BAD_TASKS[::8]
+"""Some of the bad ones, all of which tests/test_scene.py and tests/test_task.py have."""
 RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoint"}
 
 
@@ -229,7 +231,7 @@ def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command,
 # ---- wrong input -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_SCENES], ids=[bad[0] for bad in BAD_SCENES])
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in SCENES], ids=[bad[0] for bad in SCENES])
 def test_a_bad_scene_is_refused(cortado_command, folder, old, new, field):
     Path("scene.toml").write_text(GOOD_SCENE.replace(old, new, 1))
     assert_refused(cortado_command("run", "scene.toml", "--out", "dam"), "scene.toml: ", field)
@@ -499,7 +501,7 @@ def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
     assert "gravity.png" in figures("found")
 
 
-@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in TASKS], ids=[bad[0] for bad in TASKS])
 def test_a_bad_task_is_refused(cortado_command, folder, old, new, field):
     Path("task.toml").write_text(GOOD_TASK.replace(old, new, 1))
     assert_refused(cortado_command("optimise", "task.toml", "--out", "found"), "task.toml: ", field)

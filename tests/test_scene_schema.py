@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 import warnings
+from functools import cache
 from unicodedata import normalize
 
 import numpy as np
@@ -39,9 +40,12 @@ TABLES = [table for table in _tables() if table.model_fields]
 FIELDS = [pytest.param(table, name, id=f"{table.__name__}.{name}") for table in TABLES for name in table.model_fields]
 
 
+json_schema = cache(lambda table: table.model_json_schema())
+
+
 def schema_of(table: type[Table], name: str) -> dict:
     """What a field is if it is given, with what it refers to."""
-    whole = table.model_json_schema()
+    whole = json_schema(table)
     part = whole["properties"][name]
     part = {**part, **part["anyOf"][0]} if "anyOf" in part else part
     return whole["$defs"][part["$ref"].rpartition("/")[2]] if "$ref" in part else part
