@@ -225,6 +225,10 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 
     sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
+    of_asked = {  # one over time may be given as one vector for all steps
+        name: exact.gradient[name] if exact.gradient[name].shape == value.shape else exact.gradient[name].sum(axis=0)
+        for name, value in asked.items()
+    }
     perturbations = coherent_directions(problem, chosen, sizes, random)
     known = {**problem.simulation.parameters(), **values}
     time = float(known["time_step"]) * max(problem.steps, 1)
@@ -240,7 +244,7 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
         growth=growth(norms.numpy(), float(known["time_step"])) / max(problem.steps, 1),
         horizons=horizons,
-        alignment=alignment(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
+        alignment=alignment(problem, asked, sizes, of_asked) if asked else None,
         beside=None if wrong else beside,
         beyond=(*beyond, *filter(None, map(beyond_words, horizons))),
     )
@@ -258,14 +262,6 @@ def _problem(subject: Any, steps: int | None) -> Problem:
         raise InputError(f"steps is left out, but must be given where what is certified is no Problem but a {found}.")
     simulation = subject if isinstance(subject, Simulation) else Simulation(subject, precision="float64")
     return Problem(simulation, steps, FinalPositions(simulation.positions))
-
-
-def _of(chosen: Arrays, gradient: Arrays) -> Arrays:
-    """The gradient in the shapes of the chosen parameters: one over time may be given as one vector for all steps."""
-    return {
-        name: gradient[name] if gradient[name].shape == value.shape else gradient[name].sum(axis=0)
-        for name, value in chosen.items()
-    }
 
 
 def _consistency(

@@ -64,7 +64,8 @@ class Ensemble:
             )
         require_whole("seed", self.seed, 0)
         for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
-            _checked_spread(name, spread)
+            if (as_number(spread) or 0.0) <= 0.0:
+                raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
         checked_executor(self.executor)
         keep_own(self, "spread")
 
@@ -100,7 +101,7 @@ class Ensemble:
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:
             raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
-        return _checked_spread(name, self.spread[name] if isinstance(self.spread, Mapping) else self.spread)
+        return float(self.spread[name] if isinstance(self.spread, Mapping) else self.spread)
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,6 @@ class Sampler:
     def named(self, numbers: np.ndarray) -> Arrays:
         """One vector of numbers (numbers,) as arrays by the parameters' names."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
-
-
-def _checked_spread(name: str, spread: object) -> float:
-    number = as_number(spread)
-    if number is None or number <= 0.0:
-        raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
-    return number
 
 
 def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:

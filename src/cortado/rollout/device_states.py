@@ -1,7 +1,7 @@
 """States of steps, and derivatives with respect to them, as NumPy arrays or on the device: there other programs take
 and give them by DLPack, and parameters over time may stay there, too."""
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from math import prod
@@ -184,16 +184,14 @@ class DeviceStates(HostStates):
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         """As `HostStates.begin`."""
-        self._require_own(state)
-        self._require_judged(state)
+        self._require_taken(state)
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes, state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:
         """Give a rollout a first state, and leave its parameters as they are."""
-        self._require_own(state)
-        self._require_judged(state)
+        self._require_taken(state)
         rollout.begin_evaluation()
         rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
         rollout.initial.assign(state.arrays)
@@ -231,7 +229,10 @@ class DeviceStates(HostStates):
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
         values = {"rest_density": densities[0] if self._simulation.batch is None else densities}
         space.check_restarts(self.states(state.arrays, state.scenes), values)
-        self._require_plane(state, given)
+        vectors = {field.name for field in state.arrays.fields if field.entry is Entry.VECTOR}
+        for name in vectors.intersection(given) if self._simulation.dimension == 2 else ():
+            if state[name].numpy()[..., 2].any():
+                raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
         return state
 
     def on_host(self, state: DeviceState) -> States:
@@ -242,15 +243,9 @@ class DeviceStates(HostStates):
         self._simulation.judged_states.update(one for one, scene in judged if scene in self._simulation.judged_states)
         return found[0] if self._simulation.batch is None else found
 
-    def _require_plane(self, state: DeviceState, names: Iterable[str]) -> None:
-        """Vectors of a scene in 2-D lie in its plane."""
-        vectors = {field.name for field in state.arrays.fields if field.entry is Entry.VECTOR}
-        for name in vectors.intersection(names) if self._simulation.dimension == 2 else ():
-            if state[name].numpy()[..., 2].any():
-                raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
-
-    def _require_judged(self, state: DeviceState) -> None:
+    def _require_taken(self, state: DeviceState) -> None:
         """Arrays on the device are not looked at: they are those of a step of this simulation."""
+        self._require_own(state)
         if not all(scene in self._simulation.judged_states for scene in set(state.scenes)):
             advice = "simulation.on_host(state) is taken by any of the same scene"
             raise InputError(f"state is of another simulation, but must be of this one: {advice}.")

@@ -122,26 +122,20 @@ class FirstPositions:
         former = self._judged.get(member, simulation.positions)
         if np.abs(positions - former).max(initial=0.0) < MOVED * spacing:
             return None
-        found = self._found(positions, spacing)
+        lattice, period = simulation.lattice, simulation.scene.container.periods(simulation.dimension)
+        check_apart("parameter initial_positions", positions, spacing, period)
+        found, free = None, positions[: simulation.free_particles]
+        if len(free) > 1 and simulation.scene.forces.pressure:
+            of_lattice = simulation.smoothing, lattice.support, lattice.volume, spacing
+            found = check_crowding("particles at initial_positions", free, *of_lattice, period)
+            least = nearest(free).min() / spacing
+            if found is None and least < NEAREST:
+                wanted = f"at least {NEAREST:g} of them"
+                found = f"particles at initial_positions are only {least:.2g} spacings apart, which should be {wanted}."
         self._judged[member] = positions.copy()
         if found is None or self._warned:
             return None
         self._warned = True
-        return found
-
-    def _found(self, positions: NDArray, spacing: float) -> str | None:
-        simulation, lattice = self._simulation, self._simulation.lattice
-        period = simulation.scene.container.periods(simulation.dimension)
-        check_apart("parameter initial_positions", positions, spacing, period)
-        free = positions[: simulation.free_particles]
-        if len(free) < 2 or not simulation.scene.forces.pressure:
-            return None
-        of_lattice = simulation.smoothing, lattice.support, lattice.volume, spacing
-        found = check_crowding("particles at initial_positions", free, *of_lattice, period)
-        least = nearest(free).min() / spacing
-        if found is None and least < NEAREST:
-            wanted = f"at least {NEAREST:g} of them"
-            found = f"particles at initial_positions are only {least:.2g} spacings apart, which should be {wanted}."
         return found
 
 
@@ -296,7 +290,12 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
         _check_spacing(positions[: simulation.free_particles], simulation)
     else:
         _check_origin(state.origin, origin)
-    _check_fractions(fields["mass_fractions"])
+    fractions = fields["mass_fractions"]  # of each particle shares of one whole
+    beyond = np.abs(fractions - 0.5).max(axis=1) > 0.5 + BEYOND
+    bad = np.flatnonzero(beyond | (np.abs(fractions.sum(axis=1) - 1.0) > MIXED))
+    if bad.size:
+        wrong = f"state mass_fractions of particle {bad[0]} are {_listed(tuple(fractions[bad[0]].tolist()))}"
+        raise InputError(f"{wrong}, but must be from 0 to 1 and add up to 1.")
     _check_densities(fields[DENSITY], fields["mass_fractions"], np.array(origin.rest_density))
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
     free, spacing = positions[: simulation.free_particles], scene.discretisation.spacing
@@ -325,7 +324,13 @@ def _check_origin(found: Origin, wanted: Origin) -> None:
     """Both are of the same particles."""
     for name, words in WORDS.items() if found != wanted else ():
         one, other = getattr(found, name), getattr(wanted, name)
-        if one is not None and not _is_same(one, other):
+        if one is None:
+            continue
+        if isinstance(one, str) or isinstance(other, str):
+            is_same = one == other
+        else:
+            is_same = np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=SAME, atol=0.0)
+        if not is_same:
             raise InputError(
                 f"state is of a run with {words.format(_listed(one))}, but must be of one with "
                 f"{words.format(_listed(other))}, as this simulation has{ADVICE.get(name, '')}."
@@ -345,26 +350,10 @@ WORDS = {
 ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}
 
 
-def _is_same(one: object, other: object) -> bool:
-    if isinstance(one, str) or isinstance(other, str):
-        return one == other
-    some, others = (np.asarray(value, dtype=np.float64) for value in (one, other))
-    return some.shape == others.shape and np.allclose(some, others, rtol=SAME, atol=0.0)
-
-
 def _listed(value: object) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(_listed, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _check_fractions(fractions: NDArray) -> None:
-    """The mass fractions (n, phases) of each particle are shares of one whole."""
-    beyond = np.abs(fractions - 0.5).max(axis=1) > 0.5 + BEYOND
-    bad = np.flatnonzero(beyond | (np.abs(fractions.sum(axis=1) - 1.0) > MIXED))
-    if bad.size:
-        found = f"state mass_fractions of particle {bad[0]} are {_listed(tuple(fractions[bad[0]].tolist()))}"
-        raise InputError(f"{found}, but must be from 0 to 1 and add up to 1.")
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
