@@ -44,7 +44,8 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """The same of float32, of float64 or of integers: half precision, which rounds to three digits, is refused."""
+    """A real number or an array of them, of float32, of float64 or of integers, in float64: half precision, which
+    rounds to three digits, is refused."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -52,7 +53,7 @@ def as_precise_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def read_only(what: str, value: Any) -> np.ndarray:
-    """The same as an array of its own that cannot be changed."""
+    """A real number or an array of them in float64, as an array of its own that cannot be changed."""
     array = as_numbers(what, value).copy()
     array.setflags(write=False)
     return array

@@ -63,8 +63,8 @@ def public(value: T) -> T:
 
 @cache
 def told(function: F) -> F:
-    """A function, or the ``__init__`` of a class, that raises an `InputError` for a call that does not fit it, where
-    Python has a `TypeError`, and for an argument of another type than it has where that makes the call fail."""
+    """Have a function, or the ``__init__`` of a class, raise an `InputError` for a call that does not fit it, where
+    Python has a `TypeError`. It does so for an argument of another type, too, where that makes the call fail."""
     if hasattr(function, "is_told"):
         return function
     takes = signature(function)
@@ -122,7 +122,8 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind is Any or not isclass(kind):  # or a type that a variable stands for
         return True
     if getattr(kind, "_is_protocol", False) and kind.__module__.startswith("cortado"):
-        members = [name for one in kind.__mro__ if getattr(one, "_is_protocol", False) for name in _members(one)]
+        protocols = [one for one in kind.__mro__ if getattr(one, "_is_protocol", False)]
+        members = [name for one in protocols for name in (*vars(one), *one.__annotations__) if not name.startswith("_")]
         return not isclass(value) and all(hasattr(value, name) for name in members)
     if not isinstance(value, kind) or (isinstance(value, str) and issubclass(kind, Iterable)):
         return kind is str and isinstance(value, str)
@@ -141,10 +142,6 @@ def _takes(function: Any, number: int) -> bool:
     except ValueError:  # of functions that Python knows nothing of
         pass
     return True
-
-
-def _members(protocol: type) -> list[str]:
-    return [name for name in (*vars(protocol), *protocol.__annotations__) if not name.startswith("_")]
 
 
 def _words(hint: Any) -> str:

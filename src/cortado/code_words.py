@@ -96,7 +96,7 @@ def names_in(function: Any) -> tuple[str, ...]:
 
 
 def package_of(value: Any) -> str:
-    """Of a module, a function or a class, or of the class of an object."""
+    """The name of the package of a module, a function or a class, or of the class of an object."""
     name = (
         value.__name__
         if ismodule(value)

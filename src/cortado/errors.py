@@ -76,7 +76,7 @@ class SceneError(CortadoError):
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
-        """The same error with the name of the file."""
+        """This error with the name of the file."""
         _, *rest = self.args
         return SceneError(file, *rest)
 
@@ -110,11 +110,11 @@ class DivergedError(ComputationError):
         """Of one run among several: what became of them together, in a sentence."""
 
     def with_advice(self, advice: str) -> "DivergedError":
-        """The same error with another advice."""
+        """This error with another advice."""
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """The same error as the first of several, after a sentence about all of them."""
+        """This error as the first of several, after a sentence about all of them."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:

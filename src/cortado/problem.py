@@ -21,9 +21,9 @@ from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimat
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.losses import fingerprint as loss_fingerprint
-from cortado.losses.loss import StepBar, moment_of, slope
+from cortado.losses.loss import moment_of, slope
 from cortado.losses.run_losses import LossesByStep
-from cortado.particles.state import Parameters, State
+from cortado.particles.state import State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
 from cortado.rollout.device_states import OfLost, without_lost
 from cortado.rollout.parameter_space import ParameterSpace
@@ -100,8 +100,8 @@ class ProblemForwardPass(Staying):
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """As `back`, and the derivatives with respect to the fields of the first state, by name, and to its
-        ``time``."""
+        """The gradient by an estimator, and the derivatives with respect to the fields of the first state, by name, and
+        its ``time``."""
         derivative = self._derivative(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
@@ -115,17 +115,13 @@ class ProblemForwardPass(Staying):
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
         self._residual.bring_back()
         first = self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
-        for own in (bar.step for bar in self._bars.values()):
-            if own is not None:
-                self._add(own, derivative.parameters())
+        total = derivative.parameters()
+        for own in (bar.step for bar in self._bars.values() if bar.step is not None):
+            for name, bar in own.parameters.items():
+                whole = total[name].numpy()
+                add_to_row(self.rollout, name, bar, own.row, whole)
+                total[name].assign(whole)
         return first
-
-    def _add(self, own: StepBar, total: Parameters) -> None:
-        """Add adjoints of the parameters of one step to those of all steps."""
-        for name, bar in own.parameters.items():
-            whole = total[name].numpy()
-            add_to_row(self.rollout, name, bar, own.row, whole)
-            total[name].assign(whole)
 
     def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
         bars, values = self._bars, self._values
@@ -259,7 +255,7 @@ class Problem:
     def estimate(
         self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """The same, with what the estimator ``gradient`` (`gradients.Exact` by default) reports.
+        """The loss and its derivatives, with what the estimator ``gradient`` (`gradients.Exact` by default) reports.
 
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
         go back through a run; `gradients.AdjointNorms` is such an observer.
@@ -317,7 +313,7 @@ class Problem:
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """The same along several directions, each with an observer of its own, of one run."""
+        """The tangents along several directions, each with an observer of its own, of one run; see `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -341,7 +337,7 @@ class Problem:
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
-        """Of a batch: the scenes that lost a particle in the last evaluation, by their number, and what happened."""
+        """The scenes of a batch that lost a particle in the last evaluation, by their number, and what happened."""
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
@@ -369,14 +365,14 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """The same problem, in the same arrays, that begins at another state."""
+        """This problem, in the same arrays, beginning at another state."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
         return found
 
     def batch_of(self, size: int) -> "Problem":
-        """The same problem of so many scenes in one launch; the last few sizes are kept."""
+        """This problem with so many scenes in one launch; the last few sizes are kept."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))

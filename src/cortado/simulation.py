@@ -37,7 +37,7 @@ from cortado.runs.quantity_values import Moment, QuantityEvaluator
 from cortado.runs.recording import recorded
 from cortado.runs.sensor import Sensor
 from cortado.runs.trajectory import Frame, Trajectory
-from cortado.scene.discrete_scene import DiscreteScene, check_distance, discretise
+from cortado.scene.discrete_scene import check_distance, discretise
 from cortado.scene.parameter_values import OVER_TIME, scene_values
 from cortado.scene.quantity_names import check_readable
 from cortado.scene.restart import RestartState
@@ -122,7 +122,8 @@ class Simulation(Stepping):
         """Constants of the lattice of particles at rest; masses of the fluid at the start, given and asked for [kg]."""
         self.free_particles = discrete.fluid.emitted.start
         """How many particles, the first ones, do not wait in a nozzle."""
-        self.solver: Solver = self._built(discrete)
+        own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
+        self.solver: Solver = built(self._maker, SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
         """The first state on the device."""
         self.judged_states: WeakSet[RestartState] = WeakSet()
@@ -132,10 +133,6 @@ class Simulation(Stepping):
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision, self.known)
-
-    def _built(self, discrete: DiscreteScene) -> Solver:
-        own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
-        return built(self._maker, SolverSetting(*own, self._called, self._lanes))
 
     @property
     def carried_by(self) -> str | None:
@@ -346,7 +343,7 @@ class Simulation(Stepping):
 
     @unwarned()
     def batch_of(self, size: int) -> "Simulation":
-        """The same scene so many times in one launch."""
+        """A simulation of this scene so many times in one launch."""
         return Simulation(*self._made_of(self.precision.name, size))
 
     @unwarned()

@@ -33,7 +33,7 @@ class Watched(Steppable, Protocol):
         """A single one of the same scene in a precision."""
 
     def batch_of(self, size: int) -> Any:
-        """The same scene so many times in one launch."""
+        """A simulation of this scene so many times in one launch."""
 
 
 class Watch:

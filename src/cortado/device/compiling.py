@@ -1,8 +1,8 @@
 """Kernels are compiled before they are launched: all that a step needs, side by side, and one line says so.
 
 Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all of
-them with workers of its own is as fast as what is done here, but after Ctrl-C it waits for all of them, and of a few
-at a time it takes 1.7 times as long.
+them with workers of its own is as fast as what is done here. But after Ctrl-C it waits for all of them, and of a few at
+a time it takes 1.7 times as long.
 """
 
 import os

@@ -2,8 +2,8 @@
 
 In Colagrossi et al. (2012) and in Negi and Ramachandran (2021) particles push each other until they fill a shape
 evenly. Here nonlinear least squares (Gauss-Newton) do it: the density of every particle is to be that of the lattice,
-where walls count with their weights and air counts as if it were fluid, and no two particles are to be too near each
-other. Only particles near a surface move, as those on a lattice have the rest density from the start.
+and no two particles are to be too near each other. Walls count with their weights, and air counts as if it were fluid.
+Only particles near a surface move, as those on a lattice have the rest density from the start.
 """
 
 from contextlib import nullcontext
@@ -305,8 +305,9 @@ class Packing:
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """As `packed`, computed. Of particles that have the rest density already none moves; while some are compressed,
-        as in wedges or where a small body was rounded up to a whole particle, those that are most are left out."""
+        """Compute what `packed` returns. No particle moves that has the rest density already; while some are
+        compressed, as in wedges or where a small body was rounded up to a whole particle, those that are most are left
+        out."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             crowded = self._crowded(found, stays[kept])

@@ -48,7 +48,7 @@ class Around:
 
 @wp.struct
 class Placed:
-    """The same points in the order of their cells."""
+    """Points around particles, in the order of their cells."""
 
     x: wp.array(dtype=vector)
     """[m]"""
@@ -77,7 +77,7 @@ class Equations:
 
 @wp.func
 def separation(x_i: vector, x_j: vector, around: Around) -> vector:
-    """Of the nearest image."""
+    """The separation x_i - x_j of the nearest image [m]."""
     x_ij = x_i - x_j
     if around.is_periodic:
         s = wp.cw_mul(x_ij, around.frequency)

@@ -82,7 +82,7 @@ class Block:
         return self.first, self.first + (self.counts - 1.0) * self.spacings
 
     def grown(self, cells: int) -> "Block":
-        """The same lattice with so many cells more on every side."""
+        """This lattice with so many cells more on every side."""
         return Block(self.first - cells * self.spacings, self.counts + 2 * cells, self.spacings)
 
     def points(self) -> Points:
@@ -302,8 +302,8 @@ def check_crowding(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raises `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place, in a
-    period that begins at a corner (d,) and has lengths (d,) [m], 0 along axes without one."""
+    """Raises `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place. The
+    period begins at a corner (d,) and has lengths (d,) [m], 0 along axes without one."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:

@@ -302,7 +302,7 @@ class ExposedSurface:
 
     @property
     def spacing(self) -> float:
-        """Of particles [m]."""
+        """The spacing of particles [m]."""
         return self.container.spacing
 
     @cached_property
@@ -313,8 +313,9 @@ class ExposedSurface:
 
     def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
         """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
-        as its part of the layer is, and less where it is less deep: it counts the same for the first row of fluid. None
-        counts as deeper than its layer, as those may seem whose foot is hidden where parts of a solid overlap."""
+        as its part of the layer is. Where it is less deep it has less, so that it counts the same for the first row of
+        fluid. None counts as deeper than its layer, as those may seem whose foot is hidden where parts of a solid
+        overlap."""
         parts, first_row = [], 0.5 * self.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)

@@ -308,9 +308,9 @@ def wall_weights(
     """(b,) weights of wall particles in the density [-], a fluid particle being 1.
 
     With them the lattice has the rest density at all places, and a uniform pressure pushes no particle less than a
-    spacing from a wall, as nearly as can be, in the sense of least squares: along faces, edges and corners, in a cup,
-    and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is twice
-    that of the fluid that is missing.
+    spacing from a wall. Both hold as nearly as can be, in the sense of least squares: along faces, edges and corners,
+    in a cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
+    twice that of the fluid that is missing.
 
     Args:
         walls: (b, d) wall particles [m].

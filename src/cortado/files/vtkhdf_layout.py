@@ -6,7 +6,7 @@ not there yet is the empty part. One number in `PartOffsets` makes it appear, so
 file, such as ParaView, finds every size as it was when it looked first.
 
 HDF5 lays the file out in memory, and plain writes take it to the disk. With writes of HDF5 a file would be as readable
-after a kill, but a full disk then ends the process with a segmentation fault, always while the file is laid out and
+after a kill. But a full disk then ends the process with a segmentation fault, always while the file is laid out and
 often later (HDF5 2.0). Its mode for one writer and many readers leaves files of killed writers that VTK does not open.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html

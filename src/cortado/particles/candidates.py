@@ -100,7 +100,7 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
-    """The same as `scan_by_bits`, for several lanes."""
+    """A Warp function for several lanes: append the particles first ... last - 1 that are within reach, but ``own``."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     separation = pair_functions(discretisation).separation

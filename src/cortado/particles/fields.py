@@ -36,7 +36,7 @@ class StateField:
     """Whether no step changes it: the states of a run share the array."""
 
     def shape(self, particles: int, dimension: int, phases: int) -> tuple[int, ...]:
-        """Of its values as NumPy has them."""
+        """The shape of the values of the field as NumPy has them."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
 
@@ -72,13 +72,10 @@ def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]
     for field in fields:
         if field.first is not None and field.first in parameters:
             value = parameters[field.first]
-            found[field.name] = value if field.axis is Axis.PARTICLE else _first_row(field, value)
+            if field.axis is not Axis.PARTICLE:  # (1,) or (1, components), over time the first row
+                value = (np.atleast_2d(value) if field.entry is Entry.VECTOR else np.atleast_1d(value))[:1]
+            found[field.name] = value
     return found
-
-
-def _first_row(field: StateField, value: NDArray) -> NDArray:
-    """(1,) or (1, components) of a parameter of the scene, over time the first row."""
-    return (np.atleast_2d(value) if field.entry is Entry.VECTOR else np.atleast_1d(value))[:1]
 
 
 POSITIONS = StateField("positions", "m", Entry.VECTOR, first="initial_positions")

@@ -131,16 +131,6 @@ def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dic
     def wall_growth_dot(b: int, s: neighbourhood) -> real:
         return load_number(s.wall_growths_dot, b)
 
-    return {
-        "wall_position": wall_position,
-        "wall_weight": wall_weight,
-        "wall_grip": wall_grip,
-        "wall_foot": wall_foot,
-        "wall_velocity": wall_velocity,
-        "wall_solid": wall_solid,
-        "weight_in": weight_in,
-        "wall_position_dot": wall_position_dot,
-        "wall_velocity_dot": wall_velocity_dot,
-        "wall_turn_dot": wall_turn_dot,
-        "wall_growth_dot": wall_growth_dot,
-    }
+    own = (wall_position, wall_weight, wall_grip, wall_foot, wall_velocity, wall_solid, weight_in)
+    dots = (wall_position_dot, wall_velocity_dot, wall_turn_dot, wall_growth_dot)
+    return {one.func.__name__: one for one in (*own, *dots)}

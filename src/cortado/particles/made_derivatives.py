@@ -123,7 +123,7 @@ def _adjoint(term: Term) -> Body:
 
 
 def _tangent(term: Term, d: Discretisation) -> Body:
-    """Of each component of each result the gradient times the tangents of the parameters."""
+    """Lines that add up, for each component of each result, its gradient times the tangents of the parameters."""
     kinds = {**term.parameters, **bars_of(term)}
 
     def change_of(name: str, of_j: Mapping[str, str]) -> str:

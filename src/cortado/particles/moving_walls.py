@@ -4,9 +4,9 @@ Of solids that move they tell where they are at the end of a step, sorted by cel
 above each gets there. Where a solid turns that is not as fast as the particle.
 
 A solid may be stretched about its middle by a scale sigma. Its wall particles stay as deep beneath the surface as they
-are: one that has the place r, the foot f = q - r to the point q of the surface, and the weight w, in the frame of the
-solid, is at c + R (sigma q - f), has the foot R f, and the weight sigma^(d - 1) w, as its part of the surface grows by
-that. So flat walls keep the weights that were found for them.
+are. In the frame of the solid, one has the place r, the foot f = q - r to the point q of the surface, and the weight w.
+In space it is at c + R (sigma q - f) and has the foot R f and the weight sigma^(d - 1) w, as its part of the surface
+grows by that. So flat walls keep the weights that were found for them.
 """
 
 from collections.abc import Mapping
@@ -22,11 +22,12 @@ from cortado.device.grid import Grid
 from cortado.device.launching import bundle, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
+from cortado.discretise.shapes import Rows
 from cortado.particles.state import Layout
 
 
 @dataclass(frozen=True)
-class WallArrays:
+class WallArrays(Rows):
     """Wall particles, in any order."""
 
     positions: np.ndarray
@@ -43,43 +44,22 @@ class WallArrays:
     """(b,) the number of the solid whose each is: of those that move from 0 on, of those at rest from -2 on
     downwards; -1 of the container's"""
 
-    def some(self, which: np.ndarray) -> "WallArrays":
-        """Those that are chosen."""
-        return WallArrays(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
-
-    def __len__(self) -> int:
-        return len(self.weights)
-
 
 @dataclass(frozen=True)
 class Poses:
-    """Where solids are, for each scene of a batch."""
+    """Where solids are, for each scene of a batch, or tangents of that."""
 
     positions: wp.array
     """(members, solids) vectors, of the middles [m]"""
     turns: wp.array
-    """(members, solids) matrices, from the frame of a solid to space"""
+    """(members, solids) matrices, from the frame of a solid to space; of tangents vectors: the rotation vector by which
+    solids turn further, over the change"""
 
     @classmethod
-    def zeros(cls, members: int, solids: int, precision: Precision, device: Any) -> "Poses":
-        """Still to be written."""
-        kinds = precision.vector, matrix_of(precision)
+    def zeros(cls, members: int, solids: int, precision: Precision, device: Any, tangents: bool = False) -> "Poses":
+        """Poses that are still to be written, or their ``tangents``."""
+        kinds = precision.vector, precision.vector if tangents else matrix_of(precision)
         return cls(*(wp.zeros((members, solids), dtype=kind, device=device) for kind in kinds))
-
-
-@dataclass(frozen=True)
-class PoseChanges:
-    """Tangents of `Poses`."""
-
-    positions: wp.array
-    """(members, solids) vectors"""
-    turns: wp.array
-    """(members, solids) vectors: the rotation vector by which they turn further, over the change"""
-
-    @classmethod
-    def zeros(cls, members: int, solids: int, precision: Precision, device: Any) -> "PoseChanges":
-        """Still to be written."""
-        return cls(*(wp.zeros((members, solids), dtype=precision.vector, device=device) for _ in range(2)))
 
 
 @cache
@@ -107,8 +87,8 @@ def sizes_type(precision: Precision) -> Any:
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
-    """Those that place wall particles, that write them in the order of their cells, that say where cells begin, and
-    that write tangents."""
+    """Kernels that place wall particles, write them in the order of their cells, say where cells begin, and write
+    tangents."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
@@ -229,7 +209,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
 
 class MovingWalls:
-    """Those of one search for neighbours, behind the wall particles that are at rest in its arrays."""
+    """The moving wall particles of one search for neighbours, which stand behind those at rest in its arrays."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
         """``walls`` of so many solids that move; the first of them has the number ``first`` in the arrays of the
@@ -242,7 +222,7 @@ class MovingWalls:
         self.sizes.power = precision.real(dimension - 1)
         self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
         """How many solids, and their poses before and after a step, which somebody else writes."""
-        self.before_dot, self.after_dot = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
+        self.before_dot, self.after_dot = (Poses.zeros(*sizes, tangents=True) for _ in range(2))
         """The tangents of these, likewise."""
         self.named: dict[str, wp.array] = {
             "before": self.before.positions,

@@ -46,7 +46,7 @@ class Discretisation:
 
     @property
     def still(self) -> "Discretisation":
-        """The same where walls do not move, for what is linear in the velocities of the fluid alone."""
+        """This discretisation where walls do not move, for what is linear in the velocities of the fluid alone."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
@@ -148,9 +148,9 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]:
-    """Warp functions by name: ``near_mirrors`` and ``before_mirrors`` (the bits of the walls within reach of a
-    position, on either side, and of those that it is in front of), ``reflects`` (whether bits are those of a reflection
-    in some of them) and ``reflection`` (the diagonal of R, and o)."""
+    """Warp functions of mirrors by name. ``near_mirrors`` has the bits of the walls within reach of a position, on
+    either side, ``before_mirrors`` of those that it is in front of. ``reflects`` tells whether bits are those of a
+    reflection in some walls, and ``reflection`` has the diagonal of R, and o."""
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -188,12 +188,7 @@ def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]
                 offset[axis] = real(2.0) * wp.where(lower == 1, s.mirror_lower[axis], s.mirror_upper[axis])
         return flip, offset
 
-    return {
-        "near_mirrors": near_mirrors,
-        "before_mirrors": before_mirrors,
-        "reflects": reflects,
-        "reflection": reflection,
-    }
+    return {one.func.__name__: one for one in (near_mirrors, before_mirrors, reflects, reflection)}
 
 
 @cache

@@ -1,8 +1,8 @@
 """Neighbours: particles sorted by cell, and a symmetric list that the step keeps.
 
-The list reaches a little beyond the support radius (`SKIN`), because the density is also taken at predicted positions:
-without it a pair that comes into touch within the step would count or not depending on which side of the support it
-started, a jump in the map from one state to the next (and lattices start with pairs at just that distance).
+The list reaches a little beyond the support radius (`SKIN`), because the density is also taken at predicted positions.
+Without it a pair that comes into touch within the step would count or not depending on which side of the support it
+started. The map from one state to the next would jump there, and lattices start with pairs at just that distance.
 
 The list holds j for i exactly when it holds i for j, because |x_i - x_j| is computed with the same bits from both
 sides.
@@ -224,7 +224,7 @@ class NeighbourSearch:
         self._sort(positions)
 
     def _write_walls(self, walls: WallArrays) -> None:
-        """Those at rest, in this order."""
+        """Write the wall particles at rest, in this order."""
         known = {name: getattr(walls, name) for name in ("positions", "weights", "grips", "feet")}
         for name, values in {**known, "solids": walls.solid}.items():
             array = self.walls[f"wall_{name}"]

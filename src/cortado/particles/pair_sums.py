@@ -105,10 +105,10 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool, of_one: bool) -> str:
-    """A loop over the walls, whose particles have nothing but a place, a weight _w_b, what is ``known`` of
-    `cortado.particles.terms.OF_WALLS`, and, where walls move, a velocity, which is their entry of the array v, and
-    tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all that are
-    not of the moving ``solid``."""
+    """A loop over the walls, whose particles have a place, a weight _w_b, and what is ``known`` of
+    `cortado.particles.terms.OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array v,
+    and tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all that
+    are not of the moving ``solid``."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
@@ -146,7 +146,9 @@ def summed(
     )
     text = "".join(line for line in text.splitlines(keepends=True) if line.strip())
     known = {
-        **_known(d),
+        **scope_of(d),
+        **{"_times": wp.cw_mul, "_REFLECTIONS": REFLECTIONS, "_LANES": d.lanes, "_UNROLL": UNROLL},
+        "_lane": lane_functions(d.precision, d.lanes).lane,
         **{f"_of_{name}": wp.array(dtype=kind) for name, kind in arrays.items()},
         **{f"_of_{name}": kind for name, kind in others.items()},
         **{f"_add_up_{n}": sum_over_lanes(kind, d.precision, d.lanes) for n, kind in enumerate(results)},
@@ -164,33 +166,11 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
     return getattr(kind, "_wp_scalar_type_", None) is real and len(kind._shape_) == 1
 
 
-def _known(d: Discretisation) -> dict[str, Any]:
-    pair = pair_functions(d)
-    used = (
-        "reflection",
-        "separation",
-        "neighbour",
-        "several",
-        "vectors",
-        "numbers",
-        "sixes",
-        "wall_position",
-        "wall_weight",
-        "wall_grip",
-        "wall_foot",
-        "wall_velocity",
-        "weight_in",
-        "wall_position_dot",
-        "wall_velocity_dot",
-        "wall_turn_dot",
-        "wall_growth_dot",
-    )
-    return {
-        **{f"_{name}": getattr(pair, name) for name in used},
-        **{"_times": wp.cw_mul, "_REFLECTIONS": REFLECTIONS},
-        **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},
-        **{"_lane": lane_functions(d.precision, d.lanes).lane, "_LANES": d.lanes, "_UNROLL": UNROLL},
-    }
+def scope_of(d: Discretisation) -> dict[str, Any]:
+    """What the texts of loops over neighbours know by name: types, and the functions of pairs."""
+    precision = d.precision
+    types = {"_real": precision.real, "_vector": precision.vector, "_neighbourhood": neighbourhood_type(precision)}
+    return {**{f"_{name}": function for name, function in vars(pair_functions(d)).items()}, **types}
 
 
 def zero(kind: Any, d: Discretisation) -> str:
@@ -199,7 +179,7 @@ def zero(kind: Any, d: Discretisation) -> str:
 
 
 def type_name(kind: Any, d: Discretisation) -> str:
-    """Of a type, in a text."""
+    """The name of a type in a text."""
     known = {d.precision.real: "_real", d.precision.vector: "_vector"}
     return known.get(kind) or f"_vector_{len(kind())}"
 
@@ -225,7 +205,8 @@ def pair_sum(
 
 
 def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
-    """As `pair_sum`, over the fluid alone. ``module`` is the Warp module of the function, if not that of the file."""
+    """A decorator that makes of a term its sum over the fluid alone, as `pair_sum` does over walls too. ``module`` is
+    the Warp module of the function, if not that of the file."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -235,7 +216,8 @@ def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Deco
 
 
 def image_sum(d: Discretisation) -> Decorator:
-    """As `fluid_sum`, over the images of the fluid in flat walls that mirror it (`cortado.particles.neighbourhood`)."""
+    """A decorator that makes of a term its sum over the images of the fluid in flat walls that mirror it
+    (`cortado.particles.neighbourhood`)."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -255,7 +237,7 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
-    """As `pair_sum`, over the walls alone."""
+    """A decorator that makes of a term its sum over the walls alone."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -265,7 +247,8 @@ def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
 
 
 def solid_sum(d: Discretisation) -> Decorator:
-    """As `wall_sum`, over the walls of the one moving solid that the term's parameter ``solid`` is the number of."""
+    """A decorator that makes of a term its sum over the walls of one moving solid, by its number ``solid``, a
+    parameter."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -337,7 +320,7 @@ class ByHand:
 
     kind: str
     """"tangent", or "adjoint": one that returns the adjoints of the entries of particle i in each array of the sum, in
-    their order, then those of what is the same for all neighbours, or what else a kernel needs."""
+    their order. Behind them are those of what is the same for all neighbours, or what else a kernel needs."""
     of: Any
     function: Any
 

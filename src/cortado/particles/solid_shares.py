@@ -7,9 +7,9 @@ with W = T . S_i^, to wall particle b
 
 made by Warp from W. The point of the surface above it is s_b = c + R q_b, and it is at x_b = s_b - foot_b, with a foot
 that R has turned too. Its velocity is that of s_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the
-start of the step. A scale sigma has made q_b so many times as long, and w_b sigma^(d - 1) times as large. So a solid
-that moves by c', turns further by w', and grows by g' = sigma' / sigma, and whose pose at the start of the step changed
-by c_0' and w_0', has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
+start of the step. A scale sigma has made q_b so many times as long, and w_b sigma^(d - 1) times as large. A solid moves
+by c', turns further by w', and grows by g' = sigma' / sigma, and its pose at the start of the step changed by c_0' and
+w_0'. So it has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
 
     f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
     f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
@@ -27,7 +27,8 @@ from cortado.device.launching import Named, bundle
 from cortado.device.precision import Precision
 from cortado.device.reduction import add
 from cortado.particles.moving_walls import MovingWalls, matrix_of
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.pair_sums import scope_of
 from cortado.particles.state import Layout
 from cortado.particles.terms import Term
 
@@ -213,7 +214,7 @@ def solid_kernel(
 
 def _sum(term: Term, d: Discretisation, seen: Any, rubs: bool, module: Any) -> Any:
     """The Warp function of the sums over the wall particles of one solid."""
-    precision, pair = d.precision, pair_functions(d)
+    precision = d.precision
     velocity = [name for name in ("v_ij", "v_j") if name in term.parameters]
     by_v = {(): "_vector()", ("v_ij",): "-_w_b * _by_v_ij", ("v_j",): "_w_b * _by_v_j"}[tuple(velocity)]
     read = {name for name in term.arrays if name != "x" and {f"{name}_i", f"{name}_ij"} & term.parameters.keys()}
@@ -226,17 +227,12 @@ def _sum(term: Term, d: Discretisation, seen: Any, rubs: bool, module: Any) -> A
         by_v=by_v,
         by_foot=" + _wp.cross(_foot, _w_b * _by_foot)" if "foot" in term.parameters else "",
     )
-    of_walls = (f"wall_{name}" for name in ("position", "weight", "grip", "foot", "velocity", "solid"))
-    used = ("separation", "neighbour", *of_walls)
     known: dict[str, Any] = {
-        **{f"_{name}": getattr(pair, name) for name in used},
-        "_real": precision.real,
-        "_vector": precision.vector,
+        **scope_of(d),
         "_matrix": matrix_of(precision),
         "_pair": precision.pair,
         "_vectors": wp.array(dtype=precision.vector),
         "_seen": seen,
-        "_neighbourhood": neighbourhood_type(precision),
         "_wp": wp,
         "_work": wp.func(term.function, module=module),
     }

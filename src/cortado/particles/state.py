@@ -139,7 +139,7 @@ class State(Arrays):
         return type(self)(self.fields, new, self.batch)
 
     def copy(self) -> Self:
-        """The same in arrays of its own."""
+        """This state in arrays of its own."""
         own = {name: wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
 
@@ -193,7 +193,7 @@ class StateSeries:
         return State(self._like.fields, arrays, self._like.batch)
 
     def like(self) -> Self:
-        """As many, still to be written."""
+        """A series of as many states, still to be written."""
         return type(self)(self._like, self._length)
 
     def assign(self, other: Self) -> None:
@@ -273,7 +273,7 @@ class Layout:
 
     @property
     def all_particles(self) -> int:
-        """Of all scenes."""
+        """The number of particles of all scenes."""
         return self.members * self.particles
 
     def sum_of(self, dtype: Any) -> TreeReduction:

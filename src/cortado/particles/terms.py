@@ -32,8 +32,8 @@ class Term:
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns several things.
-        Raises `TypeError` for one that has not, or for names that begin with an underscore."""
+        """The term of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns several
+        things. Raises `TypeError` for one without them, or for names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -55,7 +55,7 @@ class Term:
 
     @property
     def of_neighbours(self) -> dict[str, Any]:
-        """Those arrays of which it takes a neighbour's entry."""
+        """Types of the entries of arrays of which the term takes a neighbour's, by name."""
         read = {array_of(name) for name in self.parameters if name.endswith(("_j", "_ij"))}
         return {array: kind for array, kind in self.arrays.items() if array in read}
 
@@ -70,7 +70,7 @@ class Term:
         return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
-        """The same with the particles exchanged."""
+        """The text of its arguments with the particles exchanged."""
         return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
 
     def _arguments(

@@ -17,7 +17,8 @@ import warp as wp
 
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.pair_sums import scope_of
 from cortado.particles.solid_shares import ALL_WALLS, WorkMaker, solid_kernel
 from cortado.particles.terms import Term
 
@@ -52,8 +53,8 @@ class WallTerm:
 
     @property
     def kernels(self) -> Kernels:
-        """Of A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, which is the array ``bar`` of the
-        term. They know the ``constants`` of the work and the number ``solid``, or `ALL_WALLS`."""
+        """Kernels of the sum A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, the array ``bar``
+        of the term. They know the ``constants`` of the work and the number ``solid``, or `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
@@ -185,7 +186,7 @@ class _Text:
         return "_real(0.0)" if kind is self.d.precision.real else "_vector()" if len(kind._shape_) == 1 else "_matrix()"
 
     def _made(self, name: str, parameters: str, own: list[str], body: list[str], end: str, module: Any) -> Any:
-        d, pair = self.d, pair_functions(self.d)
+        d = self.d
         own = [*(f"_{entry}_i = at.{entry}[i]" for entry in self._entries), *own]
         text = LOOP.format(
             name=name,
@@ -195,16 +196,11 @@ class _Text:
             body="\n".join(f"            {line}" for line in body),
             end=f"    {end}",
         )
-        walls = (f"wall_{name}" for name in ("position", "weight", "grip", "foot", "velocity", "solid"))
-        dots = (f"wall_{name}_dot" for name in ("position", "velocity", "turn", "growth"))
         matrices = [kind for kind in self.term.arrays.values() if kind not in (d.precision.real, d.precision.vector)]
         known: dict[str, Any] = {
-            **{f"_{name}": getattr(pair, name) for name in ("separation", "neighbour", *walls, *dots)},
-            "_real": d.precision.real,
-            "_vector": d.precision.vector,
+            **scope_of(d),
             "_matrix": matrices[0] if matrices else None,
             "_pair": d.precision.pair,
-            "_neighbourhood": neighbourhood_type(d.precision),
             "_ALL": wp.constant(ALL_WALLS),
             "_wp": wp,
             "_work": wp.func(self.term.function, module=module),

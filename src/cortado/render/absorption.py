@@ -1,13 +1,13 @@
 """Emission and absorption along a ray, front to back (Max 1995), through the colour field (P, A).
 
 A sample of the thickness kappa ds (the extinction times the step) lets exp(-u) of what comes from behind through, where
-u = kappa ds A, and adds kappa ds P E(u), where E(u) = (1 - exp(-u)) / u: the emission of a layer whose colour is P / A,
+u = kappa ds A. It adds kappa ds P E(u), where E(u) = (1 - exp(-u)) / u: the emission of a layer whose colour is P / A,
 without the division. With T_0 = 1,
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
-On the way back what comes from behind a sample is the image less what came up to there, so that one pass over the
-samples does, which may be as dark behind as they like.
+On the way back what comes from behind a sample is the image less what came up to there. So one pass over the samples
+does, and these may be as dark as they like.
 
 `RayMarcher` makes a picture of a field, and goes back from it.
 """
@@ -94,7 +94,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
 
     @wp.func
     def diagonal(nodes: nodes_struct) -> vector:
-        """Of one cell."""
+        """The diagonal of one cell [m]."""
         return vector(nodes.cell, nodes.cell, nodes.cell)
 
     @wp.kernel(module=module, enable_backward=False)

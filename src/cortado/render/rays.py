@@ -254,7 +254,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
-        """Of the value at a point that moves; on the face of a cell as `gradient`."""
+        """The derivative of the value at a point that moves; on the face of a cell as `gradient`."""
         i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):

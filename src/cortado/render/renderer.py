@@ -143,13 +143,13 @@ class Renderer:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of a picture: rows, columns, 3."""
+        """The shape of a picture: rows, columns, 3."""
         columns, rows = self.view.camera.resolution
         return rows, columns, 3
 
     @property
     def precision(self) -> Precision:
-        """That it computes in."""
+        """The precision that it computes in."""
         return self._precision
 
     @property

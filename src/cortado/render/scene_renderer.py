@@ -49,7 +49,8 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
     `Simulation.renderer`.
     """
     scene = simulation.scene
-    lower, upper = _extent(simulation)
+    ends, x = scene.container.extent(), simulation.positions
+    lower, upper = (x.min(axis=0), x.max(axis=0)) if ends is None else ends
     dimension = simulation.dimension
     cell = scene.discretisation.spacing * FINENESS[dimension]
     table = _table(scene, settings)
@@ -99,10 +100,3 @@ def _view(
     camera = Perspective(table.position, table.look_at, up, table.field_of_view, resolution=resolution)
     extinction = CLEARNESS / float(np.max(upper - lower)) if table.extinction is None else table.extinction
     return Volume(camera, extinction_factor * extinction, **options)
-
-
-def _extent(simulation: Pictured) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (d,) of the container, or of the fluid's first positions [m]."""
-    ends = simulation.scene.container.extent()
-    x = simulation.positions
-    return (x.min(axis=0), x.max(axis=0)) if ends is None else ends

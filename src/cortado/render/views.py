@@ -29,7 +29,7 @@ class View(Protocol):
 
     @property
     def extinction(self) -> float:
-        """Of filled fluid [1 / m]."""
+        """The extinction of filled fluid [1 / m]."""
         ...
 
     @property

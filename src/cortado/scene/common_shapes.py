@@ -167,8 +167,8 @@ def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
 
 @lru_cache(maxsize=8)
 def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
-    """Of a mesh times a scale [m]; infinite where all are thicker than a reach [m]. Once, as it takes thousands of
-    points."""
+    """The thickness of the thinnest sheet of a mesh times a scale [m]; infinite where all are thicker than a reach [m].
+    Once, as it takes thousands of points."""
     return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 

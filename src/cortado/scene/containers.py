@@ -84,7 +84,7 @@ class Container(Table):
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
-        """The same as one object."""
+        """The container's room and its periods as one object."""
         return Domain.of(*self.periods(dimension))
 
 

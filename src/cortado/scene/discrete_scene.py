@@ -82,7 +82,7 @@ class Walls:
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
+    """The wall particles of a scene. Raises `InputError` for a solid that no fluid can touch."""
     container = _container(scene, layers, lattice)
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
@@ -99,7 +99,7 @@ def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Contai
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of them that solids at rest leave."""
+    """The wall particles of the container that solids at rest leave."""
     from scipy.spatial import cKDTree
 
     points, dimension = container.points.some(container.stay), scene.dimension
@@ -125,7 +125,8 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of all solids at rest and of the container near them, of what fluid can touch of them together."""
+    """The wall particles of all solids at rest and of the container near them, of what fluid can touch of them
+    together."""
     room, (lower, _) = container.room, scene.container.periods(scene.dimension)
     resting = [solid for solid in scene.solid if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -146,7 +147,8 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period.
+    """The wall particles of one solid that moves, as if nothing else were there, but for its own images where it fills
+    a period.
 
     They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
     how it is turned.

@@ -96,11 +96,11 @@ class EmitterTable(FluidBody):
         return self.flow_rate / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """Of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
+        """The area of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Of the opening [m2], in 2-D its width [m]."""
+        """The area of the opening [m2], in 2-D its width [m]."""
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
 
     def opening(self, spacing: float) -> Points:

@@ -124,7 +124,7 @@ class Surroundings:
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """That which is nearer to one body than to others, and no further from it than half a period."""
+        """The air that is nearer to one body than to others, and no further from it than half a period."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)

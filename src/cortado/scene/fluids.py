@@ -81,7 +81,7 @@ class Fluid(FluidBody):
         return found + np.cross(self.angular_velocity, arms)
 
     def greatest_speed(self, spacing: float) -> float:
-        """Of its particles at the start, or somewhat more [m/s]."""
+        """The greatest speed of its particles at the start, or somewhat more [m/s]."""
         spin = np.linalg.norm(self.angular_velocity or 0.0)
         lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
@@ -134,8 +134,8 @@ class RegionFluid(Fluid):
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it, one for
-        each cell of the spacing's volume, with whole layers between faces that are flat."""
+        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it. There is
+        one for each cell of the spacing's volume, with whole layers between faces that are flat."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
@@ -324,7 +324,7 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """The same body of fluid; one that has a rotation where it can do without, as one that is packed."""
+    """This body of fluid; with a rotation where it can do without, as one that is packed."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

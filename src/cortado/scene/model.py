@@ -133,7 +133,8 @@ AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(di
 
 
 def greatest_viscosity(phase: Any, viscosity: float) -> float:
-    """Of a phase [Pa s], for what its key viscosity, or a parameter in its place, says [Pa s]."""
+    """The greatest viscosity of a phase [Pa s], for what its key viscosity, or a parameter in its place, says [Pa
+    s]."""
     return viscosity if phase.rheology is None else float(phase.rheology.thickest(viscosity))
 
 

@@ -118,7 +118,7 @@ class _Schedule(Table):
 
     @property
     def courses(self) -> dict[str, Course]:
-        """Those that are given, by the names of their parameters."""
+        """The courses that are given, by the names of their parameters."""
         found = {name: getattr(self, name) for name in _COURSES}
         return {name: course for name, course in found.items() if course is not None}
 
@@ -250,7 +250,9 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
     unturned = np.zeros(_shape_of(2 * len(middle) - 3))
     when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
-    place, turn, rate = {"change": _spacings}, {"change": _constant(RADIAN)}, {"change": _constant(1.0)}
+    place = {"change": lambda source, value: np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)}
+    turn, rate = {"change": _constant(RADIAN)}, {"change": _constant(1.0)}
+    size = {"role": Role.STATE, "range": Range.POSITIVE, "change": lambda source, value: STRETCH * np.abs(value)}
     steps: dict[str, Any] = {"axis": Axis.STEP, "moment": 1.0, "grows": True}
 
     def made(of: Callable[[str], str], unit: str, meaning: str, value: Any, **more: Any) -> Parameter:
@@ -267,7 +269,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     return [
         made(position_name, "m", f"where the middle of the solid {name} is at the start", middle, **place),
         made(rotation_name, "rad", f"how the solid {name} is turned about its middle at the start", rotation, **turn),
-        made(scale_name, "", stretched, 1.0, role=Role.STATE, range=Range.POSITIVE, change=_stretch),
+        made(scale_name, "", stretched, 1.0, **size),
         made(displacement_name, "m", displaced, still, **steps, **place, course=shifts),
         made(turn_name, "rad", turned, unturned, **steps, **turn, course=turns),
         made(
@@ -276,14 +278,6 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
         made(angular_velocity_name, "rad/s", f"how fast the solid {name} turns about its middle{when}", spin, **rate),
         made(density_name, "kg/m³", heavy, solid.density or 0.0, range=Range.POSITIVE),
     ]
-
-
-def _spacings(source: Source, value: NDArray) -> NDArray[np.float64]:
-    return np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)
-
-
-def _stretch(source: Source, value: NDArray) -> NDArray[np.float64]:
-    return np.asarray(STRETCH * np.abs(value))
 
 
 def _constant(size: float) -> Callable[[Source, NDArray], NDArray[np.float64]]:

@@ -74,7 +74,7 @@ class PackageMaker:
 
     @cached_property
     def parameters(self) -> Any:
-        """Those of the part, whose functions are guarded."""
+        """The parameters of the part, whose functions are guarded."""
         found = self.__getattr__("parameters")
         return [self._judged(one) for one in found] if isinstance(found, (list, tuple)) else found
 
@@ -169,7 +169,7 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
 
 
 def _package_of(entry: EntryPoint) -> str:
-    """As sentences call it."""
+    """What sentences call a package."""
     return f"the package {entry.dist.name}" if entry.dist is not None else f"the package of {entry.value}"
 
 
@@ -220,7 +220,7 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
-    """Those that have names, and ``**others`` if it takes them; None where Python cannot tell."""
+    """The arguments of a function that have names, and ``**others`` if it takes them; None where Python cannot tell."""
     for evaluated in (True, False):
         try:
             found = signature(factory, eval_str=evaluated).parameters

@@ -29,7 +29,7 @@ class Quantity:
     kind: Kind = Kind.NUMBER
 
     def shape(self, particles: int, dimension: int) -> tuple[int, ...]:
-        """Of its values."""
+        """The shape of its values."""
         is_vector = self.kind is Kind.VECTOR or (self.kind is Kind.TURNING and dimension == 3)
         return (particles, dimension) if is_vector else (particles,)
 
@@ -61,17 +61,19 @@ LOAD = ".load"
 
 
 def load_name(solid: str) -> str:
-    """Of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the other."""
+    """The name of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the
+    other."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """Whether it is the name of a load; whether there is such a solid, those say who compute it."""
+    """Whether a name is that of a load; who computes it says whether there is such a solid."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """As `check_quantity`, with the ``fields`` of a state and the loads on solids as further names."""
+    """A name of a quantity, of one of the ``fields`` of a state, or of a load on a solid; raises `InputError` for any
+    other."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 

@@ -36,7 +36,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class RecordedClock(Clock):
-    """That of the first state of a run whose time steps were chosen, and recorded."""
+    """The clock of the first state of a run whose time steps were chosen, and recorded."""
 
     recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
     """(steps + 1,) when each state was [s]; the states that the run did not come to have no meaning."""
@@ -48,7 +48,7 @@ class RecordedClock(Clock):
         return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
 
     def after(self, steps: int, time_step: float) -> Clock:
-        """As `Clock.after`."""
+        """The clock of the state so many steps later."""
         if steps == 0:
             return Clock(self.steps, self.time, self.time_step)
         return Clock(self.steps + steps, float(self.recorded[steps]), float(self.sizes[steps - 1]))
@@ -56,8 +56,8 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """Of which particles a state is: what is the same in every run that goes on from it. Forces, walls and the length
-    of a step may be others there, as they may change within a run."""
+    """The particles that a state is of: what is the same in every run that goes on from it. Forces, walls and the
+    length of a step may be others there, as they may change within a run."""
 
     spacing: float
     """[m]"""
@@ -107,7 +107,7 @@ class RestartState(ShortRepr):
         return self.fields[name]
 
     def fixed(self) -> "RestartState":
-        """The same in arrays of its own, which nobody can change."""
+        """This state in arrays of its own, which nobody can change."""
         own = {name: np.array(value) for name, value in self.fields.items()}
         for array in own.values():
             array.setflags(write=False)

@@ -55,7 +55,7 @@ class Scene(SceneTables):
         return self
 
     def replaced(self, *overrides: str) -> "Scene":
-        """The same scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
+        """This scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
         The overrides are those of `load_scene`; a file that one names is looked for in the current folder. Raises
         `SceneError` as `load_scene` does.
@@ -63,11 +63,11 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """The same scene with an emitter that has in reserve what a run for a time [s], or of so many ``steps``, takes.
+        """This scene with an emitter that has in reserve what a run for a time [s], or of so many ``steps``, takes.
 
-        It is the scene as it is where that has no emitter, or one with a duration, where the column suffices, and where
-        fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more particles
-        than memory holds.
+        It is the scene as it is where that has no emitter, or one with a duration, and where the column suffices. So it
+        is where fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more
+        particles than memory holds.
         """
         emitter, spacing = self.emitter, self.discretisation.spacing
         lengths = self.container.periods(self.dimension)[1]
@@ -84,7 +84,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """The same scene with an emitter that has as many particles as the run that a state is of."""
+        """This scene with an emitter that has as many particles as the run that a state is of."""
         emitter, origin, spacing = self.emitter, state.origin, self.discretisation.spacing
         if emitter is None or origin is None or emitter.duration is not None:
             return self

@@ -28,7 +28,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Those of some fields of a table that are there, with other values than their defaults."""
+    """The names, among some, of the fields of a table that are there with other values than their defaults."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -207,8 +207,8 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
 """In spacings: how thick walls are at least that hold fluid, where they have one layer of particles, and two as fluid
-sees further than two spacings. With either solver, and steps however short, water 25 to 120 spacings deep, at rest, on
-a shelf or in a cup, went through those of 0.75, in space 1.0, and of 1.0 to 1.25, within 10 to 90 steps."""
+sees further than two spacings. Water 25 to 120 spacings deep, at rest, on a shelf or in a cup, went through those of
+0.75, in space 1.0, and of 1.0 to 1.25. It did so within 10 to 90 steps, with either solver and steps however short."""
 DEPTHS = np.arange(1, 9) / 8.0
 """Of that thickness: beneath the surface there is to be no room for fluid so deep."""
 MARGIN = 1e-3

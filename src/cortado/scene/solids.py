@@ -121,8 +121,8 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets are all thicker than a
-        few spacings [m]."""
+        """The thickness of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets are all
+        thicker than a few spacings [m]."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
         """This table, at a path, as it is in a container, which shapes without an end need to know."""
@@ -139,7 +139,7 @@ class SolidTable(Coloured):
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """The same about its middle, not turned."""
+        """Where fluid may not be, about the middle of the solid, which is not turned."""
         shape = self.shape_about()[0]
         return Hollow(shape) if self.side == "inside" else shape
 

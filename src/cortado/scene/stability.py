@@ -23,11 +23,11 @@ def greatest_fall(scene: SceneTables, gravity: Points) -> float:
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """What gravity (k, d) [m/s2] gives at most to fluid that falls to the foot of a solid from where fluid, or a free
-    body, is highest at the start or comes out, per mass [J/kg], with ``values`` of parameters that replace the scene's.
-    That of the `greatest_fall` where something else raises fluid or takes the solid down: where gravity changes or goes
-    around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What values say of each step
-    of a path is not looked at."""
+    """What gravity (k, d) [m/s2] gives at most to fluid that falls to the foot of a solid, per mass [J/kg]. It falls
+    from where fluid, or a free body, is highest at the start or comes out; ``values`` of parameters replace the
+    scene's. That of the `greatest_fall` where something else raises fluid or takes the solid down: where gravity
+    changes or goes around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What values
+    say of each step of a path is not looked at."""
     whole = greatest_fall(scene, gravity)
     around = scene.container.periods(scene.dimension)[1] > 0.0
     stirred = greatest_speed(told(scene.solid), values) > 0.0 or any(one.surface_velocity for one in scene.solid)
@@ -89,8 +89,8 @@ DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
 """By the kernel, C in the limit C s^(3/2) / (H sqrt(g)) of fluid that rests H deep with a support of 2 spacings s.
 
 The bottom is compressed until pressure has come down to it, by more the deeper it is. Water at rest, 20 to 80 spacings
-deep in the plane and up to 32 in space, held at the limit and was lost at 1.1 to 1.4 times it, with 5 to 200 pressure
-iterations a step; only 5 of them were too few at 20 spacings.
+deep in the plane and up to 32 in space, held at the limit and was lost at 1.1 to 1.4 times it. It took 5 to 200
+pressure iterations a step; only 5 of them were too few at 20 spacings.
 """
 
 
@@ -140,8 +140,7 @@ def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[
 
 
 def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
-    """Those of the `stability_limits` that a time step is beyond, the smallest first: what each is of, and the limit
-    [s]."""
+    """The `stability_limits` that a time step is beyond, the smallest first: what each is of, and the limit [s]."""
     limits = sorted(stability_limits(scene, values).items(), key=lambda item: item[1])
     return [(name, limit) for name, limit in limits if time_step > limit * (1.0 + 1e-9)]
 
@@ -165,8 +164,10 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
     outlet.
-    Solids: beside each of them fluid goes no further than 0.4 spacings in a step, nor than a quarter of its thickness,
-    with the speed of a fall to its foot from where fluid is highest at the start, see `cortado.scene.stability`.
+
+    Solids: beside each of them fluid goes no further than 0.4 spacings in a step, nor than a quarter of its thickness.
+    Its speed is that of a fall to the foot of the solid from where fluid is highest at the start, see `fall_to`.
+
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a part of 2 rho / (mu l), the longest explicit step that a
     lattice bears, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`; of the most viscous
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
@@ -192,8 +193,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
-    """Those of the `stability_limits` [s] that do not depend on how fast the fluid is, with the speed of some of its
-    solids."""
+    """The `stability_limits` [s] that do not depend on how fast the fluid is, with the speed of some of its solids."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
@@ -202,7 +202,7 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
 
 
 def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
-    """Those of the `stability_limits` (k,) [s] that gravity (k, d) [m/s2] sets, each of its rows for itself."""
+    """The `stability_limits` (k,) [s] that gravity (k, d) [m/s2] sets, each of its rows for itself."""
     strength = np.linalg.norm(gravity, axis=1)
     with np.errstate(divide="ignore"):
         force = 0.25 * np.sqrt(scene.discretisation.support_radius / strength)

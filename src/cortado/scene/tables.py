@@ -33,7 +33,7 @@ def field_docstrings(cls: type) -> dict[str, str]:
 
 @cache
 def _of_module(name: str) -> dict[str, dict[str, str]]:
-    """Those of all classes of a module that are in no other class or function."""
+    """The docstrings of all classes of a module that are in no other class or function."""
     try:
         source = inspect.getsource(modules[name])
     except (KeyError, OSError, TypeError):
@@ -286,7 +286,8 @@ class Table(BaseModel):
         return self.model_copy(update=filled)
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Those fields of these names that are there and given have as many components as there are dimensions."""
+        """Raises a `field_error` for a field of these names whose components are not as many as there are
+        dimensions."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:

@@ -58,7 +58,7 @@ def read_toml(
 
 
 def overrides_of(overrides: Sequence[str], tables: Sequence[str]) -> list[str]:
-    """Those of some overrides that replace something in tables."""
+    """The overrides, among some, that replace something in tables."""
     return [one for one in overrides if isinstance(one, str) and _table_of(one) in tables]
 
 
@@ -165,7 +165,7 @@ def _entries(tables: list[Any]) -> str:
 
 
 def _names(tables: list[Any]) -> list[str]:
-    """Of the entries that have one: their names, or the kinds of forces that have no other name."""
+    """The names of entries that have one, or the kinds of forces that have no other name."""
     found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
     return [str(name) for name in found if name is not None]
 

@@ -123,8 +123,8 @@ def _forces(
 
 
 def _check_force(force: Force, maker: Any) -> None:
-    """Raises `InputError` for what a maker made that lacks something of a `Force`, for a force that has methods of a
-    part and is none, as no step would call them, and for a part that would leave its fields unwritten."""
+    """Raises `InputError` for what a maker made that lacks something of a `Force`, and for a part that would leave its
+    fields unwritten. So it does for a force that has methods of a part and is none, as no step would call them."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
         made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"

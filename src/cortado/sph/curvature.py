@@ -3,15 +3,15 @@
 J is that of flat surfaces: a lattice is cut across an axis and across a diagonal of a plane. In a layer all particles
 are alike, so that the sums of a few layers are all that it takes.
 
-What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a
-spacing apart (in spacings, for every kernel with a support of 2.5 spacings or more within 0.05): the curvature is found
-`DEEP` below the surface, where it is greater, and w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds
+What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a spacing
+apart. It is in spacings, for every kernel with a support of 2.5 spacings or more within 0.05. The curvature is found
+`DEEP` below the surface, where it is greater. And w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds
 a particle is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of curvatures in
 the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a wave of the
 surface moves less: the square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
 ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the curvature makes.
-So ACTS d / (3 (d - 1)) is taken off: pressure and squared frequency of the mode 2 then err by as much, one to this side
-and one to that, by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
+So ACTS d / (3 (d - 1)) is taken off. Pressure and squared frequency of the mode 2 then err by as much, one to this side
+and one to that: by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
 
 Functions of Warp for these sums, and for what follows from them, are here too.
 """

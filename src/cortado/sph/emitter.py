@@ -1,7 +1,7 @@
 """Fluid that comes out of a nozzle: particles are prescribed until they pass its opening, and then are free.
 
-A particle that starts u upstream of the opening, o beside the axis, is prescribed in step n = 0, 1, ..., while it is
-s = u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
+A particle starts u upstream of the opening, o beside the axis. It is prescribed in step n = 0, 1, ..., while it is s =
+u - l > 0 upstream, where l grows by w dt in each step, w = Q / A:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 

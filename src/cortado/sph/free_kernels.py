@@ -1,14 +1,14 @@
 """The rotation and the motion of free rigid bodies.
 
 A body's rotation is R = Q R(w_0) for the rotation w_0 that it began with. A state has how far the ends of the three
-unit axes of its frame have moved since, the columns of Q - I, of which derivatives are taken by the vector w' of a
+unit axes of its frame have moved since, the columns of Q - I. Derivatives of these are taken by the vector w' of a
 further turn: columns q change by w' x q, and an adjoint t of w' is one of columns, t x q / 2.
 
-In a step, whose kernels have a thread for each scene, a body with the density rho is at c, turned by R, and has the
+A step has kernels with a thread for each scene. In it a body with the density rho is at c, turned by R. It has the
 velocities V and W and the angular momentum L = rho R I R^T W, for its inertia I at a density of 1; volumes are in those
 of a particle. A step begins by where it would go, c' = c + dt V and R' = R(dt W) R, where its walls are. What fluid,
-gravity and contact give it leads to V_1 and L_1, and it ends at c + dt V_1, turned by R(dt W_1) R, with W_1 = R' I^-1
-R'^T L_1 / rho, and turns with the angular velocity that L_1 gives it there, so that both momenta are kept.
+gravity and contact give it leads to V_1 and L_1. It ends at c + dt V_1, turned by R(dt W_1) R, with W_1 = R' I^-1 R'^T
+L_1 / rho. It turns with the angular velocity that L_1 gives it there, so that both momenta are kept.
 """
 
 from dataclasses import dataclass

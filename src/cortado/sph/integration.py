@@ -65,8 +65,8 @@ def prediction_share(precision: Precision) -> Any:
 
 @cache
 def new_state_adjoint(precision: Precision) -> Any:
-    """The Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of v',
-    and to that of the time step, to which they add."""
+    """The Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of v'.
+    It adds to that of the time step, too."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
 

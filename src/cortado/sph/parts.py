@@ -44,9 +44,9 @@ from cortado.sph.integration import OrderKernels, order_kernels
 @dataclass(frozen=True)
 class StepContext:
     """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
-    lies around each particle), ``order`` (sorted -> scene), ``step`` (members,), the number of the step,
-    ``particles``, how many a scene has: particle i belongs to scene i // particles of a batch; and ``cell``, the volume
-    of a particle [m^d]."""
+    lies around each particle) and ``order`` (sorted -> scene). They find ``step`` (members,), the number of the step,
+    and ``cell``, the volume of a particle [m^d]. A scene has so many ``particles``: particle i belongs to scene i //
+    particles of a batch."""
 
     launcher: KernelLauncher
     particles: int
@@ -232,8 +232,8 @@ class Part:
         return moved
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the part's fields of ``state``, that at the end of the step, and, if it has a `target` of its own, all
-        positions and velocities of ``moved``, from those that it finds in its target."""
+        """Write the part's fields of ``state``, that at the end of the step. If it has a `target` of its own, write all
+        positions and velocities of ``moved`` from those that it finds in its target."""
 
     def new_tangent(self) -> PartTangent:
         """Forward mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""

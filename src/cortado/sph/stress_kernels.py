@@ -5,7 +5,7 @@ With s_ij = -V a_ij of grad W = a x, so that s_ij is not negative, the sums of p
     M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j,
 
 of which A M^-1 is the velocity gradient, corrected so that it is exact where velocities are linear (Bonet and Lok
-1999), and also the one that fits the velocities of the neighbours best, with weights s_ij. What it leaves of them,
+1999). It is also the one that fits the velocities of the neighbours best, with weights s_ij. What it leaves of them,
 v_ij - G_i x_ij, is damped (Ganzenmueller 2015 damps it against modes that the gradient does not see):
 
     m_i a_i = -sum_j s_ij ((T_i + T_j) x_ij + C (mu_i + mu_j) v_ij),   T_i = 2 mu_i D_i M_i^-1 - C mu_i G_i.
@@ -13,8 +13,8 @@ v_ij - G_i x_ij, is damped (Ganzenmueller 2015 damps it against modes that the g
 That is minus half the derivative by v_i of what is dissipated, sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i
 x_ij|^2), as the weighted sum of the remainders times x_ij is 0. So energy is never made; both parts are 0 where a body
 turns as a whole, whatever the order of its particles, so that linear and angular momentum are kept. On a lattice a
-shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...), with the moments m_2 and m_4
-of s_ij along k: C = 4 / (3 m_2) takes the second term out, in every direction and for every kernel.
+shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). With the moments m_2 and m_4
+of s_ij along k, C = 4 / (3 m_2) takes the second term out, in every direction and for every kernel.
 
 mu_i is the harmonic mean of the viscosities between i and its neighbours (`cortado.sph.stress_functions`): it keeps the
 shear stress the same on both sides of a layer.

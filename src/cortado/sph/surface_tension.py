@@ -1,8 +1,8 @@
 """Surface tension: by curvature (`cortado.sph.curvature_kernels`), and with PCISPH as a force of pairs
 (`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
-Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis,
-and Gamma is the tension of that surface without it, times `RELAXED`.
+Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis.
+Gamma is the tension of that surface without it, times `RELAXED`.
 
 Forces of pairs are opposite, so that momentum is kept; as they are not along the pair, angular momentum is so only
 nearly. They are the gradient of no energy either, and that by curvature is not: a fluid that has hardly any viscosity

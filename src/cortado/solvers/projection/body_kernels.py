@@ -11,8 +11,8 @@ is the transpose of what its velocity adds to the divergence, - gamma_i . (V + W
 (V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off.
 
 The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho
-K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1, divided by which
-the body's part of the matrix has no eigenvalue beyond 2.
+K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1. Divided by it the
+body's part of the matrix has no eigenvalue beyond 2.
 """
 
 from dataclasses import dataclass

@@ -2,9 +2,9 @@
 
 An iteration of `cortado.solvers.projection.pressure` hands a pressure on by a spacing or two. Before each of them but
 the first, which has the pressure of the step before, the smooth part of what is missing is found at once, on a grid
-with nodes two spacings apart (Takahashi and Lin 2016 have a multilevel particle solver;
-`cortado.solvers.projection.coarse_pressure` has the equations of this one). Before the first as well it would cost
-twice as much and gain a tenth at most, but in a cold scene, which has no pressure of the step before.
+with nodes two spacings apart. Takahashi and Lin 2016 have a multilevel particle solver;
+`cortado.solvers.projection.coarse_pressure` has the equations of this one. Before the first as well it would cost twice
+as much and gain a tenth at most, but in a cold scene, which has no pressure of the step before.
 """
 
 from collections.abc import Callable
@@ -232,8 +232,8 @@ class CoarseAdjoint:
         u_bar: wp.array,
     ) -> None:
         """Before iteration k, from the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, and ``u_bar``, to
-        those of k and y of the one before, ``at``, and to d_bar and S there, from which u before has what it has not
-        from u_bar."""
+        those of k and y of the one before, ``at``. It adds to d_bar and S there, too, from which u before has what it
+        has not from u_bar."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])

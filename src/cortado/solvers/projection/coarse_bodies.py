@@ -1,9 +1,9 @@
 """Free bodies on the coarse grid of the pressure, so that a light body gives way from the first step on.
 
 Pressure impulses y give a body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i
-(`cortado.solvers.projection.body_kernels`), so the velocities V = F / (rho K) and W = R' I^-1 R'^T T / rho, which take
-(G y)_i = gamma_i . (V + W x r_i) from the divergence of particle i. G is symmetric and not negative: y . G y is twice
-the kinetic energy that y gives to bodies at rest. On the grid it adds
+(`cortado.solvers.projection.body_kernels`). So they give it the velocities V = F / (rho K) and W = R' I^-1 R'^T T /
+rho, which take (G y)_i = gamma_i . (V + W x r_i) from the divergence of particle i. G is symmetric and not negative: y
+. G y is twice the kinetic energy that y gives to bodies at rest. On the grid it adds
 
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 

@@ -1,9 +1,9 @@
 """What a particle's neighbourhood lets the projection do, from the moments of its neighbours.
 
-With the moments M, Q and g of `cortado.solvers.projection.sums`, gamma and nu of `cortado.solvers.projection.walls`,
-the fullness H of `cortado.sph.moment_functions`, S(a, b) a smoothstep of H from a to b, and B = 1 / (1 +
-((nu + 9 q nu_m) / 0.05)^4), which is 0 beside walls, with nu_m of those that mirror and q, which is 0 beside others
-(`cortado.solvers.projection.images`):
+M, Q and g are the moments of `cortado.solvers.projection.sums`, gamma and nu those of
+`cortado.solvers.projection.walls`, and H is the fullness of `cortado.sph.moment_functions`. S(a, b) is a smoothstep of
+H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is 0 beside walls, with nu_m of those that mirror and q, which
+is 0 beside others (`cortado.solvers.projection.images`). The projection takes:
 
     sigma = S(0.1, 0.5) B    how much tension is let through, 1 where a scene is shut (see `pressure`),
     f = S(0.1, 0.5) of H + nu   how full it is: how much of the last step's pressure is taken on,

@@ -1,8 +1,8 @@
 """The mean normal stress of the projection's pressures about a particle, which is the pressure that a gauge reads.
 
-Particle j pushes i with the force -V (T_i + T_j) g_ij and wall particle b with -V k_i b_ib, where T = k L, and b_ib is
-what b adds to gamma_i, all times 1 / dt. The momentum that these forces carry is spread evenly from particle to
-particle, and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
+Particle j pushes i with the force -V (T_i + T_j) g_ij / dt, where T = k L, and wall particle b with -V k_i b_ib / dt,
+where b_ib is what b adds to gamma_i. The momentum that these forces carry is spread evenly from particle to particle,
+and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
 
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 

@@ -2,8 +2,8 @@
 delta, and velocities that follow both.
 
 Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
-2013), and pairs that are nearer than 0.65 s are moved apart, wherever they are, at a rate that follows the velocity
-gradient and the tension, so that a fluid at rest is not stirred:
+2013). Pairs that are nearer than 0.65 s are moved apart, wherever they are. The rate follows the velocity gradient and
+the tension, so that a fluid at rest is not stirred:
 
     delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,

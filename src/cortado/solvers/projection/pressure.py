@@ -20,9 +20,9 @@ A step begins with the pressure of the step before: k is f times as large as it 
 the kick w = -D^T k / m that it gave.
 
 Not so for a particle that its kick would take towards a wall, gamma . w > 0, by more than a tenth of a spacing in the
-step. Between walls that are nearer to one another than a spacing it has come from one to the other, and what held it
-off the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure;
-of that choice there is no derivative.
+step. Between walls that are nearer to one another than a spacing it has come from one to the other. What held it off
+the first would throw it at the second, harder in each step. Such a particle begins with v* and without a pressure; of
+that choice there is no derivative.
 
 In a shut scene, where every particle has a share c of the coarse pressure, tension is let through beside walls too,
 sigma = 1: fluid that fills a container cannot leave its walls. Of that choice there is no derivative either.

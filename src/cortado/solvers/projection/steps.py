@@ -37,10 +37,10 @@ IMPULSE = "pressure_impulse"
 KICK = "pressure_kick"
 """The name of -D^T k / m, which a step's pressures added to velocities, in a state."""
 MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
-"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983) from t = 5 and not
-from 1, as the first k is that of the step before. Later ones, which begin with a coarse correction, have none: with it,
-many of them would not come to rest. From step to step errors shrink where iterations leave between -1/3 and 1 of them:
-two of them do up to 1.6 times the stiffest wave of the lattice."""
+"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983). It is from t = 5 and
+not from 1, as the first k is that of the step before. Later ones, which begin with a coarse correction, have none: with
+it, many of them would not come to rest. From step to step errors shrink where iterations leave between -1/3 and 1 of
+them: two of them do up to 1.6 times the stiffest wave of the lattice."""
 
 
 @dataclass(frozen=True)

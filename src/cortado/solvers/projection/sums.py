@@ -22,9 +22,10 @@ APART = 0.65
 """In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come as
 seldom to half a spacing; energy rises more with 0.7, 0.03 in place of 0.02 % in a dam 12 deep, and with 0.8."""
 UNEQUAL = 2.0
-"""By how much more a lighter neighbour counts in the diagonal of the projection's matrix: an iteration goes too far
-where one light particle takes the pressures of many that are heavy (on the lattice 1.2 and 1.5 times as far at ratios
-of 100 and 1,000, 2.3 times for one light particle among heavy ones), and with this as far as among equals."""
+"""By how much more a lighter neighbour counts in the diagonal of the projection's matrix. Without it an iteration goes
+too far where one light particle takes the pressures of many that are heavy. On the lattice it goes 1.2 and 1.5 times as
+far at ratios of 100 and 1,000, 2.3 times for one light particle among heavy ones. With it, it goes as far as among
+equals."""
 
 
 @dataclass(frozen=True)
