@@ -61,14 +61,8 @@ BAD_STATES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "another field": (lambda s: {**s, "colour": s["time"]}, "state has .*colour.*, but must have positions"),
     "another shape": (lambda s: {**s, "positions": s["positions"][1:]}, r"state positions has shape \(63, 2\), but"),
     "transposed": (lambda s: {**s, "velocities": s["velocities"].T}, r"state velocities has shape \(2, 64\), but"),
-    "complex": (
-        lambda s: {**s, "positions": s["positions"] + 0j},
-        r"state positions is (an array|a tensor) of (torch\.)?complex128",
-    ),
-    "truth values": (
-        lambda s: {**s, "positions": s["positions"] > 0},
-        r"state positions is (an array|a tensor) of (torch\.)?bool",
-    ),
+    "complex": (lambda s: {**s, "positions": s["positions"] + 0j}, f"state positions is {ARRAY}complex128"),
+    "truth values": (lambda s: {**s, "positions": s["positions"] > 0}, f"state positions is {ARRAY}bool"),
     "text": (lambda s: {**s, "positions": "here"}, "state positions is 'here', but must be a number or an array"),
     "nothing": (lambda s: {**s, "positions": None}, "state positions is None, but must be a number or an array"),
     "NaN": (lambda s: {**s, "positions": s["positions"] * np.nan}, "state positions has a value that is not finite"),

@@ -894,10 +894,6 @@ class Returning:
         return self.found
 
 
-def estimate_of(viscosity):
-    return Returning(Estimate(1.0, {"viscosity": viscosity}))
-
-
 def test_an_estimate_comes_in_float64():
     simulation = simulation_of("2-D")
     problem = Problem(simulation, 1, Mixed(simulation))

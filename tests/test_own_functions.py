@@ -22,11 +22,6 @@ STEPS = 5
 STRENGTH = 0.3
 
 
-@wp.func
-def bump(r: wp.float64):
-    return wp.exp(-r * r)
-
-
 def gust(x, v, t, k, centre, wind=(1.0, 0.5, -0.5)):
     """Everything that a function may have: numbers from outside, whole numbers, branches, loops, types of Warp."""
     away = x - centre

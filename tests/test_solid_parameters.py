@@ -34,7 +34,6 @@ BALL = {
     "velocity": [-0.3, 0.2],
     "slip": "free",
 }
-NOZZLE = {"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
 PCISPH = {"kind": "pcisph", "time_step": 0.001}
 STEPS = 5
 

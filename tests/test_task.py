@@ -200,45 +200,38 @@ def result(parameters, losses):
     return Result(found, min(losses), found, history, len(losses) - 1, len(losses), "done", converged=False)
 
 
-def test_what_is_reached_passes(task_file):
-    verdict = judge(load_task(task_file), result({"gravity": [1.5, -9.81]}, [1.0, 0.25]))
-    assert (verdict.reduction, verdict.errors, verdict.failures) == (4.0, {"gravity": 0.0}, [])
+TRUE, OFF = [1.5, -9.81], [3.0, 5.0]
+FELL = [4.0, 1.0]
+NOT_REACHED = [
+    "The loss fell 1.5 times, but the task asks for 2 times.",
+    "The parameter gravity is 20% off, but the task asks for 10%.",
+]
+JUDGED = {
+    "reached": ([], TRUE, [1.0, 0.25], 0.0, 4.0, []),
+    "not reached": (
+        ["problem.target.gravity=[3,4]", "optimise.check.parameter_error=0.1"],
+        *(OFF, [3.0, 4.0, 2.0], 0.2, 1.5, NOT_REACHED),
+    ),
+    "no loss": ([], TRUE, [0.0], 0.0, math.inf, []),
+    "no loss any more": ([], TRUE, [1.0, 0.0], 0.0, math.inf, []),
+    "distance from a hidden zero": (["problem.target.gravity=[0,0]"], [0.3, 0.4], FELL, 0.5, 4.0, None),
+    "target over time": ([f"problem.target.gravity={[[3.0, 4.0]] * 5}"], OFF, FELL, 0.2, 4.0, []),
+    "found over time": (["problem.target.gravity=[3,4]"], [OFF] * 5, FELL, 0.2, 4.0, []),
+    "a target that is not optimised": (["problem.target.viscosity=0.1"], TRUE, FELL, 0.0, 4.0, []),
+}
 
 
-def test_what_is_not_reached_is_said(task_file):
-    task = load_task(task_file, ["problem.target.gravity=[3,4]", "optimise.check.parameter_error=0.1"])
-    verdict = judge(task, result({"gravity": [3.0, 5.0]}, [3.0, 4.0, 2.0]))
-    assert verdict.errors == {"gravity": pytest.approx(0.2)}
-    assert verdict.failures == [
-        "The loss fell 1.5 times, but the task asks for 2 times.",
-        "The parameter gravity is 20% off, but the task asks for 10%.",
-    ]
-
-
-@pytest.mark.parametrize("losses", [[0.0], [1.0, 0.0]])
-def test_a_loss_of_zero_cannot_be_lowered(task_file, losses):
-    verdict = judge(load_task(task_file), result({"gravity": [1.5, -9.81]}, losses))
-    assert verdict.reduction == math.inf and verdict.failures == []
+@pytest.mark.parametrize(
+    ("overrides", "found", "losses", "error", "reduction", "failures"), JUDGED.values(), ids=JUDGED
+)
+def test_a_result_is_judged_as_its_task_asks(task_file, overrides, found, losses, error, reduction, failures):
+    task = load_task(task_file, overrides)
+    verdict = judge(task, result({"gravity": found}, losses))
+    assert verdict.errors == {"gravity": pytest.approx(error)} and verdict.reduction == reduction
+    assert failures is None or verdict.failures == failures
     assert verdict.first == losses[0]
-
-
-def test_next_to_a_hidden_zero_the_distance_counts(task_file):
-    task = load_task(task_file, ["problem.target.gravity=[0,0]"])
-    assert judge(task, result({"gravity": [0.3, 0.4]}, [4.0, 1.0])).errors == {"gravity": pytest.approx(0.5)}
-
-
-@pytest.mark.parametrize("over_time", ["target", "found"])
-def test_constant_gravity_is_compared_with_gravity_over_time(task_file, over_time):
-    target, found = np.array([3.0, 4.0]), np.array([3.0, 5.0])
-    table = np.tile(target, (5, 1)).tolist() if over_time == "target" else target.tolist()
-    task = load_task(task_file, [f"problem.target.gravity={table}"])
-    guess = np.tile(found, (5, 1)) if over_time == "found" else found
-    assert judge(task, result({"gravity": guess}, [4.0, 1.0])).errors == {"gravity": pytest.approx(0.2)}
-
-
-def test_a_target_that_is_not_optimised_is_not_judged(task_file):
-    task = load_task(task_file, ["problem.target.viscosity=0.1"])
-    assert judge(task, result({"gravity": [1.5, -9.81]}, [4.0, 1.0])).errors == {"gravity": 0.0}
+    coordinates = judge(task, result({"gravity": [9.0, 9.0]}, losses), {"gravity": np.array(found)})
+    assert coordinates.errors == verdict.errors, "what is found is judged, not its coordinates"
 
 
 def test_an_image_is_judged_by_its_noise(task_file):
@@ -249,11 +242,6 @@ def test_an_image_is_judged_by_its_noise(task_file):
     assert judge(task, reached, noise=29.5).failures == [
         "The image is matched to 29.5 dB, but the task asks for 30 dB."
     ]
-
-
-def test_what_is_found_is_judged_not_its_coordinates(task_file):
-    verdict = judge(load_task(task_file), result({"gravity": [9.0, 9.0]}, [4.0, 1.0]), {"gravity": [1.5, -9.81]})
-    assert verdict.errors == {"gravity": 0.0}
 
 
 @pytest.mark.parametrize("table", ["problem", "optimise"])
