@@ -5,13 +5,14 @@ change, fitted together with the parameters, with an error of its own by the sam
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
 from cortado.optimisation.fitting.certainty import Certainty, ScoreCovariance, hessian, inverse, noise_of, spread
+from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, weighted
 from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
@@ -207,13 +208,15 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighti
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        said = None if "rest_density" in values else explained(problem, at, weights, _by_density(problem, values), True)
+        said = None
+        if "rest_density" not in values:
+            said = explained(problem, at, weights, _by_change(problem, values, _by_density), True)
         if said and abs(said.sizes[0]) < 1.0:
             found.append(
                 f"A density {1.0 + said.sizes[0]:.3g} times as large would explain {said.share:.0%} of the squares of "
                 "the residuals: is rest_density right?"
             )
-        said = explained(problem, at, weights, _by_slip(problem, values), True)
+        said = explained(problem, at, weights, _by_change(problem, values, _by_slip), True)
         if said and said.sizes[0] > 0.0:
             found.append(
                 f"The other slip of the container would explain {said.share:.0%} of the squares of the residuals: is "
@@ -281,38 +284,35 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
     return found
 
 
-def _by_density(problem: LeastSquares, values: Arrays) -> list[np.ndarray]:
-    """By how much predictions change with the logarithm of all densities; 0 where that cannot be told."""
+def _by_change(
+    problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
+) -> list[np.ndarray]:
+    """By how much predictions change with something else in each experiment, which a function says with the runs and
+    the runs along a tangent that it took; 0 where that cannot be told."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
-        own, density = problem.values_of(k, values), experiment.simulation.parameters()["rest_density"]
         try:
-            _, slopes = experiment.linearised(own, [{"rest_density": density}])
+            runs, tangents, changed = change(experiment, problem.values_of(k, values))
         except (DivergedError, InputError):
             continue
-        problem.runs, problem.tangents = problem.runs + 1, problem.tangents + 1
+        problem.runs, problem.tangents = problem.runs + runs, problem.tangents + tangents
         for part, column in zip(problem.parts, columns, strict=True):
-            if part.experiment == k:
-                column[:] = np.where(np.isnan(part.observation.measured)[..., None], 0.0, slopes[part.name])
+            if part.experiment == k and changed:
+                column[..., 0] = np.where(np.isnan(part.observation.measured), 0.0, changed[part.name])
     return columns
 
 
-def _by_slip(problem: LeastSquares, values: Arrays) -> list[np.ndarray]:
-    """By how much predictions change with the other slip of the container; 0 where there is none."""
-    columns = _nothing(problem, 1)
-    for k, one in enumerate(problem.experiments):
-        slip = getattr(one.simulation.scene.container, "slip", None)
-        if slip is None:
-            continue
-        try:
-            simulation = one.simulation.replaced(f"container.slip={'no' if slip == 'free' else 'free'}")
-            own = problem.values_of(k, values)
-            changed, now = one.simulated_by(simulation).predicted(own), one.predicted(own)
-        except (DivergedError, InputError):
-            continue
-        problem.runs += 2
-        for part, column in zip(problem.parts, columns, strict=True):
-            if part.experiment == k:
-                column[..., 0] = np.nan_to_num(changed[part.name] - now[part.name])
-                column[np.isnan(part.observation.measured)] = 0.0
-    return columns
+def _by_density(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
+    """With the logarithm of all densities."""
+    _, slopes = experiment.linearised(values, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
+    return 1, 1, {name: slope[..., 0] for name, slope in slopes.items()}
+
+
+def _by_slip(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
+    """With the other slip of the container, if it has one."""
+    slip = getattr(experiment.simulation.scene.container, "slip", None)
+    if slip is None:
+        return 0, 0, {}
+    simulation = experiment.simulation.replaced(f"container.slip={'no' if slip == 'free' else 'free'}")
+    changed, now = experiment.simulated_by(simulation).predicted(values), experiment.predicted(values)
+    return 2, 0, {name: np.nan_to_num(changed[name] - now[name]) for name in now}

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from cortado.losses import FinalPositions, Snapshot
 from cortado.optimisation.fitting.observations import CLOCK, Again, Direction, Frames, Observation
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.rollout.rollout import Observer
 from cortado.runs.probes import warn_of_places
 from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.restart import RestartState
@@ -145,11 +145,8 @@ class Experiment:
         """Where the frames of each observation are, by its clock; what is before the run is as its first state."""
         found = {}
         for name, one in self.observations.items():
-            late = (
-                float(parameters.get(f"{name}.{CLOCK}", one.start[CLOCK]) - one.start[CLOCK])
-                if CLOCK in one.start
-                else 0.0
-            )
+            begun = one.start.get(CLOCK, 0.0)
+            late = float(parameters.get(f"{name}.{CLOCK}", begun) - begun) if CLOCK in one.start else 0.0
             times = np.maximum(one.times + late, 0.0)
             found[name] = Frames.of(times, self._time_step, int(np.ceil(times[-1] / self._time_step)))
         return found
@@ -182,14 +179,11 @@ class Experiment:
         """States by the number of steps before them, and along each of some directions their tangents, by fields."""
         wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
-        def observer(kept: dict[int, Arrays]) -> Observer:
-            def observe(step: int, dot: State) -> None:
-                if step in wanted:
-                    kept[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
+        def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:
+            if step in wanted:
+                kept[step] = {name: a.astype(np.float64) for name, a in dot.numpy(dimension).items()}
 
-            return observe
-
-        each = zip(moves, map(observer, dots), strict=True)
+        each = zip(moves, (partial(observe, kept) for kept in dots), strict=True)
         return problem.several_tangents(values, each, steps), iter(dots)
 
     def _read(

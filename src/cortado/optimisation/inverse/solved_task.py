@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from cortado.device.compiling import compile_meanwhile
-from cortado.discretise.shapes import Points
 from cortado.files.image_encoding import write_video
 from cortado.files.terminal import announce
 from cortado.losses import Snapshot
 from cortado.optimisation.inverse.task import Setup, Task
 from cortado.optimisation.optimise import Result
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.pictures.film import FilmedRun, Page, Panel, film, is_out, those
+from cortado.pictures.film import FilmedRun, Page, film, is_out, those
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import colours_of, painter, side_by_side
 from cortado.pictures.plots import images, loss_curve, panels, particles
@@ -213,14 +212,12 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
         runs["target"] = run(made.task.true_parameters)
     page = partial(_page, made, device=device)
     three = page(list(runs), list(runs.values()))
-    path = folder / "found.png"
-    write_picture(path, three.image(steps[-1]))
-    compared: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
+    write_picture(folder / "found.png", three.image(steps[-1]))
+    compared: Figures = [(f"The end of the run: {', '.join(runs)}.", folder / "found.png")]
     shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
     searched = page([f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
-    path = folder / "search.png"
-    write_picture(path, searched.image(steps[-1]))
-    search: Figures = [("The end of the run as the search went on.", path)]
+    write_picture(folder / "search.png", searched.image(steps[-1]))
+    search: Figures = [("The end of the run as the search went on.", folder / "search.png")]
     if picture.film_frames == 0 or len(steps) < 2:
         return TaskFigures(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
@@ -251,13 +248,8 @@ def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -
     places = [run[step].positions for run in runs for step in run]
     artist = painter(scene.model_copy(update={"picture": panel}), places, device)
 
-    def composed(images: list[Points]) -> Points:
-        return side_by_side(images, across, names)
-
-    def drawn(run: Run) -> Panel:
-        return FilmedRun(artist, partial(_state, made, run))
-
-    return Page([drawn(run) for run in runs], composed)
+    filmed = [FilmedRun(artist, partial(_state, made, run)) for run in runs]
+    return Page(filmed, partial(side_by_side, across=across, names=names))
 
 
 def _state(made: Setup, run: Run, step: int) -> State:
