@@ -1,9 +1,8 @@
 """The tables of a task, [problem] with what was measured, [optimise] and [fit], and the JSON schema of all files."""
 
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
@@ -33,7 +32,7 @@ from cortado.gradients import (
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.optimise import MOST_ITERATIONS
-from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
+from cortado.optimisation.optimisers import BY_NAME, Optimiser
 from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, components, count, field_error, quantity
 from cortado.scene.parameter_values import NAMES, UNITS
 from cortado.scene.scene import Scene
@@ -45,14 +44,8 @@ Pixel = Annotated[int, count(0, 100_000)]
 Seconds = Annotated[float, quantity("s")]
 Clock = tuple[Literal["start"], ...]
 _NUMBERS: list[Any] = [{"type": "number"}, {"type": "array"}]
-OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
-    "adam": Adam,
-    "gradient_descent": GradientDescent,
-    "lbfgs": lambda scale: LBFGS(scale=scale),
-    "line_search": LineSearch,
-}
-"""By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step, for the line
-search the longest one)."""
+WITH_A_SCALE = ("lbfgs", "line_search")
+"""Optimisers whose learning rate is the size of the first step, or the longest one."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
 ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
@@ -354,7 +347,7 @@ class OptimiseTable(Table):
     extinction_schedule: Schedule = (1.0,)
     """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
     with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
-    optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
+    optimiser: Annotated[str, OneOf(BY_NAME)] = "adam"
     """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """For Adam about the size of its steps, in units of the parameters; for L-BFGS the size of its first step, for the
@@ -376,9 +369,9 @@ class OptimiseTable(Table):
 
     def algorithm(self) -> Optimiser:
         """The optimiser as an object."""
-        made = OPTIMISERS[self.optimiser](self.learning_rate)
-        if isinstance(made, LBFGS) and self.tolerance is not None:
-            return replace(made, tolerance=self.tolerance)
+        setting = "scale" if self.optimiser in WITH_A_SCALE else "learning_rate"
+        given = {setting: self.learning_rate, "tolerance": self.tolerance}
+        made: Optimiser = BY_NAME[self.optimiser](**{key: one for key, one in given.items() if one is not None})
         return made
 
 

@@ -72,8 +72,8 @@ def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, pa
     """A state of Cortado's, the first one if left out, as a table of arrays."""
     layer = steps_layer(simulation, 1)
     with layer.turn:
-        found = layer.states.of(given, dict(_table("parameters", parameters)))
-        return part(bridge.made(named(STATE, found), layer), STATE)
+        first = simulation.on_device(given, parameters=dict(_table("parameters", parameters)))
+        return part(bridge.made(named(STATE, layer.states.arrays(first)), layer), STATE)
 
 
 def restart_state(

@@ -18,7 +18,7 @@ import warp as wp
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.fields import Entry
 from cortado.particles.state import State
-from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates, Given
+from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
 from cortado.scene.parameter_values import Arrays
@@ -280,10 +280,6 @@ class NamedStates:
             self._remember(state.arrays, tuple(scene.origin for scene in state.scenes if scene.origin))
         return found
 
-    def of(self, state: Given | DeviceState, parameters: Arrays) -> dict[str, Array]:
-        """The same of a state on the host, or of the first one of a run with these parameters."""
-        return self.arrays(self._simulation.on_device(state, parameters=parameters))
-
     def written(self, given: Named) -> State:
         """Fields, or derivatives with respect to them, as Cortado has them, 0 where they are left out."""
         state = self._simulation.solver.new_state()
@@ -419,10 +415,10 @@ class LayerParameters:
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
         """Derivatives with respect to values, of a batch with a first axis for the scenes, in their shapes; those on
         the device have them."""
-        shared = {name: _shared(bar, values[name].shape) for name, bar in found.items() if isinstance(bar, np.ndarray)}
+        shared = {}
+        for name, bar in found.items():
+            if isinstance(bar, np.ndarray):
+                shape = values[name].shape
+                is_shared = bar.size != int(np.prod(shape))  # by all scenes, over which it is added up
+                shared[name] = (bar.sum(axis=0) if is_shared else bar).reshape(shape)
         return named(PARAMETER, {**found, **shared})
-
-
-def _shared(bar: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A derivative with a first axis for the scenes, added up where the value is the same for all."""
-    return bar.reshape(shape) if bar.size == int(np.prod(shape)) else bar.sum(axis=0).reshape(shape)

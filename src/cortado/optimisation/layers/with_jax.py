@@ -122,7 +122,7 @@ def derivative(
 
 
 def _evaluated(arrays: Arrays, *, layer: Layer, names: Names, sizes: Sizes, keep: bool) -> list[Array]:
-    found, tickets = evaluate(layer, _entries(sizes), dict(zip(names, arrays, strict=True)), keep)
+    found, tickets = evaluate(layer, prod(sizes) if sizes else None, dict(zip(names, arrays, strict=True)), keep)
     own = [found[name] for name in layer.outputs()]
     return [*own, tickets] if keep else own
 
@@ -132,13 +132,8 @@ def _derived(way: Way, arrays: Arrays, *, layer: Layer, names: Names, along: Nam
     given, outputs = dict(zip(names, rest[: len(names)], strict=True)), tuple(layer.outputs())
     along, wanted = (along, outputs) if way == "push" else (outputs, along)
     others = dict(zip(along, rest[len(names) :], strict=True))
-    found = derivative(way, layer, _entries(sizes), on_host(tickets), given, others)
+    found = derivative(way, layer, prod(sizes) if sizes else None, on_host(tickets), given, others)
     return [found[name] for name in wanted]
-
-
-def _entries(sizes: Sizes) -> int | None:
-    """Over how many entries a layer is mapped, if it is."""
-    return prod(sizes) if sizes else None
 
 
 def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **others: Any) -> list[Any]:
@@ -338,7 +333,7 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
         with WARP, _in_order(results[0].device):
             try:
-                found = _FUNCTIONS[number]([_as_array(array) for array in arrays])
+                found = _FUNCTIONS[number]([array.numpy() if array.device.is_cpu else array for array in arrays])
             except CortadoError as error:
                 raise error.with_traceback(None) from None
             for result, own in zip(results, found, strict=True):
@@ -378,7 +373,3 @@ def _stream(device: str) -> Any:
 
 def _annotation(axes: int, dtype: str) -> Any:
     return wp.array(dtype=getattr(wp, dtype), ndim=axes)
-
-
-def _as_array(array: wp.array) -> Array:
-    return array.numpy() if array.device.is_cpu else array
