@@ -153,8 +153,8 @@ class Turnable(RegionFluid):
 
 class BoxFluid(BoxShape, Turnable):
     """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed where it is turned. Where a side is no
-    whole multiple of the spacing, they are up to 3 % further apart along some axes and closer along others, so that the
-    box has the mass of its volume within 0.3 %. Where no such lattice is, they are packed, which takes up to 0.8 % off
+    whole multiple of the spacing, they are up to 3 % further apart along some axes and closer along others. The box
+    then has the mass of its volume within 0.3 %. Where no such lattice is, they are packed, which takes up to 0.8 % off
     the mass; `describe` and a run then say both masses."""
 
     def block(self, spacing: float) -> Block:
