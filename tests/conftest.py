@@ -48,6 +48,10 @@ VALIDATION = {
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
 
 
+COLLECTED = pytest.StashKey[set[tuple[str, str]]]()
+"""Files and names of all cases, and of their tests, before any is left out."""
+
+
 def tier(item: pytest.Item) -> str:
     if item.path.stem in VALIDATION:
         return "validation"
@@ -62,6 +66,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Marks tests by their tier, and leaves out with ``--short`` what only `make test-all` runs. Long files come first,
     so that no core ends with one while the others have nothing to do; ``--no-loadscope-reorder`` in pyproject.toml
     keeps this order."""
+    names = ((item, name) for item in items for name in (item.name, getattr(item, "originalname", item.name)))
+    config.stash[COLLECTED] = {(item.path.stem, name) for item, name in names}
     if config.getoption("--short"):
         run = {id(item) for item in short(items)}
         config.hook.pytest_deselected(items=[item for item in items if id(item) not in run])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import VALIDATION, tier
+from conftest import COLLECTED, VALIDATION, tier
 from short import KEPT, MEASURED, SLOW, chosen, short, values_of, write_seconds
 from skips import complaints
 
@@ -27,6 +27,15 @@ def test_what_is_listed_is_there(file):
 def test_only_what_is_slow_has_to_be_kept():
     slow = {*MEASURED, *((file, test.partition("[")[0]) for file, test in MEASURED)}
     assert {(file, test.partition("[")[0]) for file, tests in KEPT.items() for test in tests} <= slow
+
+
+def test_times_are_of_cases_that_there_are(request):
+    """Of files that are collected whole: a case that has another name by now would no longer be left out."""
+    config = request.config
+    if not (config.option.keyword or config.option.markexpr or any("::" in one for one in config.args)):
+        there = config.stash[COLLECTED]
+        files = {file for file, _ in there}
+        assert [key for key in MEASURED if key[0] in files and key not in there] == []
 
 
 def test_the_marks_are_set(request):
