@@ -12,8 +12,8 @@ import cortado
 import test_kernels
 from cortado import Simulation
 from cortado.forces import Body, Pair
-from cortado.particles.solid_shares import ALL_WALLS, SolidShares
 from cortado.particles.state import Fields, Layout
+from cortado.particles.wall_terms import ALL_WALLS, SolidShares
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.curvature_kernels import curvature_adjoints, curvature_kernels, curvature_tangents, entries
 from cortado.sph.emitter import Nozzle, emitter_kernels, nozzle_type

@@ -209,7 +209,7 @@ def test_there_is_a_launch_to_speak_of():
 
 MOST_ARGUMENTS = 14
 """Of a kernel: more can hardly be read."""
-LOOPS = {f"particles.{name}" for name in ("pair_sums", "solid_shares", "wall_terms", "neighbours")}
+LOOPS = {f"particles.{name}" for name in ("pair_sums", "wall_terms", "neighbours")}
 """Modules that may count neighbours: three write loops, the other lists neighbours and images."""
 
 

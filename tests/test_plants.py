@@ -37,7 +37,7 @@ UNNAMED = {
     "solvers.projection.body_kernels": {"body_kernels.push_back"},
     "solvers.projection.body_motion": {"motion_kernels.slower"},
     "solvers.pcisph.pressure": {"_work.pressure_work"},
-    "particles.solid_shares": {"solid_kernel.share"},
+    "particles.wall_terms": {"solid_kernel.share"},
     "sph.rotations": {"rotations.back", "rotations.back_about_z"},
     "sph.density": {"_density_work.density_work"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
@@ -78,7 +78,6 @@ ELSEWHERE = {
     "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "solvers.projection.mean_stress": "of a quantity, which no loss of these scenes sees: tests/test_energy_budget.py",
-    "particles.wall_terms": "of loads, which are quantities: tests/test_solid_loads.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""
 FEWEST = {"functions": 48, "plants": 226}

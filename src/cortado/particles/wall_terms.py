@@ -1,41 +1,118 @@
-"""What the walls of one solid, or all walls, do to each particle by one term of a step, with its derivatives.
+"""What the walls of one solid, or all walls, do to each particle by one term of a step, with its derivatives; and what
+the adjoint of such a sum gives to solids that move: to where they are, and to how large.
 
-A term is told by its work W, a number that is linear in a vector ``bar`` of particle i, as it is to
-`cortado.particles.solid_shares.solid_kernel`. Its sum over wall particles b, such as the acceleration by them, is
+A term is told by its work W, a number that is linear in a vector ``bar`` of particle i. Its sum over wall particles b,
+such as the acceleration by them, is
 
     A_i = sum_b w_b dW / dbar_i.
 
 Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``.
+``bar``, and the adjoint is the gradient of W for the adjoint of A as ``bar``. With that, particle i gives to wall
+particle b
+
+    x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
+
+made by Warp from W. The point of the surface above it is s_b = c + R q_b, and it is at x_b = s_b - foot_b, with a foot
+that R has turned too. Its velocity is that of s_b, which is (s_b - s_b^0) / dt + R u from s_b^0 = c_0 + R_0 q_b at the
+start of the step. A scale sigma has made q_b so many times as long, and w_b sigma^(d - 1) times as large. A solid moves
+by c', turns further by w', and grows by g' = sigma' / sigma, and its pose at the start of the step changed by c_0' and
+w_0'. So it has the work f . c' + t . w' + f_0 . c_0' + t_0 . w_0' + g g' with
+
+    f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
+    f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
+    g = sum R q_b . x_b^ + (R q_b - R_0 q_b) . v_b^ / dt + (d - 1) w_b W.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from cortado.device.launching import bundle
+from cortado.device.launching import Named, bundle
 from cortado.device.modules import Kernels
+from cortado.device.precision import Precision
+from cortado.device.reduction import add
+from cortado.particles.made_derivatives import dot_of
+from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import scope_of
-from cortado.particles.solid_shares import ALL_WALLS, WorkMaker, solid_kernel
+from cortado.particles.particle_kernels import MADE, made_kernel
+from cortado.particles.state import Layout
 from cortado.particles.terms import Term
 
+ALL_WALLS = -(2**31)
+"""In the place of the number of a solid: those of all solids and of the container."""
+NAMES = ("force", "torque", "force_before", "torque_before", "growth")
+"""f, t, f_0, t_0 and g."""
+WHOLE = ("force", "torque", "growth")
+"""What others than particles give."""
 LOOP = """\
-def {name}(i: int, {parameters}constants: _pair, solid: int, s: _neighbourhood):
-    _x_i = at.x[i]
-{begin}
+_x_i = at.x[i]
+    {own}
     for _place in range(s.fluid_count[i], s.count[i]):
         _b = _neighbour(_place, i, s)
         if solid == _ALL or _wall_solid(_b, s) == solid:
             _w_b = {weight}(_b, s)
+            _x_b = _wall_position(_b, s)
             _v_b = _wall_velocity(_b, s)
             _foot = _wall_foot(_b, s)
-            _x_ij = _separation(_x_i, _wall_position(_b, s), s)
-{body}
-{end}
+            _x_ij = _separation(_x_i, _x_b, s)
+            {body}"""
+SHARE = """\
+def {name}(
+    i: int, at: _seen, constants: _pair, solid: int, middle: _vector, back: _matrix, slide: _vector, power: _real,
+    s: _neighbourhood,
+):
+    {loop}
+    return _force, _torque, _pulled, _twisted, _twisted_before, _rate, _grown, _spread
 """
+
+WorkMaker = Callable[[Discretisation], Callable[..., Any]]
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A loop over the wall particles of a term, as text."""
+
+    term: Term
+    d: Discretisation
+    rubs: bool
+
+    @property
+    def read(self) -> list[str]:
+        """Arrays but x of which it reads the entry of particle i."""
+        parameters = self.term.parameters
+        return [name for name in self.term.arrays if name != "x" and {f"{name}_i", f"{name}_ij"} & parameters.keys()]
+
+    @property
+    def arguments(self) -> str:
+        return self.term.seen_from_i({"v": "_v_b"})
+
+    @property
+    def gradients(self) -> str:
+        """The line that assigns the derivative of W by each parameter to ``_by_parameter``."""
+        return f"{', '.join(f'_by_{name}' for name in self.term.parameters)} = wp.grad(_work)({self.arguments})"
+
+    def text(self, given: Iterable[str], own: Iterable[str], body: Iterable[str]) -> str:
+        """With lines before it and within it; entries of arrays are read but for those that are ``given``."""
+        entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
+        return LOOP.format(
+            own="\n    ".join((*entries, *own)),
+            weight="_wall_grip" if self.rubs else "_wall_weight",
+            body="\n            ".join(body),
+        )
+
+    def known(self, module: Any) -> dict[str, Any]:
+        """What names in the text stand for, in a Warp module."""
+        return {
+            **scope_of(self.d),
+            **{"_matrix": matrix_of(self.d.precision), "_pair": self.d.precision.pair},
+            "_ALL": wp.constant(ALL_WALLS),
+            "_work": wp.func(self.term.function, module=module),
+            "wp": wp,
+        }
 
 
 @dataclass(frozen=True)
@@ -66,145 +143,219 @@ class WallTerm:
 def _kernels(of: WallTerm) -> Kernels:
     d = replace(of.discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(of.make(d))
-    vector, pair, neighbourhood = precision.vector, precision.pair, neighbourhood_type(precision)
-    seen = bundle(**{"x": vector, **{name: kind for name, kind in term.arrays.items() if name not in ("x", of.bar)}})
-    given = bundle(**{of.bar: vector})
-    plain, topic = replace(d, taped=False), f"{of.topic}_{term.name}_walls"
-    modules = plain.module(True, topic), plain.tangent_module(topic), plain.module(False, topic)
-    text = _Text(of, term, d, {"_seen": seen, "_given": given})
-    total_of, change_of, back = (make(module) for make, module in zip(text.makers(), modules, strict=True))
+    real, vector, zero = precision.real, precision.vector, "_vector()"
+    loop = _Loop(term, d, of.rubs)
+    kinds = {"x": vector, **{name: term.arrays[name] for name in loop.read if name != of.bar}}
+    seen, bar = bundle(**kinds), f"_{of.bar}_i"
+    modules = replace(d, taped=False).modules(f"{of.topic}_{term.name}_walls")
+    one = {"s": neighbourhood_type(precision), "solid": int, "constants": precision.pair, "at": seen}
 
-    @wp.kernel(module=modules[0], enable_backward=False)
-    def act(
-        s: neighbourhood,
-        solid: int,
-        constants: pair,
-        at: seen,
-        # out
-        total: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid()
-        total[i] = total_of(i, at, constants, solid, s)
+    def made(way: int, types: dict[str, Any], own: list[str], body: list[str], end: Iterable[str]) -> Any:
+        lines = ["i = s.first + wp.tid()", loop.text([of.bar], own, body), *end]
+        name = f"{MADE}{term.name}_act{('', '_tangent', '_adjoint')[way]}"
+        return made_kernel(name, {**one, **types}, lines, loop.known(modules[way]), modules[way])
 
-    @wp.kernel(module=modules[1], enable_backward=False)
-    def act_tangent(
-        s: neighbourhood,
-        solid: int,
-        constants: pair,
-        at: seen,
-        dot: seen,
-        # out
-        total_dot: wp.array(dtype=vector),
-    ):
-        i = s.first + wp.tid()
-        total_dot[i] = change_of(i, at, dot, constants, solid, s)
+    def product(name: str) -> str:
+        kind = term.parameters[name]
+        return f"_by_{name} * _change_{name}" if kind is real else f"wp.{dot_of(kind)}(_by_{name}, _change_{name})"
 
-    @wp.kernel(module=modules[2], enable_backward=False)
-    def act_adjoint(
-        s: neighbourhood,
-        solid: int,
-        constants: pair,
-        at: seen,
-        total_bar: given,
-        # in and out
-        bar: seen,
-    ):
-        i = s.first + wp.tid()
-        back(i, at, total_bar, bar, constants, solid, s)
+    dots = {name: f"_{name}_i_dot" for name in kinds}
+    changes = {
+        "x_ij": f"{dots['x']} - {'_wall_position_dot(_b, s)' if d.moving else zero}",
+        "v_ij": f"{dots.get('v')} - {'_wall_velocity_dot(_b, s)' if d.moving else zero}",
+        "foot": f"wp.cross({'_wall_turn_dot(_b, s)' if d.moving else zero}, _foot)",
+        **{f"{name}_i": dots[name] for name in kinds if name != "x"},
+    }
+    moved = [name for name in term.parameters if name in changes]
+    terms = [product(name) for name in moved]
+    if d.moving:  # W is linear in the unit vector, of which its gradient is all that the wall does
+        terms.append(f"_wall_growth_dot(_b, s) * _by_{of.bar}_i[_k]")
+    along = [
+        *(f"_change_{name} = {changes[name]}" for name in moved),
+        "for _k in range(_three):",
+        f"    {bar} = _vector()",
+        f"    {bar}[_k] = _real(1.0)",
+        f"    {loop.gradients}",
+        f"    _total[_k] += _w_b * ({' + '.join(terms)})",
+    ]
+    start = [*(f"{dot} = dot.{name}[i]" for name, dot in dots.items()), "_total = _vector()"]
+    start.append("_three = int(3)")  # not a number: Warp would write the gradient out for each
+    by = {name: next(f"_by_{p}" for p in (f"{name}_i", f"{name}_ij") if p in term.parameters) for name in kinds}
+    zeros = {real: "_real(0.0)", vector: zero}
+    total = wp.array(dtype=vector)
+    return Kernels(
+        made(
+            0,
+            {"total": total},
+            [f"{bar} = _vector()", "_total = _vector()"],
+            [loop.gradients, f"_total += _w_b * _by_{of.bar}_i"],
+            ["total[i] = _total"],
+        ),
+        made(1, {"dot": seen, "total_dot": total}, start, along, ["total_dot[i] = _total"]),
+        made(
+            2,
+            {"total_bar": bundle(**{of.bar: vector}), "bar": seen},
+            [f"{bar} = total_bar.{of.bar}[i]"]
+            + [f"_{name}_sum = {zeros.get(kind, '_matrix()')}" for name, kind in kinds.items()],
+            [loop.gradients, *(f"_{name}_sum += _w_b * {one}" for name, one in by.items())],
+            [f"bar.{name}[i] = bar.{name}[i] + _{name}_sum" for name in kinds],
+        ),
+    )
 
-    return Kernels(act, act_tangent, act_adjoint)
 
+class SolidShares:
+    """What the particles give to the adjoints of the poses of solids in one step, particle by particle."""
 
-@dataclass(frozen=True)
-class _Text:
-    """The loops over wall particles of a term, as Warp functions made of texts."""
-
-    of: WallTerm
-    term: Term
-    d: Discretisation
-    bundles: dict[str, Any]
-
-    def makers(self) -> tuple[Any, Any, Any]:
-        """What makes the functions of A, of its tangent and of its adjoint in a Warp module."""
-        return self._forward, self._tangent, self._adjoint
-
-    @property
-    def _entries(self) -> list[str]:
-        """Arrays of which it reads the entry of particle i."""
-        return [name for name in self.term.arrays if name not in ("x", self.of.bar)]
-
-    def _forward(self, module: Any) -> Any:
-        own = [f"_{self.of.bar}_i = _vector()", "_total = _vector()"]
-        body = [self._gradients, f"_total += _w_b * _by_{self.of.bar}_i"]
-        return self._made("act", "at: _seen, ", own, body, "return _total", module)
-
-    def _tangent(self, module: Any) -> Any:
-        moving, zero = self.d.moving, "_vector()"
-        dots = {name: f"_{name}_i_dot" for name in ("x", *self._entries)}
-        known = {
-            "x_ij": f"{dots['x']} - {'_wall_position_dot(_b, s)' if moving else zero}",
-            "v_ij": f"{dots.get('v')} - {'_wall_velocity_dot(_b, s)' if moving else zero}",
-            "foot": f"_wp.cross({'_wall_turn_dot(_b, s)' if moving else zero}, _foot)",
-            **{f"{name}_i": dots[name] for name in self._entries},
-        }
-        moved = [name for name in self.term.parameters if name in known]
-        terms = [self._product(name, f"_change_{name}") for name in moved]
-        if moving:  # W is linear in the unit vector, of which its gradient is all that the wall does
-            terms.append(f"_wall_growth_dot(_b, s) * _by_{self.of.bar}_i[_k]")
-        own = [f"{dot} = dot.{name}[i]" for name, dot in dots.items()]
-        own += ["_three = int(3)", "_total = _vector()"]  # not a number: Warp would write the gradient out for each
-        body = [f"_change_{name} = {known[name]}" for name in moved]
-        body += [
-            "for _k in range(_three):",
-            f"    _{self.of.bar}_i = _vector()",
-            f"    _{self.of.bar}_i[_k] = _real(1.0)",
+    def __init__(self, walls: MovingWalls | None, layout: Layout):
+        """``walls`` of the solids; where None move, nothing is given."""
+        self._walls, self._pair = walls, layout.precision.pair
+        size, kinds, device = layout.all_particles, share_kinds(layout.precision), layout.device
+        solids = range(0 if walls is None else walls.solids)
+        self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
+        self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
+        self._whole = [
+            {name: wp.zeros(layout.members, dtype=kinds[name], device=device) for name in WHOLE} for _ in solids
         ]
-        body += [f"    {self._gradients}", f"    _total[_k] += _w_b * ({' + '.join(terms)})"]
-        return self._made("act_tangent", "at: _seen, dot: _seen, ", own, body, "return _total", module)
+        """What was given by others than particles."""
 
-    def _adjoint(self, module: Any) -> Any:
-        kinds = {"x": self.d.precision.vector, **{name: self.term.arrays[name] for name in self._entries}}
-        own = [f"_{self.of.bar}_i = given.{self.of.bar}[i]"]
-        own += [f"_{name}_sum = {self._zero(kind)}" for name, kind in kinds.items()]
-        read = {name: next(p for p in (f"{name}_i", f"{name}_ij") if p in self.term.parameters) for name in kinds}
-        body = [self._gradients, *(f"_{name}_sum += _w_b * _by_{read[name]}" for name in kinds)]
-        end = "\n    ".join(f"bar.{name}[i] = bar.{name}[i] + _{name}_sum" for name in kinds)
-        return self._made("act_adjoint", "at: _seen, given: _given, bar: _seen, ", own, body, end, module)
+    def add(
+        self,
+        launch: Callable[..., None],
+        kernel: Callable[[], Any],
+        *groups: Named,
+        constants: tuple[float, float] = (0.0, 0.0),
+        over: int = ALL_WALLS,
+        **arrays: Any,
+    ) -> None:
+        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move; of a
+        sum ``over`` the walls of one solid, to that alone."""
+        if self._walls is None:
+            return
+        before, after, power = self._walls.before, self._walls.after, self._walls.sizes.power
+        poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns, "power": power}
+        known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
+        for solid in range(self._walls.solids):
+            if over in (ALL_WALLS, solid):
+                launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
-    @property
-    def _gradients(self) -> str:
-        names = ", ".join(f"_by_{name}" for name in self.term.parameters)
-        return f"{names} = _wp.grad(_work)({self.term.seen_from_i({'v': '_v_b'})})"
+    def of(self, solid: int) -> dict[str, wp.array]:
+        """(n,) what the particles have given to one solid so far, as kernels call it."""
+        return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
-    def _product(self, name: str, change: str) -> str:
-        kind = self.term.parameters[name]
-        if kind is self.d.precision.real:
-            return f"_by_{name} * {change}"
-        return f"_wp.{'dot' if len(kind._shape_) == 1 else 'ddot'}(_by_{name}, {change})"
+    def collect(self, solid: int) -> dict[str, wp.array]:
+        """The sums (members,) of one solid, by `NAMES`, and begin anew."""
+        found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
+        for name, given in self._whole[solid].items():
+            add(given, found[name])
+        self._forget(solid)
+        return found
 
-    def _zero(self, kind: Any) -> str:
-        return "_real(0.0)" if kind is self.d.precision.real else "_vector()" if len(kind._shape_) == 1 else "_matrix()"
+    def add_whole(self, solid: int, *given: wp.array) -> None:
+        """(members,) f, t, and g where there is one, which others than particles give to one solid."""
+        for one, own in zip(given, self._whole[solid].values(), strict=False):
+            add(one, own)
 
-    def _made(self, name: str, parameters: str, own: list[str], body: list[str], end: str, module: Any) -> Any:
-        d = self.d
-        own = [*(f"_{entry}_i = at.{entry}[i]" for entry in self._entries), *own]
-        text = LOOP.format(
-            name=name,
-            parameters=parameters,
-            begin="\n".join(f"    {line}" for line in own),
-            weight="_wall_grip" if self.of.rubs else "_wall_weight",
-            body="\n".join(f"            {line}" for line in body),
-            end=f"    {end}",
+    def clear(self) -> None:
+        """Forget what was given."""
+        for solid in range(len(self._arrays)):
+            self._forget(solid)
+
+    def _forget(self, solid: int) -> None:
+        for array in (*self._arrays[solid].values(), *self._whole[solid].values()):
+            array.zero_()
+
+
+def share_kinds(precision: Precision) -> dict[str, Any]:
+    """Types of what a particle gives, by `NAMES`."""
+    return {**dict.fromkeys(NAMES, precision.vector), "growth": precision.real}
+
+
+@cache
+def solid_kernel(
+    discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
+) -> Any:
+    """The kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
+
+    ``make(discretisation)`` gives W, a term of walls (`cortado.particles.terms`) that returns a number, of functions
+    that Warp can differentiate; it knows entries of arrays of particle i, ``v_ij`` or ``v_j``, and ``constants``. As
+    those of walls, a sum that ``rubs`` has nothing of walls that slip freely. A ``looped`` one is of iteration k, and
+    leaves out scenes that make fewer ``rounds``.
+    """
+    d = replace(discretisation, lanes=1, taped=True)
+    precision, term = d.precision, Term.of(make(d))
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_of(precision), precision.pair
+    seen, module = bundle(**term.arrays), replace(d, taped=False).module(False, f"{topic}_{term.name}_solids")
+    shares = _share(_Loop(term, d, rubs), seen, module)
+    neighbourhood = neighbourhood_type(precision)
+    bars = bundle(**share_kinds(precision), time_step=real)
+    LOOPED = wp.constant(looped)
+
+    def share(
+        s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
+        solid: int,
+        constants: pair,
+        time_step: wp.array(dtype=real),
+        positions: wp.array2d(dtype=vector),
+        turns: wp.array2d(dtype=matrix),
+        turns_before: wp.array2d(dtype=matrix),
+        slides: wp.array(dtype=vector),
+        power: real,
+        at: seen,
+        # in and out
+        bar: bars,
+    ):
+        i = s.first + wp.tid()
+        member = i // s.particles
+        if s.count[i] <= s.fluid_count[i]:
+            return
+        if LOOPED:  # noqa: SIM102, as Warp reads both sides of an `and`
+            if k >= rounds[member]:
+                return
+        R = turns[member, solid]
+        slide = R * slides[solid]
+        back = turns_before[member, solid] * wp.transpose(R)
+        force, torque, pulled, twisted, twisted_before, rate, grown, spread = shares(
+            i, at, constants, solid, positions[member, solid], back, slide, power, s
         )
-        matrices = [kind for kind in self.term.arrays.values() if kind not in (d.precision.real, d.precision.vector)]
-        known: dict[str, Any] = {
-            **scope_of(d),
-            "_matrix": matrices[0] if matrices else None,
-            "_pair": d.precision.pair,
-            "_ALL": wp.constant(ALL_WALLS),
-            "_wp": wp,
-            "_work": wp.func(self.term.function, module=module),
-            **self.bundles,
-        }
-        exec(text, known)
-        return wp.Function(known[name], f"{self.term.name}_{name}", "", module=module, source=text)
+        per = real(1.0) / time_step[member]
+        bar.force[i] = bar.force[i] + force + per * pulled
+        bar.torque[i] = bar.torque[i] + torque + per * twisted + wp.cross(slide, pulled)
+        bar.force_before[i] = bar.force_before[i] - per * pulled
+        bar.torque_before[i] = bar.torque_before[i] - per * twisted_before
+        bar.growth[i] = bar.growth[i] + grown + per * spread
+        bar.time_step[i] = bar.time_step[i] - per * rate
+
+    share.__qualname__ = share.__name__ = f"{term.name}_share"
+    return wp.kernel(share, module=module, enable_backward=False)
+
+
+def _share(loop: _Loop, seen: Any, module: Any) -> Any:
+    """The Warp function of the sums over the wall particles of one solid, of which particles' shares are made."""
+    term = loop.term
+    velocity = [name for name in ("v_ij", "v_j") if name in term.parameters]
+    by_v = {(): "_vector()", ("v_ij",): "-_w_b * _by_v_ij", ("v_j",): "_w_b * _by_v_j"}[tuple(velocity)]
+    by_foot = " + wp.cross(_foot, _w_b * _by_foot)" * ("foot" in term.parameters)
+    body = [
+        loop.gradients,
+        "_arm = _x_b - middle",
+        "_x_bar = -_w_b * _by_x_ij",
+        f"_v_bar = {by_v}",
+        "_force += _x_bar",
+        f"_torque += wp.cross(_arm, _x_bar){by_foot}",
+        "_pulled += _v_bar",
+        "_surface = _arm + _foot",
+        "_surface_before = back * _surface",
+        "_twisted += wp.cross(_surface, _v_bar)",
+        "_twisted_before += wp.cross(_surface_before, _v_bar)",
+        "_rate += wp.dot(_v_bar, _v_b - slide)",
+        f"_grown += wp.dot(_surface, _x_bar) + power * _w_b * _work({loop.arguments})",
+        "_spread += wp.dot(_surface - _surface_before, _v_bar)",
+    ]
+    own = [f"_{name} = _vector()" for name in ("force", "torque", "pulled", "twisted", "twisted_before")]
+    own += [f"_{name} = _real(0.0)" for name in ("rate", "grown", "spread")]
+    text = SHARE.format(name=f"{term.name}_sum", loop=loop.text([], own, body))
+    known = {**loop.known(module), "_seen": seen}
+    exec(text, known)
+    return wp.Function(known[f"{term.name}_sum"], f"{term.name}_sum", "", module=module, source=text)

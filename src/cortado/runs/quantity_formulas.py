@@ -21,8 +21,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
-from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Fields, padded
+from cortado.particles.wall_terms import ALL_WALLS
 from cortado.scene.quantity_names import load_name
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
@@ -157,7 +157,7 @@ class _Rubbing:
 
 class WallLoads:
     """Of a solver's particles, (n, 3) in float64. ``solid`` is the number of a solid's wall particles, or
-    `cortado.particles.solid_shares.ALL_WALLS`."""
+    `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
         cell, self._power = solver.lattice.cell, solver.density_power

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.reduction import sum_of
-from cortado.particles.solid_shares import WHOLE
 from cortado.particles.state import Layout, padded
+from cortado.particles.wall_terms import WHOLE
 from cortado.scene.motions import density_name
 from cortado.solvers.contact_kernels import contact_kernels, strength_kernels
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh

@@ -5,8 +5,8 @@ from weakref import finalize
 import warp as wp
 
 from cortado.device.reduction import add
-from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Fields, Parameters, State
+from cortado.particles.wall_terms import SolidShares
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
 from cortado.sph.begin_adjoint import begin_adjoint_kernel

@@ -16,7 +16,7 @@ from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
-from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.wall_terms import solid_kernel
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.solid_shares import share_kinds
 from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.wall_terms import share_kinds
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module

@@ -32,8 +32,8 @@ from cortado.discretise.walls import WallLayers
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import StateField
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Arrays, Fields, Layout, Parameters, State, zeros
+from cortado.particles.wall_terms import SolidShares
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import argument
 from cortado.scene.parameters import Axis

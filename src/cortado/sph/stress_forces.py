@@ -267,7 +267,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
 
 def stress_work(d: Discretisation) -> Any:
     """What the sum gives to solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control`` as
-    ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+    ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
     fall, hold = contact.fall, contact.hold

@@ -266,7 +266,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
 
 def moments_work(d: Discretisation) -> Any:
     """What the sums give to solids, for their adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the first of
-    the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+    the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)

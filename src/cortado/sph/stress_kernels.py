@@ -32,7 +32,7 @@ import warp as wp
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
-from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.moment_functions import matrix_type, moment_functions
 from cortado.sph.stress_forces import stress_sums, stress_work
 from cortado.sph.stress_functions import moment_sums, moments_work, stress_of_particle

@@ -13,8 +13,7 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
-from cortado.particles.solid_shares import WorkMaker
-from cortado.particles.wall_terms import WallTerm
+from cortado.particles.wall_terms import WallTerm, WorkMaker
 from cortado.scene.parameters import Parameter
 from cortado.sph.formula import Packed, compiled
 from cortado.sph.moment_functions import matrix_type

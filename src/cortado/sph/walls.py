@@ -71,7 +71,7 @@ def _work(d: Discretisation) -> Any:
 
 class WallAction(Protocol):
     """What walls do to the particles around them by one term of a step, after the step. ``solid`` is the number of wall
-    particles of a solid, or `cortado.particles.solid_shares.ALL_WALLS`."""
+    particles of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
         """(n,) vectors of the sorted particles: of a force its accelerations by walls [m / s2]."""

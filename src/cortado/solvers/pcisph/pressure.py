@@ -22,7 +22,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
-from cortado.particles.solid_shares import solid_kernel
+from cortado.particles.wall_terms import solid_kernel
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
 
@@ -158,7 +158,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
 def pressure_solid_kernel(discretisation: Discretisation) -> Any:
     """The kernel of what the pressure force of an iteration gives to solids that move, for its adjoint ``scaled_bar``
-    (`cortado.particles.solid_shares.solid_kernel`)."""
+    (`cortado.particles.wall_terms.solid_kernel`)."""
     return solid_kernel(discretisation, "pcisph", _work, looped=True)
 
 

@@ -27,9 +27,8 @@ from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
 from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.particles.solid_shares import ALL_WALLS
 from cortado.particles.state import Layout
-from cortado.particles.wall_terms import WallTerm
+from cortado.particles.wall_terms import ALL_WALLS, WallTerm
 from cortado.solvers.projection.images import CONTAINER
 from cortado.solvers.projection.walls import normal_part
 from cortado.sph.integration import integration_module

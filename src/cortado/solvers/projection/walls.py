@@ -30,9 +30,8 @@ from numpy.typing import NDArray
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
-from cortado.particles.solid_shares import ALL_WALLS, solid_kernel
 from cortado.particles.state import Layout
-from cortado.particles.wall_terms import WallTerm
+from cortado.particles.wall_terms import ALL_WALLS, WallTerm, solid_kernel
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.sph.moment_functions import moment_functions
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -148,7 +147,7 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
 
 
 def beside_solid_kernel(discretisation: Discretisation) -> Any:
-    """The kernel of what they give to solids (`cortado.particles.solid_shares.SolidShares.add`), for the adjoints of
+    """The kernel of what they give to solids (`cortado.particles.wall_terms.SolidShares.add`), for the adjoints of
     the sums."""
     return solid_kernel(discretisation, "projection", _work)
 
