@@ -21,6 +21,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.fields import POSITIONS, VELOCITIES, Entry, StateField
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout, Parameters, State, to_device
 from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
@@ -83,20 +84,11 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
             return real(0.0)
         return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
 
-    @wp.kernel(module=integration_module(precision, True, taped))
+    @particle_kernel(integration_module(precision, True, taped), "outlet emitted", numbers=["nozzle"])
     def begin(
-        nozzle: nozzle_of,
-        flow_rate: wp.array(dtype=real),
-        time_step: wp.array(dtype=real),
-        outlet_in: wp.array(dtype=vector),
-        emitted_in: wp.array(dtype=wp.float64),
-        # out
-        outlet: wp.array(dtype=vector),
-        emitted: wp.array(dtype=wp.float64),
-    ):
-        b = wp.tid()
-        outlet[b] = outlet_in[b]
-        emitted[b] = emitted_in[b] + advance(flow_rate[b], nozzle.area, time_step[b])
+        nozzle: nozzle_of, flow_rate_i: real, time_step_i: real, outlet_in_i: vector, emitted_in_i: wp.float64
+    ) -> tuple[vector, wp.float64]:
+        return outlet_in_i, emitted_in_i + advance(flow_rate_i, nozzle.area, time_step_i)
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def prescribe(
@@ -132,24 +124,19 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
             outlet_out[b] = q
             emitted_out[b] = emitted[b]
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    @particle_kernel(integration_module(precision, False), "outlet_dot emitted_dot", numbers=["nozzle"])
     def begin_tangent(
         nozzle: nozzle_of,
-        flow_rate: wp.array(dtype=real),
-        flow_rate_dot: wp.array(dtype=real),
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        outlet_in_dot: wp.array(dtype=vector),
-        emitted_in_dot: wp.array(dtype=wp.float64),
-        # out
-        outlet_dot: wp.array(dtype=vector),
-        emitted_dot: wp.array(dtype=wp.float64),
-    ):
-        b = wp.tid()
-        outlet_dot[b] = outlet_in_dot[b]
-        faster = advance(flow_rate_dot[b], nozzle.area, time_step[b])
-        longer = advance(flow_rate[b], nozzle.area, time_step_dot[b])
-        emitted_dot[b] = emitted_in_dot[b] + faster + longer
+        flow_rate_i: real,
+        flow_rate_dot_i: real,
+        time_step_i: real,
+        time_step_dot_i: real,
+        outlet_in_dot_i: vector,
+        emitted_in_dot_i: wp.float64,
+    ) -> tuple[vector, wp.float64]:
+        faster = advance(flow_rate_dot_i, nozzle.area, time_step_i)
+        longer = advance(flow_rate_i, nozzle.area, time_step_dot_i)
+        return outlet_in_dot_i, emitted_in_dot_i + faster + longer
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def prescribe_tangent(
@@ -183,27 +170,22 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
             outlet_out_dot[b] = q_dot
             emitted_out_dot[b] = dot.emitted[b]
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    @particle_kernel(
+        integration_module(precision, False),
+        "x_free_bar v_free_bar x_prescribed_bar v_prescribed_bar",
+        numbers=["nozzle", "particles"],
+    )
     def prescribe_adjoint(
-        particles: int,
-        nozzle: nozzle_of,
-        emitted: wp.array(dtype=wp.float64),
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        # out
-        x_free_bar: wp.array(dtype=vector),
-        v_free_bar: wp.array(dtype=vector),
-        x_prescribed_bar: wp.array(dtype=vector),
-        v_prescribed_bar: wp.array(dtype=vector),
-    ):
+        i: int, member: int, particles: int, nozzle: nozzle_of, emitted: wp.float64, x_bar_i: vector, v_bar_i: vector
+    ) -> tuple[vector, vector, vector, vector]:
         """What reaches free particles, and what reaches prescribed ones."""
-        i = wp.tid()
-        b = i // particles
-        prescribed = remaining(i - b * particles, nozzle, emitted[b]) > real(0.0)
-        x_free_bar[i] = wp.where(prescribed, vector(), x_bar[i])
-        v_free_bar[i] = wp.where(prescribed, vector(), v_bar[i])
-        x_prescribed_bar[i] = wp.where(prescribed, x_bar[i], vector())
-        v_prescribed_bar[i] = wp.where(prescribed, v_bar[i], vector())
+        prescribed = remaining(i - member * particles, nozzle, emitted) > real(0.0)
+        return (
+            wp.where(prescribed, vector(), x_bar_i),
+            wp.where(prescribed, vector(), v_bar_i),
+            wp.where(prescribed, x_bar_i, vector()),
+            wp.where(prescribed, v_bar_i, vector()),
+        )
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def collect(

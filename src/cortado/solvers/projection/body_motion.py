@@ -30,56 +30,60 @@ def motion_kernels(precision: Precision) -> MotionKernels:
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module, rate = free_module(precision), rate_function(precision)
     moving = bundle(V=vector, W=vector, L=vector)
-    begun, sums = bundle(V_0=vector, W_0=vector, L_0=vector), bundle(pulled_sum=vector, twisted_sum=vector)
+    sums = bundle(pulled_sum=vector, twisted_sum=vector)
 
-    @wp.kernel(module=module, enable_backward=False)
+    constants, table, poses = ["number", "volume", "inverse"], wp.array2d(dtype=vector), wp.array2d(dtype=matrix)
+
+    @particle_kernel(module, "V L W", numbers=constants)
     def move(
+        i: int,
         number: int,
-        step: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        gravity: wp.array2d(dtype=vector),
-        density: wp.array(dtype=real),
+        step_i: wp.int32,
+        time_step_i: real,
+        gravity: table,
+        density_i: real,
         volume: real,
         inverse: matrix,
-        turns: wp.array2d(dtype=matrix),
-        at: begun,
-        by: sums,
-        # out
-        later: moving,
-    ):
-        b = wp.tid()
-        L = at.L_0[b] + by.twisted_sum[b]
-        later.V[b] = at.V_0[b] + time_step[b] * gravity[b, step[b]] + by.pulled_sum[b] / (density[b] * volume)
-        later.L[b] = L
-        later.W[b] = rate(turns[b, number], inverse, L) / density[b]
+        turns: poses,
+        V_0_i: vector,
+        L_0_i: vector,
+        pulled_sum_i: vector,
+        twisted_sum_i: vector,
+    ) -> tuple[vector, vector, vector]:
+        """A thread is a scene, as in the next two."""
+        L = L_0_i + twisted_sum_i
+        V = V_0_i + time_step_i * gravity[i, step_i] + pulled_sum_i / (density_i * volume)
+        return V, L, rate(turns[i, number], inverse, L) / density_i
 
-    @wp.kernel(module=module, enable_backward=False)
+    @particle_kernel(module, "V_dot L_dot W_dot", numbers=constants)
     def move_tangent(
+        i: int,
         number: int,
-        step: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        gravity: wp.array2d(dtype=vector),
-        density: wp.array(dtype=real),
+        step_i: wp.int32,
+        time_step_i: real,
+        time_step_dot_i: real,
+        gravity: table,
+        gravity_dot: table,
+        density_i: real,
+        density_dot_i: real,
         volume: real,
         inverse: matrix,
-        turns: wp.array2d(dtype=matrix),
-        by: sums,
-        later: moving,
-        given_dot: bundle(time_step_dot=real, density_dot=real),
-        gravity_dot: wp.array2d(dtype=vector),
-        turned_dot: wp.array2d(dtype=vector),
-        dot: bundle(V_0=vector, L_0=vector, pulled_sum=vector, twisted_sum=vector, V=vector, W=vector, L=vector),
-    ):
-        """The last three of ``dot`` are written."""
-        b = wp.tid()
-        k, turned, rho = step[b], turned_dot[b, number], density[b]
-        rho_dot, R = given_dot.density_dot[b] / rho, turns[b, number]
-        L_dot = dot.L_0[b] + dot.twisted_sum[b]
-        V_dot = dot.V_0[b] + time_step[b] * gravity_dot[b, k] + given_dot.time_step_dot[b] * gravity[b, k]
-        dot.V[b] = V_dot + (dot.pulled_sum[b] - rho_dot * by.pulled_sum[b]) / (rho * volume)
-        dot.L[b] = L_dot
-        W_dot = rate(R, inverse, L_dot - wp.cross(turned, later.L[b])) / rho
-        dot.W[b] = W_dot + wp.cross(turned, later.W[b]) - rho_dot * later.W[b]
+        turns: poses,
+        turned_dot: table,
+        V_0_dot_i: vector,
+        L_0_dot_i: vector,
+        pulled_sum_i: vector,
+        pulled_sum_dot_i: vector,
+        twisted_sum_dot_i: vector,
+        W_i: vector,
+        L_i: vector,
+    ) -> tuple[vector, vector, vector]:
+        turned, denser, R = turned_dot[i, number], density_dot_i / density_i, turns[i, number]
+        L_dot = L_0_dot_i + twisted_sum_dot_i
+        V_dot = V_0_dot_i + time_step_i * gravity_dot[i, step_i] + time_step_dot_i * gravity[i, step_i]
+        V_dot += (pulled_sum_dot_i - denser * pulled_sum_i) / (density_i * volume)
+        W_dot = rate(R, inverse, L_dot - wp.cross(turned, L_i)) / density_i
+        return V_dot, L_dot, W_dot + wp.cross(turned, W_i) - denser * W_i
 
     @wp.kernel(module=module, enable_backward=False)
     def move_adjoint(
