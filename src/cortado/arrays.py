@@ -156,7 +156,7 @@ def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
 
 
 def _is_masked(value: Any) -> bool:
-    """Whether entries are masked, of a masked array or of a list with masked arrays in it."""
+    """True for a masked array, or a list with masked arrays in it, that has masked entries."""
     if isinstance(value, np.ma.MaskedArray):
         return bool(np.ma.is_masked(value))
     return isinstance(value, (list, tuple)) and any(map(_is_masked, value))

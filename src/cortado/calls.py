@@ -1,4 +1,4 @@
-"""What users call says in a sentence which arguments a call lacks, has that are none, or has of another kind.
+"""Functions that users call say in a sentence which arguments a call lacks, has that are none, or has of another kind.
 
 Objects that do not change once they are made (`fixed`), and objects that stay in their process (`Staying`), refuse in a
 sentence too.
@@ -97,7 +97,7 @@ def told(function: F) -> F:
 
 
 def _misfit(function: Any, bound: BoundArguments) -> str | None:
-    """What to say of the first argument that is not of the type that the function has for it."""
+    """The sentence about the first argument that is not of the type that the function has for it."""
     try:
         hints = get_type_hints(function)
     except NameError:  # of types that are imported for the check of types alone
@@ -109,7 +109,7 @@ def _misfit(function: Any, bound: BoundArguments) -> str | None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of a type, as far as it can be told without going over what may be gone over once only."""
+    """True for a value of a type, as far as it can be told without going over what may be gone over once only."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -145,7 +145,7 @@ def _takes(function: Any, number: int) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """What a value of a type is called in a sentence."""
+    """The words for a value of a type in a sentence."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return " or ".join(dict.fromkeys(map(_words, inner)))

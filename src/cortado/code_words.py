@@ -1,4 +1,5 @@
-"""What something of a user's computes, as a text: its code, and the numbers, functions and objects that it reads."""
+"""The meaning of a user's function or object as a text, which is another where it computes something else: its code,
+and the numbers, functions and objects that it reads."""
 
 import sysconfig
 from collections.abc import Mapping
@@ -48,7 +49,7 @@ def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | Non
 
 
 def _parts(value: Any) -> Any:
-    """What tells a value: itself, or a list of what it consists of."""
+    """The parts by which a value is told from others: itself, or a list of what it consists of."""
     if isinstance(value, wp.Function) and value.func:
         forms = [*value.user_overloads.values(), *value.user_templates.values()] or [value]
         more = ("func", "custom_grad_func", "custom_replay_func", *SNIPPETS)
@@ -70,7 +71,7 @@ def _parts(value: Any) -> Any:
 
 
 def _is_told_by_name(value: Any) -> bool:
-    """Whether a module or a function is Cortado's or Python's."""
+    """True for a module or a function of Cortado's or Python's own."""
     file = value.__code__.co_filename if isfunction(value) else ""
     is_python = file.startswith(PYTHON) and "site-packages" not in file
     return is_python or (package_of(value) == "cortado" and (ismodule(value) or isfunction(value)))
@@ -82,7 +83,7 @@ def _of_code(code: CodeType) -> list[str]:
 
 
 def read_by(function: FunctionType) -> dict[str, Any]:
-    """What a function reads from outside of it, by name."""
+    """The values that a function reads from outside of it, by name."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     found = {name: function.__globals__[name] for name in names_in(function) if name in function.__globals__}
     return dict(sorted({**found, **{name: cell.cell_contents for name, cell in cells if cell != CellType()}}.items()))

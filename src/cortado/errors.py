@@ -1,4 +1,4 @@
-"""What can go wrong, each with one sentence for the user."""
+"""The errors and warnings of Cortado, each with one sentence for the user."""
 
 import sys
 import warnings
@@ -43,7 +43,7 @@ def unwarned() -> Iterator[None]:
 
 
 class InputError(CortadoError):
-    """What the user gave is wrong; takes the sentence that says so. Exit code 2."""
+    """Something that the user gave is wrong; takes the sentence that says so. Exit code 2."""
 
 
 class OutOfRangeError(InputError):

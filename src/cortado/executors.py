@@ -44,7 +44,7 @@ class Executor(ABC):
     """
 
     def threads(self) -> int:
-        """How many items are computed at a time."""
+        """The number of items that are computed at a time."""
         return 1
 
     @abstractmethod
@@ -158,7 +158,7 @@ class Distributed(Executor):
         return _Map(self, Payload.of(function), on_result).results(items)
 
     def threads(self) -> int:
-        """How many items workers compute at a time; raises `ComputationError` where the scheduler is lost."""
+        """The number of items that workers compute at a time; raises `ComputationError` where the scheduler is lost."""
         if self.client.status != "running":
             raise self.lost()
         try:

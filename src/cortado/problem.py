@@ -65,7 +65,7 @@ class ProblemForwardPass(Staying):
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the rollout."""
+        """The lock that a thread holds which uses the rollout."""
         return self.rollout.turn
 
     def _derivative(self, estimator: AdjointEstimator) -> BackwardStep:
@@ -212,7 +212,7 @@ class Problem:
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the problem's simulation."""
+        """The lock that a thread holds which uses the problem's simulation."""
         return self.simulation.turn
 
     @in_turn

@@ -136,7 +136,8 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """What sentences call the solver, if it has fields of its own in states: then no other goes on from them."""
+        """The name of the solver in sentences, if it has fields of its own in states: then no other goes on from
+        them."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -144,7 +145,7 @@ class Simulation(Stepping):
         return _made_again, (self._made_of(self.precision.name, self.batch), self._points)
 
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
-        """What a simulation of the same scene is made from."""
+        """The arguments from which a simulation of the same scene is made."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return self.scene, self.device.alias, precision, energy, batch, *self._given, self._lanes
 
@@ -165,7 +166,7 @@ class Simulation(Stepping):
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the simulation."""
+        """The lock that a thread holds which uses the simulation."""
         return self.solver.turn
 
     @in_turn
@@ -228,11 +229,11 @@ class Simulation(Stepping):
         return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """What a trajectory records of a state: the fields that steps change."""
+        """The fields of a state that a trajectory records: those that steps change."""
         return state.numpy(self.dimension, only=[field.name for field in state.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
-        """How many numbers `frame` records at most, if vectors have so many components."""
+        """The number of numbers that `frame` records at most, if vectors have so many components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
@@ -310,8 +311,8 @@ class Simulation(Stepping):
         return made
 
     def renderer(self, **settings: Any) -> Renderer:
-        """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
-        table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+        """The renderer that takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates
+        them: as the table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
 
         ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
         look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
@@ -357,8 +358,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """How many runs of so many steps are worth one launch, and fit half of the memory that is free, with at most so
-        many bytes of ``checkpoints`` in all."""
+        """The number of runs of so many steps that are worth one launch, and fit half of the memory that is free, with
+        at most so many bytes of ``checkpoints`` in all."""
         neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)

@@ -116,7 +116,7 @@ class Steps(torch.nn.Module):
 
 
 def _key(name: str) -> str:
-    """What PyTorch calls a parameter, whose name may have a point."""
+    """The name that PyTorch has for a parameter, whose name may have a point."""
     return name.replace(".", "/")
 
 

@@ -1,4 +1,4 @@
-"""What is looked at of a run's states while it runs: quantities of recorded frames, and sensors in every step."""
+"""Looking at a run's states while it runs: quantities of recorded frames, and sensors in every step."""
 
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -87,6 +87,6 @@ class Watch:
         self._log.go_on(steps, readings)
 
     def readings(self) -> dict[str, Readings]:
-        """What the sensors have read, by their names."""
+        """The readings of the sensors, by their names."""
         clock, steps = self._rollout.clocks[0], np.arange(self._rollout.steps + 1)
         return self._log.readings(clock.times(steps, float(self._rollout.time_steps[0])))

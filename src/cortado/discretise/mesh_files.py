@@ -113,7 +113,7 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
 
 
 def _is_single(path: str) -> bool:
-    """Whether a file has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
+    """True for a file that has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
     suffix = Path(path).suffix.lower()
     if suffix in (".stl", ".ply"):
         with open(path, "rb") as file:

@@ -212,8 +212,8 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """How thick it is at least between sides that are nearly parallel, and share no corner [m]; infinite where no
-        two face each other."""
+        """The least thickness between sides that are nearly parallel, and share no corner [m]; infinite where no two
+        face each other."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]

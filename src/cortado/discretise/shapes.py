@@ -158,7 +158,7 @@ def whole_origin(points: Points) -> Points:
 
 
 def whole_cells(lengths: Points, spacing: float) -> Points:
-    """How many cells fit into lengths [m], any shape."""
+    """The numbers of cells that fit into lengths [m], any shape."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 

@@ -165,7 +165,7 @@ class Solid(ABC):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether all of it is in the box around it."""
+        """False for a solid without an end, which its box does not hold."""
         return True
 
     @abstractmethod

@@ -157,7 +157,7 @@ def find_windings(
     # out
     windings: wp.array(dtype=wp.int32),
 ):
-    """How often closed surfaces go around a point: 1 within one whose normals point outwards, 0 outside."""
+    """The winding numbers of closed surfaces about points: 1 within one whose normals point outwards, 0 outside."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -181,7 +181,7 @@ def find_windings(
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Whether a segment goes through the inside of a triangle, and further than a tolerance to both sides."""
+    """True for a segment that goes through the inside of a triangle, and further than a tolerance to both sides."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -207,7 +207,7 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """Whether an edge of triangle s that has no vertex of triangle t goes through it."""
+    """True where an edge of triangle s that has no vertex of triangle t goes through t."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """How many cells fill a length [m] best, at least 1."""
+    """The number of cells that fill a length [m] best, at least 1."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 

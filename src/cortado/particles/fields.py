@@ -1,4 +1,4 @@
-"""What a state consists of, as solvers and their parts declare it. Without Warp."""
+"""The fields that a state consists of, as solvers and their parts declare them. Without Warp."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from cortado.scene.parameters import Axis, Parameter
 
 
 class Entry(Enum):
-    """What a field holds for each thing that it describes."""
+    """The kind of entry that a field holds for each thing that it describes."""
 
     NUMBER = "a number"
     VECTOR = "a vector"
@@ -67,7 +67,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """What fields begin as, by their names, of those whose parameter is among the given ones."""
+    """The first values of fields whose parameter is among the given ones, by their names."""
     found = {}
     for field in fields:
         if field.first is not None and field.first in parameters:

@@ -1,7 +1,7 @@
-"""What a sum over neighbours reads of particles and of wall particles.
+"""Reading the entries of particles and of wall particles in a sum over neighbours.
 
-It is read without the count from an array's end that Warp's own indices allow: a negative index takes a comparison and
-an addition, for every neighbour and every array.
+They are read without the count from an array's end that Warp's own indices allow: a negative index takes a comparison
+and an addition, for every neighbour and every array.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,5 @@
-"""What a particle sees: its neighbours, the walls and images in these, as one argument of kernels that sum over them.
+"""The neighbourhood of a particle: other particles, walls and images in these, as one argument of kernels that sum over
+them.
 
 Flat walls mirror the fluid: an image of particle j is what one of them mirrors, or two or three that meet. A reflection
 has a bit for each wall: 1, 2 and 4 for those at the lower ends of the axes, 8, 16 and 32 for the upper ones. It is
@@ -291,22 +292,21 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     def sixes(a: wp.array(dtype=six), j: wp.vec4i) -> six_rows:
         return wp.matrix_from_rows(load_six(a, j[0]), load_six(a, j[1]), load_six(a, j[2]), load_six(a, j[3]))
 
+    of_kernel = (
+        weight,
+        slope,
+        slope_change,
+        slope_gradient,
+        gradient,
+        hessian_product,
+        per_size,
+        factor,
+        factor_gradient,
+    )
+    own = (*of_kernel, neighbour, several, vectors, numbers, sixes)
     return SimpleNamespace(
         separation=nearest_image if discretisation.periodic else difference,
-        weight=weight,
-        slope=slope,
-        slope_change=slope_change,
-        slope_gradient=slope_gradient,
-        gradient=gradient,
-        hessian_product=hessian_product,
-        per_size=per_size,
-        factor=factor,
-        factor_gradient=factor_gradient,
-        neighbour=neighbour,
+        **{one.func.__name__: one for one in own},
         **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
         **mirror_functions(discretisation.precision, neighbourhood),
-        several=several,
-        vectors=vectors,
-        numbers=numbers,
-        sixes=sixes,
     )

@@ -167,7 +167,7 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 
 def scope_of(d: Discretisation) -> dict[str, Any]:
-    """What the texts of loops over neighbours know by name: types, and the functions of pairs."""
+    """The names that texts of loops over neighbours know: types, and the functions of pairs."""
     precision = d.precision
     types = {"_real": precision.real, "_vector": precision.vector, "_neighbourhood": neighbourhood_type(precision)}
     return {**{f"_{name}": function for name, function in vars(pair_functions(d)).items()}, **types}
@@ -227,8 +227,8 @@ def image_sum(d: Discretisation) -> Decorator:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """What gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum` where some
-    walls have no slip, and `fluid_sum` where all slip freely."""
+    """A function that gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum`
+    where some walls have no slip, and `fluid_sum` where all slip freely."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, ahead)

@@ -164,9 +164,9 @@ def sum_kernels(
     **renamed: str,
 ) -> Kernels:
     """The three kernels of one sum, each in its own of the Warp ``modules``, given the sum with its tangent and its
-    adjoint, as `cortado.particles.by_hand` notes them: of ``result`` = ``before`` + ``times`` the sum / ``per``, where
-    ``before`` is an array, and the others are texts, all of which may be left out. Adjoints are added to those of
-    arrays and of scenes, but for those of arrays that are ``written``."""
+    adjoint, as `cortado.particles.pair_sums` notes them. It is of ``result`` = ``before`` + ``times`` the sum /
+    ``per``, where ``before`` is an array, and the others are texts, all of which may be left out. Adjoints are added to
+    those of arrays and of scenes, but for those of arrays that are ``written``."""
     total, tangent, adjoint = sums
     told = {**renamed, **dotted(renamed)}
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]

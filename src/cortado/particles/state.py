@@ -1,4 +1,4 @@
-"""What a step depends on, as Warp arrays by name: the state before it, the sorted particles, and the parameters.
+"""The inputs of a step as Warp arrays by name: the state before it, the sorted particles, and the parameters.
 
 Vectors have three components on a device, z is 0 in 2-D.
 """
@@ -203,7 +203,7 @@ class StateSeries:
 
 
 class Parameters(Arrays):
-    """What steps depend on besides the state, by the names of parameters. Also the type of its derivatives.
+    """The inputs of steps besides the state, by the names of parameters. Also the type of its derivatives.
 
     A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, any other
     (members,) numbers or vectors, with one member for each scene of a batch.
@@ -216,7 +216,7 @@ class Parameters(Arrays):
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
-        """What `set` has written, by name; `set_row` writes to it."""
+        """The values that `set` has written, by name; `set_row` writes to it."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
@@ -253,7 +253,7 @@ class Parameters(Arrays):
 
 @dataclass(frozen=True)
 class Layout:
-    """How large the arrays of one solver are, and where they are: those of one scene, or of several in one launch, one
+    """The sizes of the arrays of one solver, and their device: those of one scene, or of several in one launch, one
     behind the other. A kernel has one thread for each particle of all of them."""
 
     particles: int
@@ -268,7 +268,7 @@ class Layout:
 
     @property
     def members(self) -> int:
-        """How many scenes there are."""
+        """The number of scenes."""
         return self.batch or 1
 
     @property

@@ -237,7 +237,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
 
 
 def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
-    """What kernels see of a camera whose samples are so far apart [m]."""
+    """The struct by which kernels know a camera whose samples are so far apart [m]."""
     struct = camera_type(precision)()
     struct.position = precision.vector(*camera.position)
     struct.orientation = type(struct.orientation)(*camera.orientation.ravel())
@@ -249,7 +249,7 @@ def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
 
 
 def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any:
-    """What kernels see of how a view changes whose samples are so far apart [m]."""
+    """The struct by which kernels know the change of a view whose samples are so far apart [m]."""
     struct = camera_tangent_type(precision)()
     struct.position, struct.turn = precision.vector(*along.translation), precision.vector(*along.rotation)
     struct.half_width, struct.growth = along.half_width

@@ -28,7 +28,7 @@ def positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """What all cameras have. Samples along a ray stand at fixed distances between ``near`` and ``far``."""
+    """The base of all cameras. Samples along a ray stand at fixed distances between ``near`` and ``far``."""
 
     position: Vector
     """[m], (3,)"""

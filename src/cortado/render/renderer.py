@@ -233,7 +233,7 @@ class Renderer:
             raise InputError(f"There is no picture to differentiate; call render before {method}.")
 
     def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
-        """What `render` was given, a frame taken apart, and what was left out filled in."""
+        """The arguments of `render`, a frame taken apart, and what was left out filled in."""
         if hasattr(positions, "positions"):
             frame, positions = positions, positions.positions
             fractions = frame.mass_fractions if fractions is None else fractions

@@ -27,7 +27,7 @@ CAMERA = ("position", "look_at", "field_of_view", "extinction")
 
 
 class Pictured(Protocol):
-    """What is asked of a `cortado.Simulation`."""
+    """A `cortado.Simulation` as its renderer knows it."""
 
     scene: Scene
     positions: np.ndarray

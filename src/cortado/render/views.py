@@ -1,4 +1,4 @@
-"""What a picture shows: a camera, how opaque the fluid is, what stands behind it, and how such a view changes.
+"""Views: a camera, how opaque the fluid is, what stands behind it, and how such a view changes.
 
 A view may not be known exactly: `Calibration` has the numbers of its camera as parameters.
 """
@@ -22,7 +22,7 @@ NUDGE = 1e-6
 
 
 class View(Protocol):
-    """What the renderer asks of a view."""
+    """A view as the renderer knows it."""
 
     @property
     def camera(self) -> Camera: ...
@@ -122,7 +122,7 @@ class TopView:
 
 @dataclass(frozen=True)
 class ViewTangent:
-    """How a view changes: the direction of a derivative."""
+    """The change of a view: the direction of a derivative."""
 
     translation: Vector = ZERO
     """Of the camera (3,) [m]."""
@@ -177,7 +177,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """How the view with these values changes along directions of some of them."""
+        """The change of the view with these values along directions of some of them."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

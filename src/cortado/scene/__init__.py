@@ -1,4 +1,4 @@
-"""What a user writes: the tables of a scene, checked and frozen, its parameters, and the particles it is cut into."""
+"""Scenes as users write them: their tables, checked and frozen, its parameters, and the particles it is cut into."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""What a scene looks like in pictures: materials, lights, cameras, and the tables [picture] and [render].
+"""The looks of a scene in pictures: materials, lights, cameras, and the tables [picture] and [render].
 
 Nothing that is computed depends on it. Colours are linear, from 0 to 1.
 """
@@ -341,7 +341,7 @@ class Picture(Table):
 
     @property
     def searched_frames(self) -> int:
-        """How many states a search records for its films, at most."""
+        """The number of states that a search records for its films, at most."""
         return SEARCHED_FRAMES if self.film_frames is None else self.film_frames
 
     @field_validator("look_at")

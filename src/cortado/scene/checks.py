@@ -1,4 +1,4 @@
-"""What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises a `field_error`."""
+"""Checks of a scene as a whole: its names, its sizes, and where the fluid is. Each check raises a `field_error`."""
 
 from itertools import product
 from typing import Any

@@ -154,7 +154,7 @@ class MeshShape(Table):
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest_sheet(self, spacing: float) -> float:
-        """How thick its thinnest sheet is [m]; infinite where all are thicker than `THIN` spacings [m]."""
+        """The thickness of its thinnest sheet [m]; infinite where all are thicker than `THIN` spacings [m]."""
         return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
 
 

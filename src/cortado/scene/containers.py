@@ -25,12 +25,12 @@ class Container(Table):
 
     @property
     def sticks(self) -> bool:
-        """Whether its walls have no slip."""
+        """True where its walls have no slip."""
         return getattr(self, "slip", "free") == "no"
 
     @property
     def finish(self) -> Finish | None:
-        """What its walls look like; None if the scene says nothing of it."""
+        """The finish of its walls; None if the scene says nothing of it."""
         material, colour = getattr(self, "material", None), getattr(self, "colour", None)
         if material is None:
             return None if colour is None else Finish(colour)
@@ -64,7 +64,7 @@ class Container(Table):
 
     @abstractmethod
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """What closes it, as solids, up to ``reach`` [m] beyond the ends of a period."""
+        """The solids that close the container, up to ``reach`` [m] beyond the ends of a period."""
 
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""

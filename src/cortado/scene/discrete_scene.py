@@ -3,7 +3,6 @@
 It is the same for every device, every precision and every engine.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,15 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.calibration import (
-    lattice_laplacian_correction,
-    pressure_stiffness,
-    rest_volume,
-    wall_response,
-)
+from cortado.discretise.calibration import lattice_laplacian_correction, pressure_stiffness, rest_volume, wall_response
 from cortado.discretise.packing import Packing
 from cortado.discretise.room import Domain, Region, Room
-from cortado.discretise.shapes import Points, check_crowding
+from cortado.discretise.shapes import Points, Rows, check_crowding
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
@@ -53,7 +47,7 @@ NEAREST_PLACE = 0.4
 
 
 @dataclass(frozen=True)
-class Walls:
+class Walls(Rows):
     """Wall particles, those at rest first."""
 
     positions: Points
@@ -74,11 +68,6 @@ class Walls:
         """Those of the container, with the weights that were found; whether all stick, or each of them (b,)."""
         grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
         return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
-
-    @classmethod
-    def joined(cls, parts: Sequence["Walls"]) -> "Walls":
-        """One behind the other."""
-        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
@@ -236,7 +225,7 @@ class Lattice:
 
 @dataclass(frozen=True)
 class DiscreteScene:
-    """What a solver starts from, besides what the scene says itself."""
+    """The particles, walls and constants that a solver starts from, besides the scene itself."""
 
     kernel: SmoothingKernel
     """The smoothing kernel W."""

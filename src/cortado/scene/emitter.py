@@ -68,14 +68,14 @@ class EmitterTable(FluidBody):
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
     def layers(self, spacing: float) -> float:
-        """How many layers the column has, with their middle within its length, or all if they are fewer: a whole number
-        that may be larger than any array."""
+        """The number of layers of the column, with their middle within its length, or all if they are fewer: a whole
+        number that may be larger than any array."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.duration is None else min(within, self.supply(spacing))
 
     def supply(self, spacing: float) -> float:
-        """How many layers there are, with those in reserve."""
+        """The number of layers, with those in reserve."""
         if self.duration is None:
             return self.layers(spacing)
         return float(max(math.ceil(self.duration * self.speed(spacing) / spacing - ROUND_OFF), 1))

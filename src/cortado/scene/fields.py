@@ -26,7 +26,7 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """What is wrong with a field.
+    """An error in a field: its path, what was found, and what was wanted.
 
     Its ``repr`` does not show the value that was found, as pydantic puts it into messages, and the value may be of any
     length.

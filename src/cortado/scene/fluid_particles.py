@@ -32,8 +32,8 @@ DIGITS = 6
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Whether particles of a body may have another density than the lattice: where its own surface cuts cells, or where
-    it is no further than ``reach`` [m] from a solid."""
+    """True where particles of a body may have another density than the lattice: where its own surface cuts cells, or
+    where it is no further than ``reach`` [m] from a solid."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
@@ -97,7 +97,7 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _cuts_cells(self) -> bool:
-        """Whether a surface goes through cells: that of the body, or that of a solid."""
+        """True where a surface goes through cells: that of the body, or that of a solid."""
         if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
@@ -106,7 +106,7 @@ class CutBody:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What lies around bodies that were cut: particles that stay where they are, air, and walls."""
+    """The surroundings of bodies that were cut: particles that stay where they are, air, and walls."""
 
     bodies: tuple[CutBody, ...]
     staying: Points

@@ -1,4 +1,4 @@
-"""What changes while a scene runs: parameters over time, as values at some times, and solids that move, are turned and
+"""Changes while a scene runs: parameters over time, as values at some times, and solids that move, are turned and
 change their size. States have the fields of solids by the names that are made here."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

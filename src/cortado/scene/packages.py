@@ -31,7 +31,7 @@ OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
 
 
 def _in_words(problem: BaseException, package: str) -> str:
-    """What a package raised, and where, without the full stop."""
+    """The error that a package raised, and where, in words without the full stop."""
     try:
         text = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".: ")
     except Exception:  # words of its own that cannot be made
@@ -57,7 +57,7 @@ def guarded(
 
 
 class PackageMaker:
-    """What a package makes of a table, as `Simulation` takes it; what it makes in turn is guarded too."""
+    """The part that a package makes of a table, as `Simulation` takes it; what it makes in turn is guarded too."""
 
     def __init__(self, part: Any, kind: str, package: str):
         """``kind``: the name that the package gives it; ``package``: what sentences call that."""
@@ -99,8 +99,8 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """What a part of a package made, such as a solver: the methods and properties of its class are guarded from then
-    on, and what they return."""
+    """An object that a part of a package made, such as a solver: the methods and properties of its class are guarded
+    from then on, and what they return."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
@@ -169,7 +169,7 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
 
 
 def _package_of(entry: EntryPoint) -> str:
-    """What sentences call a package."""
+    """The name of a package in sentences."""
     return f"the package {entry.dist.name}" if entry.dist is not None else f"the package of {entry.value}"
 
 
@@ -234,8 +234,8 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """What checks a value, and what it must be, in words; of other annotations than plain types and fields of scenes
-    whoever is given the value judges it."""
+    """The check of a value, and what the value must be, in words; of other annotations than plain types and fields of
+    scenes whoever is given the value judges it."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -257,7 +257,8 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """What a factory makes of the keys of a table, which must have a method of that name; raises a `SceneError`."""
+    """The part that a factory makes of the keys of a table, which must have a method of that name; raises a
+    `SceneError`."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)

@@ -140,7 +140,7 @@ class Known(Mapping[str, Parameter]):
         """How these change while a scene runs."""
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """Whether a value of a parameter has rows in time: one for each step, or for each of some knots."""
+        """True for a value of a parameter that has rows in time: one for each step, or for each of some knots."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
@@ -179,7 +179,7 @@ follow, and runs that go on have their own."""
 
 
 def argument(name: str) -> str:
-    """What arguments of kernels call a parameter: ``drag_k`` is that of ``drag.k``."""
+    """The name of a parameter among arguments of kernels: ``drag_k`` is that of ``drag.k``."""
     return name.replace(".", "_")
 
 
@@ -213,7 +213,7 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 
 
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
-    """Whether there is such a parameter, and a scene has it; raises `InputError`."""
+    """Raises `InputError` for a parameter that there is not, or that a scene does not have."""
     if name not in known or known[name].role is Role.CLOCK:
         owner = str(name).rpartition(".")[0]
         if owner in (solid.name for solid in scene.solid if not solid.moves):
@@ -235,7 +235,7 @@ def require_points(points: object) -> None:
 
 
 def is_too_small(array: np.ndarray, allowed: Range) -> bool:
-    """Whether a number is below a range that begins at 0."""
+    """True where a number is below a range that begins at 0."""
     if allowed is Range.POSITIVE:
         return bool((array <= 0.0).any())
     return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 class Axis(Enum):
-    """What a parameter has a value for."""
+    """The things for each of which a parameter has a value."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -24,7 +24,7 @@ class Axis(Enum):
 
 
 class Role(Enum):
-    """What a parameter is to a run."""
+    """The part that a parameter plays in a run."""
 
     RUN = "what steps depend on"
     STATE = "part of the first state"
@@ -52,7 +52,7 @@ class Source(Protocol):
 
 
 class Changing(Protocol):
-    """How a parameter changes while a scene runs, at times (n,) [s]."""
+    """The course of a parameter while a scene runs, at times (n,) [s]."""
 
     def at(self, times: NDArray) -> NDArray:
         """(n,) numbers or (n, components)."""
@@ -106,7 +106,7 @@ class Parameter:
 
     @property
     def rank(self) -> int:
-        """How many axes the value has for one step, one phase or one particle: 1 of a vector."""
+        """The number of axes that the value has for one step, one phase or one particle: 1 of a vector."""
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:

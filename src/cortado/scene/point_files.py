@@ -199,7 +199,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 
 def _read_apart(path: str, size: int) -> Any:
-    """What another process reads: see `cortado.scene.point_files`."""
+    """The points that another process reads: see `cortado.scene.point_files`."""
     limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory

@@ -11,7 +11,7 @@ from cortado.errors import InputError, shown
 
 
 class Kind(Enum):
-    """How many numbers a quantity has for each particle."""
+    """The numbers that a quantity has for each particle."""
 
     NUMBER = "a number"
     VECTOR = "a vector"
@@ -20,7 +20,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a state decides of each particle, together with the parameters of the step after it."""
+    """A quantity of each particle that follows from a state and the parameters of the step after it."""
 
     name: str
     unit: str
@@ -67,7 +67,7 @@ def load_name(solid: str) -> str:
 
 
 def is_load(name: object) -> bool:
-    """Whether a name is that of a load; who computes it says whether there is such a solid."""
+    """True for the name of a load; who computes it says whether there is such a solid."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 

@@ -1,4 +1,4 @@
-"""What a run needs to go on from where another one stopped, bit for bit: a state, and when it is."""
+"""States from which a run goes on where another one stopped, bit for bit, and when they are."""
 
 import json
 from collections.abc import Mapping
@@ -80,7 +80,7 @@ class Origin:
 
     @classmethod
     def from_json(cls, text: str) -> "Origin":
-        """What `to_json` wrote; raises `ValueError` or `TypeError` for anything else."""
+        """The origin that `to_json` wrote; raises `ValueError` or `TypeError` for anything else."""
         read: dict[str, Any] = json.loads(text)
         values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
         return cls(**values)

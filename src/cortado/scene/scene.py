@@ -1,4 +1,4 @@
-"""What the user writes: a scene, from a TOML file or in Python, checked and frozen.
+"""A scene as users write it, in a TOML file or in Python, checked and frozen.
 
 Whatever is wrong raises a `SceneError`, one sentence.
 """
@@ -133,7 +133,7 @@ class Scene(SceneTables):
 
 
 def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
-    """What to say of numbers that look as if they had another unit."""
+    """Sentences about numbers that look as if they had another unit."""
     for phase in scene.phase:
         if phase.rest_density < LIGHTEST:
             found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
@@ -149,8 +149,8 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """What to say of fluid that weighs so much that its lengths may be in millimetres; None where it does not, or where
-    gravity is not the Earth's in metres."""
+    """The sentence about fluid that weighs so much that its lengths may be in millimetres; None where it does not, or
+    where gravity is not the Earth's in metres."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
@@ -203,7 +203,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def scene_in_words(scene: Scene, particles: int) -> str:
-    """What is in a scene that has so many particles, what holds it, and what acts on it; one sentence."""
+    """One sentence about a scene that has so many particles: what is in it, what holds it, and what acts on it."""
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )

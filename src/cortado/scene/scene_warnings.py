@@ -43,7 +43,7 @@ def check_idle(scene: SceneTables) -> None:
 
 
 def idle_sentences(scene: SceneTables) -> Iterator[str]:
-    """What to say of keys that a number of 0 turns off."""
+    """Sentences about keys that a number of 0 turns off."""
     for path, table, names, reason in _turned_off(scene):
         for name in given(table, *names):
             yield f"{field_name((*path, name))} changes nothing, as {reason}."
@@ -149,12 +149,12 @@ FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the di
 
 
 def wall_sentence(scene: SceneTables) -> str | None:
-    """What to say of a scene whose walls hold the fluid back; None if there is nothing."""
+    """The sentence about a scene whose walls hold the fluid back; None if there is nothing."""
     return _sentence(scene, 'slip is "no" at walls') if scene.sticks else None
 
 
 def parameter_sentence(scene: SceneTables) -> str | None:
-    """What to say where the viscosity is a parameter of a problem; None if there is nothing."""
+    """The sentence about a viscosity that is a parameter of a problem; None if there is nothing."""
     return _sentence(scene, "the viscosity is a parameter")
 
 
@@ -196,7 +196,7 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """Whether a path does not turn a solid, and keeps its middle as far from a wall across an axis."""
+    """True for a path that does not turn a solid, and keeps its middle as far from a wall across an axis."""
     shifts, turns = courses(table)
     if turns.greatest() > 0.0:
         return False
@@ -218,7 +218,7 @@ SHARE = 0.01
 
 
 def holding_thickness(cut: DiscretisationTable) -> float:
-    """How thick walls are at least that hold fluid [m]."""
+    """The least thickness of walls that hold fluid [m]."""
     return (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
 
 

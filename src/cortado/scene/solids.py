@@ -88,7 +88,7 @@ class SolidTable(Coloured):
 
     @property
     def finish(self) -> Finish:
-        """What its surface looks like."""
+        """The finish of its surface."""
         plain = Finish(self.plain, transparency=float(self.side == "inside"))
         own = plain if self.material is None else FINISHES[self.material]
         clear = own.transparency if self.transparency is None else self.transparency
@@ -96,12 +96,12 @@ class SolidTable(Coloured):
 
     @property
     def sticks(self) -> bool:
-        """Whether fluid has no slip along it."""
+        """True where fluid has no slip along it."""
         return self.slip == "no"
 
     @property
     def moves(self) -> bool:
-        """Whether it or its surface moves."""
+        """True where it or its surface moves."""
         return self.motion != "fixed" or self.surface_velocity is not None
 
     def middle(self) -> Points:
@@ -172,7 +172,7 @@ def _times(scale: float, value: Any) -> Any:
 
 
 def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
-    """What a path has fits together."""
+    """Raises a `field_error` where the keys of a motion do not fit together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
     if solid.density is not None and solid.motion != "free":
@@ -389,7 +389,7 @@ class CupSolid(SolidTable):
         return self.thickness
 
     def _middle(self) -> float:
-        """How high its centroid is above the base [m]."""
+        """The height of its centroid above the base [m]."""
         power = len(self.base) - 1
         solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
         whole, cavity = solid * self.height, hollow * (self.height - self.thickness)

@@ -55,7 +55,7 @@ class SolverTable(Table):
 
     @property
     def chooses(self) -> bool:
-        """Whether the time step is chosen before each step."""
+        """True where the time step is chosen before each step."""
         return self.time_step == "auto"
 
     def fixed_time_step(self, what: str) -> float:
@@ -134,7 +134,8 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """What a solver, or a table that will be one, wants of other tables where none of the keys of an entry is given."""
+    """The entries of other tables that suit a solver, or a table that will be one, where none of their keys is
+    given."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

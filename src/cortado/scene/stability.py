@@ -17,14 +17,14 @@ from cortado.scene.solvers import ProjectionSolver
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
-    """What gravity (k, d) [m/s2] gives at most to fluid that falls through the whole room, per mass [J/kg]."""
+    """The most energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls through the whole room."""
     lower, upper = _extent(scene)
     return float((np.abs(gravity) @ (upper - lower)).max())
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """What gravity (k, d) [m/s2] gives at most to fluid that falls to the foot of a solid, per mass [J/kg]. It falls
-    from where fluid, or a free body, is highest at the start or comes out; ``values`` of parameters replace the
+    """The most energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls to the foot of a solid. It
+    falls from where fluid, or a free body, is highest at the start or comes out; ``values`` of parameters replace the
     scene's. That of the `greatest_fall` where something else raises fluid or takes the solid down: where gravity
     changes or goes around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What values
     say of each step of a path is not looked at."""
@@ -113,7 +113,7 @@ with walls 1.25 to 2 spacings thick those of 0.4 to 0.65 of their thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """What bounds the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
+    """The bounds of the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
     the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself
     (`gravity_limits`), so that here the scene's counts, or the weakest of a schedule, whose others bound the steps in
     which they act. So do paths of solids. Where nothing else bounds the steps, the strongest gravity and the fastest
@@ -146,7 +146,7 @@ def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """What to try where a run diverged with parameters that replace the scene's: with the limit that its time step [s]
+    """The advice where a run diverged with parameters that replace the scene's: with the limit that its time step [s]
     breaks, if any. A time step that is chosen breaks none."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
@@ -222,8 +222,8 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Whether the viscous force is a stress that acts as velocities are at the end of a step, in a scene in which these
-    ``values`` of parameters replace its own."""
+    """True where the viscous force is a stress that acts as velocities are at the end of a step, in a scene in which
+    these ``values`` of parameters replace its own."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False

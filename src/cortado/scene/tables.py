@@ -125,7 +125,7 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
 
 
 def _is_out_of_size(number: float, schema: Schema) -> bool:
-    """Whether it is too large or, above 0, too small for any quantity."""
+    """True for a number that is too large or, above 0, too small for any quantity."""
     tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
     return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
 
@@ -161,7 +161,7 @@ def _whole(part: Schema) -> Schema:
 
 
 def wanted(schema: Schema, name: str = "") -> str:
-    """What a value must be, in words, from its part of a JSON schema; ``name`` is that of its field."""
+    """The words for what a value must be, from its part of a JSON schema; ``name`` is that of its field."""
     match schema:
         case {"enum": names}:
             return _any_of(names)
@@ -199,7 +199,7 @@ def _any_of(names: Iterable[str]) -> str:
 
 
 def _limits(schema: Schema) -> str:
-    """What a number must be."""
+    """The words for what a number must be."""
     unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
     least, most = schema["minimum"], schema["maximum"]
     limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
@@ -295,7 +295,7 @@ class Table(BaseModel):
 
 
 def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCustomError:
-    """What is raised of a vector that has another number of components."""
+    """The error of a vector that has another number of components than there are dimensions."""
     wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
     return field_error(path, value, wanted)
 

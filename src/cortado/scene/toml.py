@@ -156,7 +156,7 @@ def _entry(tables: list[Any], part: str) -> int | None:
 
 
 def _entries(tables: list[Any]) -> str:
-    """How the entries of a list are addressed."""
+    """The words that say how entries of a list are addressed."""
     if not tables:
         return "left out, as the list is empty"
     names = _names(tables)
@@ -200,7 +200,7 @@ def _schema() -> JsonSchema:
 
 
 def _part(schema: JsonSchema, part: str) -> JsonSchema:
-    """What an entry of a list, by its number, or of a table may be."""
+    """The schema of an entry of a list, by its number, or of a table."""
     found: JsonSchema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
     return found
 
