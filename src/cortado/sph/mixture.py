@@ -98,7 +98,8 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         c_scene_bar: wp.array(dtype=fractions),
     ) -> tuple[fractions, fractions, fractions]:
         """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
-        c_bar, rest_density_bar, viscosity_bar = c_scene_bar[order_i], fractions(), fractions()
+        c_bar = fractions(c_scene_bar[order_i])  # a copy: what follows writes to its components
+        rest_density_bar, viscosity_bar = fractions(), fractions()
         power_bar = mu_bar_i * mu_i
         for k in range(wp.static(phases)):
             by_volume = rho_0_bar_i * rho_0_i * rho_0_i / rest_density[member, k]
