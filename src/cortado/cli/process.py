@@ -115,14 +115,8 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)", r"\2 is '\1', but must be one of \3"),
     (r"Error parsing (\S+): invalid literal for int.*?: (.*)", r"\1 is \2, but must be a whole number"),
     (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2, but must be a number"),
-    (
-        r"Error parsing (\S+): no type .*\|INT .*? from \[(.*?)\]\. .*",
-        r"\1 is \2, but must be a whole number",
-    ),
-    (
-        r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*",
-        r"\1 is \2, but must be a number",
-    ),
+    (r"Error parsing (\S+): no type .*\|INT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a whole number"),
+    (r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a number"),
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
 """What tyro says, and what we say; where its words are none of these, as of another release, they come as they are."""

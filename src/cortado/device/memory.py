@@ -99,11 +99,7 @@ def available(device: Any = None) -> float:
     """[bytes] that are free on a device as Warp has it, or for this process on a CPU; infinite where nobody says."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
-    return max(min(_of_machine(), _of_container(), _of_process()), 0.0)
-
-
-def _of_machine() -> float:
-    return float(psutil.virtual_memory().available)
+    return max(min(float(psutil.virtual_memory().available), _of_container(), _of_process()), 0.0)
 
 
 def _of_container() -> float:

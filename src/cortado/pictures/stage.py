@@ -275,8 +275,7 @@ class Stage:
     @property
     def glass_ends(self) -> tuple[Points, Points]:
         """Lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
-        points = self.placed(corners(*self.container.extent())) @ self.glass_frame.T
-        return points.min(axis=0), points.max(axis=0)
+        return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:

@@ -150,13 +150,10 @@ def sized(scene: Scene, motions: Mapping[str, SolidMotion]) -> Scene:
 
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
     """The same where they are in a frame, to be drawn."""
-    tables = [
-        _posed(table, motions[table.name], frame) if table.name in motions else table
-        for table in sized(scene, motions).solid
-    ]
+    tables = []
+    for table in sized(scene, motions).solid:
+        if motion := motions.get(table.name):
+            rotation = tuple(np.atleast_1d(motion.rotations[frame]).tolist())
+            table = table.model_copy(update={"position": tuple(motion.positions[frame].tolist()), "rotation": rotation})
+        tables.append(table)
     return scene.model_copy(update={"solid": tuple(tables)})
-
-
-def _posed(table: Any, motion: SolidMotion, frame: int) -> Any:
-    rotation = tuple(np.atleast_1d(motion.rotations[frame]).tolist())
-    return table.model_copy(update={"position": tuple(motion.positions[frame].tolist()), "rotation": rotation})

@@ -123,13 +123,12 @@ def make_dataset(
         failed: list[int] = []
         with (
             (where if left else HERE).executor(device, len(left)) as executor,
-            keeping(kept),
             _saying(kept),
             track(len(left), "data set") as advance,
         ):
             executor.map(member, left, note)
         there, notes, failures = _finished(parts, split)
-        with keeping(kept), _saying(kept):
+        with _saying(kept):
             sizes = _put_together(member, there, notes)
     _warn(told, failures, runs)
     return f"The data set is in {absolute}: {sizes}."
@@ -137,9 +136,10 @@ def make_dataset(
 
 @contextmanager
 def _saying(kept: Callable[[], str]) -> Iterator[None]:
-    """A disk that refuses is said together with what is ``kept``."""
+    """A disk that refuses, and an interruption, are said together with what is ``kept``."""
     try:
-        yield
+        with keeping(kept):
+            yield
     except ComputationError as error:
         raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
 
