@@ -90,7 +90,7 @@ def test_a_cubic_metre_of_water_is_a_tonne():
     ],
 )
 def test_a_run_has_the_steps_and_the_frames_that_were_told(time, steps, choice):
-    told = RunLength.of(cortado.Simulation("scene.toml"), steps, time, choice)
+    told = RunLength(cortado.Simulation("scene.toml"), steps, time, choice)
     run_scene(Path("scene.toml"), RunRequest(Path("run"), steps, time, frames=choice, report=False))
     trajectory = cortado.Trajectory.load("run/trajectory.vtkhdf")
     assert len(trajectory) == told.frames and len(trajectory.converged) == told.steps
@@ -104,7 +104,7 @@ def test_the_run_and_its_film_are_told(capsys):
     assert "500 steps, 1.05 s of motion: about" in out and "film        53 frames, 2.1 s, at 0.5 x; 448 of" in out
     assert "; about 26 s to draw, 0.5 s for the first state; splashes take up to twice as long\n" in out
     none = cortado.Simulation(cortado.load_scene("scene.toml", ["picture.film_frames=0"]))
-    assert RunLength.of(none, 10, None, EverySteps(1)).film is None
+    assert RunLength(none, 10, None, EverySteps(1)).film is None
 
 
 def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
@@ -121,10 +121,10 @@ def test_a_picture_is_timed_where_there_is_something_to_draw(monkeypatch):
 
 def test_steps_that_are_chosen_are_estimated():
     simulation = cortado.Simulation(plane(solver={"kind": "pcisph", "time_step": "auto"}))
-    told, taken = RunLength.of(simulation, None, 0.2, EverySteps(1)), len(simulation.run(time=0.2).converged)
+    told, taken = RunLength(simulation, None, 0.2, EverySteps(1)), len(simulation.run(time=0.2).converged)
     assert told.is_about and told.time == 0.2 and told.frames == told.steps + 1 and told.film is not None
     assert 0.5 * taken < told.steps < 2.5 * taken
-    unknown = RunLength.of(simulation, 10, None, FramesPerSecond(50.0))
+    unknown = RunLength(simulation, 10, None, FramesPerSecond(50.0))
     assert unknown.frames is unknown.trajectory is unknown.film is None and unknown.in_words == "10 steps"
 
 
@@ -222,7 +222,7 @@ def test_every_limit_is_one_of_those_of_the_time_step():
 def test_energies_are_those_of_the_particles(make):
     simulation = cortado.Simulation(make(), precision="float64")
     rollout = simulation.rollout(3)
-    summary = RunSummary.of(simulation, rollout, rollout.forward(keep=False), 0.3)
+    summary = RunSummary(simulation, rollout, rollout.forward(keep=False), 0.3)
     trajectory, scene = simulation.run(3), simulation.scene
     masses = simulation.lattice.cell * trajectory.constants["reference_density"]
     kinetic = 0.5 * (masses * (trajectory.velocities[-1] ** 2).sum(axis=1)).sum()
@@ -248,9 +248,7 @@ def test_densities_are_those_of_the_rest_lattice():
     simulation = cortado.Simulation(scene, precision="float64")
     rollout = simulation.rollout(2)
     last = rollout.forward(keep=False)
-    assert RunSummary.of(simulation, rollout, last, 1.0).densities == pytest.approx(
-        [800.0 * (1.0 - SLACK)] * 2, rel=1e-9
-    )
+    assert RunSummary(simulation, rollout, last, 1.0).densities == pytest.approx([800.0 * (1.0 - SLACK)] * 2, rel=1e-9)
     at = last.numpy(2)["positions"]
     at[7] += 0.02
     last.set({"positions": at})
@@ -266,7 +264,7 @@ def test_densities_leave_out_what_waits_in_an_emitter():
     last = rollout.forward(keep=False)
     rest = simulation.scene.phase[0].rest_density
     assert simulation.solver.densities(last, rollout.parameters).max() > 1.5 * rest
-    assert RunSummary.of(simulation, rollout, last, 1.0).densities[1] < 1.1 * rest
+    assert RunSummary(simulation, rollout, last, 1.0).densities[1] < 1.1 * rest
 
 
 def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
@@ -286,7 +284,7 @@ def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
     )
     steps = 60
     rollout = simulation.rollout(steps)
-    found = RunSummary.of(simulation, rollout, rollout.forward(keep=False), 1.0).densities
+    found = RunSummary(simulation, rollout, rollout.forward(keep=False), 1.0).densities
     wanted = simulation.run(steps, record_every=steps, record=["density"])[-1]["density"]
     assert found == pytest.approx((wanted.min(), wanted.max()), rel=1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands.describe import MeasuredSpeed
+from cortado.cli.commands.describe import measured_speed
 from cortado.discretise.room import Domain
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
@@ -623,5 +623,5 @@ def test_other_names_of_sensors_come_back_from_the_table(name, tmp_path):
 def test_describe_counts_what_sensors_cost(monkeypatch):
     read = []
     monkeypatch.setattr(Watch, "step", lambda own, step, state: read.append(step))
-    speed = MeasuredSpeed.measured(cortado.Simulation(plane(sensor=[{"kind": "wall_force", "name": "walls"}])))
-    assert len(read) >= 3 * speed.steps
+    steps, _ = measured_speed(cortado.Simulation(plane(sensor=[{"kind": "wall_force", "name": "walls"}])))
+    assert len(read) >= 3 * steps

@@ -6,7 +6,6 @@ limit.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -238,30 +237,23 @@ def _line(one: MeasuredColumn) -> str:
     )
 
 
-@dataclass(frozen=True)
 class Resolved:
     """One of the runs."""
 
-    path: Path
-    scene: dict[str, Any]
-    precision: str
-    end: float
-    """[s]"""
-    mass: float
-    """Of all fluid [kg], in 2-D of a layer 1 m thick."""
-    numbers: dict[str, tuple[str, float]]
-    """The unit and the value of each, by name."""
-
-    @classmethod
-    def read(cls, folder: RunFolder, quantities: Sequence[OwnQuantity]) -> "Resolved":
+    def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
         """With ``quantities`` of the user's own. Raises `InputError` for a run that has not ended well."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
         trajectory = Trajectory.load(folder.trajectory)
-        last = trajectory[-1:]
+        last, self.path, self.scene = trajectory[-1:], folder.path, read_json(folder.scene)
+        self.precision = read_json(folder.environment).get("settings", {}).get("precision", "")
+        self.end = float(last.times[0])
+        """[s]"""
+        masses = last.constants["reference_density"].astype(np.float64)
+        self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
+        """Of all fluid [kg], in 2-D of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
-        scene, masses = read_json(folder.scene), last.constants["reference_density"].astype(np.float64)
         centre = masses @ last.positions[0].astype(np.float64) / masses.sum()
         numbers |= {f"centre of mass, {axis}": ("m", float(x)) for axis, x in zip("xyz", centre, strict=False)}
         readings = folder.read_sensors()
@@ -269,10 +261,8 @@ class Resolved:
             for column, found in columns.items():
                 unit = readings[name].units[column]
                 numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
-        numbers |= {one.name: ("", one(trajectory)) for one in quantities}
-        precision = read_json(folder.environment).get("settings", {}).get("precision", "")
-        mass = float(masses.sum()) * float(scene["discretisation"]["spacing"]) ** last.dimension
-        return cls(folder.path, scene, precision, float(last.times[0]), mass, numbers)
+        self.numbers = numbers | {one.name: ("", one(trajectory)) for one in quantities}
+        """The unit and the value of each, by name."""
 
     def size(self, key: str) -> float:
         """The spacing [m] or the time step [s]; raises `InputError` for one that is chosen."""
@@ -285,8 +275,8 @@ class Resolved:
 
 def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
     """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
-    own = [OwnQuantity.named(one) for one in quantities]
-    runs = [Resolved.read(folder, own) for folder in named_runs(folders)]
+    own = [OwnQuantity(one) for one in quantities]
+    runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
         raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST_RUNS}.")
     key = _varied(runs)

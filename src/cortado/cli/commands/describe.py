@@ -5,7 +5,6 @@ import math
 import time
 from collections import Counter
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,68 +49,49 @@ HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
 """Bytes of a trajectory file besides its frames, measured: its heads, what no step changes, what the solver notes."""
 
 
-@dataclass(frozen=True)
-class MeasuredSpeed:
-    """How long the first steps of a scene take, with what its sensors read after each."""
-
-    steps: int
-    """That were measured, after twice as many that were not."""
-    seconds: float
-    """Of one of them."""
-
-    @classmethod
-    def measured(cls, simulation: Simulation) -> "MeasuredSpeed":
-        """Raises `DivergedError` of a scene that does not even bear these steps."""
-        steps = FIRST_STEPS
-        while True:
-            rollout = simulation.rollout(steps)
-            watch = Watch(simulation, rollout).step if simulation.scene.sensor else None
-            for _ in range(2):  # the first time compiles, the second captures graphs
-                rollout.forward(watch, keep=False)
-            begun = time.perf_counter()
+def measured_speed(simulation: Simulation) -> tuple[int, float]:
+    """How many first steps of a scene were measured, after twice as many that were not, and how long one of them takes
+    [s], with what sensors read after each. Raises `DivergedError` of a scene that does not even bear these steps."""
+    steps = FIRST_STEPS
+    while True:
+        rollout = simulation.rollout(steps)
+        watch = Watch(simulation, rollout).step if simulation.scene.sensor else None
+        for _ in range(2):  # the first time compiles, the second captures graphs
             rollout.forward(watch, keep=False)
-            wp.synchronize_device(simulation.device)
-            seconds = (time.perf_counter() - begun) / steps
-            if steps == MOST_STEPS or steps * seconds > 0.5 * ENOUGH:
-                return cls(steps, seconds)
-            steps = min(math.ceil(ENOUGH / seconds), MOST_STEPS)
+        begun = time.perf_counter()
+        rollout.forward(watch, keep=False)
+        wp.synchronize_device(simulation.device)
+        seconds = (time.perf_counter() - begun) / steps
+        if steps == MOST_STEPS or steps * seconds > 0.5 * ENOUGH:
+            return steps, seconds
+        steps = min(math.ceil(ENOUGH / seconds), MOST_STEPS)
 
 
-@dataclass(frozen=True)
 class RunLength:
     """Of a run that is asked for by a number of steps or by a time."""
 
-    steps: int
-    """About as many, where it ends at a time and chooses its steps."""
-    is_about: bool
-    """Whether the number of steps is an estimate."""
-    time: float | None
-    """That it simulates [s]; None of a number of steps that are chosen."""
-    frames: int | None
-    """That it records, the first and the last among them; None where that depends on a time that is not known."""
-    trajectory: float | None
-    """[bytes] of them on disk."""
-    film: Pace | None
-    """Which frames its film shows, and how fast; None where there is no film, or its length is not known."""
-
-    @classmethod
-    def of(cls, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice) -> "RunLength":
+    def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
         """Of a run with so many steps, or for a time [s]. Raises `InputError` for what is neither."""
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
-        is_about = solver.chooses and time is not None
-        count = steps_of_run(simulation, steps, time, {}) // (ROOM if is_about else 1)
-        if not solver.chooses:
-            time = count * float(solver.time_step)
-        frames = choice.count(count, time)
-        film = None
-        if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
-            film = Pace.of(np.linspace(0.0, time, frames), picture.film_frames, picture.film_speed, choice.rate)
-        numbers = simulation.numbers_in_frame(components=3)  # as in the file
-        size = None
+        self.is_about = solver.chooses and time is not None
+        """Whether the number of steps is an estimate."""
+        self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
+        """About as many, where it ends at a time and chooses its steps."""
+        self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
+        """That it simulates [s]; None of a number of steps that are chosen."""
+        self.frames = frames = choice.count(self.steps, time)
+        """That it records, the first and the last among them; None where that depends on a time that is not known."""
+        self.trajectory: float | None = None
+        """[bytes] of them on disk."""
         if frames is not None:
+            numbers = simulation.numbers_in_frame(components=3)  # as in the file
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
-            size += HEADS + PER_PARTICLE * simulation.particles + PER_STEP * count
-        return cls(count, is_about, time, frames, size, film)
+            self.trajectory = size + (HEADS + PER_PARTICLE * simulation.particles + PER_STEP * self.steps)
+        self.film: Pace | None = None
+        """Which frames its film shows, and how fast; None where there is no film, or its length is not known."""
+        if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
+            times = np.linspace(0.0, time, frames)
+            self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
     def for_machines(self) -> dict[str, Any]:
         """By names that end in units."""
@@ -155,7 +135,7 @@ def describe_scene(
     count = sum(body.count(scene.discretisation.spacing) for body in bodies)
     with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
         simulation = Simulation(scene, device, precision)
-    length = RunLength.of(simulation, steps, time, frames)
+    length = RunLength(simulation, steps, time, frames)
     found = _described(simulation, length)
     if length.film is not None:
         found["picture_seconds"] = seconds_of_picture(simulation)
@@ -235,13 +215,13 @@ def _viscosity(scene: Scene) -> str:
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
     """How long so many steps will take; of a scene that does not bear the first ones, what happened."""
     try:
-        speed = MeasuredSpeed.measured(simulation)
+        measured, seconds = measured_speed(simulation)
     except DivergedError as error:
         return {"diverged": str(error)}
     return {
-        "milliseconds_per_step": 1e3 * speed.seconds,
-        "measured_steps": speed.steps,
-        "expected_seconds": steps * speed.seconds,
+        "milliseconds_per_step": 1e3 * seconds,
+        "measured_steps": measured,
+        "expected_seconds": steps * seconds,
         "sensors": len(simulation.scene.sensor),
     }
 

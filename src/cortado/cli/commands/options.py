@@ -1,7 +1,7 @@
 """What options of several commands name: runs, numbers of the user's own, and where work is computed."""
 
 import runpy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,18 +68,12 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
     return found
 
 
-@dataclass(frozen=True)
 class OwnQuantity:
     """A function of a trajectory that returns a number."""
 
-    where: str
-    """``FILE.py:FUNCTION``"""
-    name: str
-    function: Callable[[Trajectory], float]
-
-    @classmethod
-    def named(cls, where: str) -> "OwnQuantity":
-        """Runs the file. Raises `InputError` for one that cannot be run, or has no such function."""
+    def __init__(self, where: str):
+        """Runs the file of ``FILE.py:FUNCTION``. Raises `InputError` for one that cannot be run, or has no such
+        function."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
             raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
@@ -89,12 +83,12 @@ class OwnQuantity:
             raise InputError(f"--quantity {where} cannot be read: {_told(problem)}.") from problem
         if not callable(function):
             raise InputError(f"{file} has no function {name}, but must, as --quantity names it.")
-        return cls(where, name, function)
+        self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
         """The number; raises `InputError` where the function fails, or returns something else."""
         try:
-            found = self.function(trajectory)
+            found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
         except CortadoError:
             raise

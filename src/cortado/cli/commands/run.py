@@ -244,7 +244,7 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
         report(Section("What came out", failures=[error]))
         raise told from error
     with keeping(lambda: f"the run is whole, and in {folder.path}; cortado picture {folder.path} --film films it"):
-        summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun, recording.watch.readings())
+        summary = RunSummary(simulation, rollout, last, time.perf_counter() - begun, recording.watch.readings())
         announce(str(summary))
         folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
         report(Section("In numbers", head=("", "value", "unit"), rows=summary.rows()))

@@ -4,7 +4,7 @@ The report is written at first without shaded pictures, which take long, then wi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
@@ -29,7 +29,6 @@ from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary
 from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.fluid_particles import FluidMasses
 from cortado.scene.scene import Scene, scene_in_words
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -65,64 +64,42 @@ class Energy:
         )
 
 
-@dataclass(frozen=True)
 class RunSummary:
     """Of a run that has gone through all of its steps."""
 
-    steps: int
-    time: float
-    """That was simulated [s]."""
-    sizes: str
-    """How long steps were, in words."""
-    computed: int
-    """Of the steps, those that the present process took: the others were there already."""
-    seconds: float
-    """That these took, with what was recorded of them."""
-    first: Energy
-    last: Energy
-    turned: bool
-    """Whether gravity changed during the run, and potential energies are those of other gravities."""
-    densities: tuple[float, float] | None
-    """The least and the greatest at the end [kg/m3], of particles that do not wait in an emitter; None of a solver
-    without particles."""
-    spilt: int
-    """Particles beside or below an open cup at the end."""
-    particles: int
-    """That did not begin in an emitter."""
-    masses: FluidMasses
-    """Of the fluid at the start."""
-    readings: Mapping[str, Readings] = field(default_factory=dict)
-    """What sensors read, by their names."""
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         simulation: Simulation,
         rollout: Rollout,
         last: State,
         seconds: float,
         readings: Mapping[str, Readings] | None = None,
-    ) -> "RunSummary":
-        """``last``: the state at the end; ``readings`` of sensors."""
-        solver, taken, found = rollout.solver, rollout.taken, None
+    ):
+        """``last``: the state at the end; ``seconds``: that the present process took, with what was recorded;
+        ``readings``: what sensors read, by their names."""
+        solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
+        self.steps, self.seconds, self.readings = taken, seconds, readings or {}
+        self.computed = taken - rollout.progress.step
+        """Of the steps, those that the present process took: the others were there already."""
+        self.time = simulated(rollout)
+        """That was simulated [s]."""
+        self.sizes = sizes_in_words(rollout)
+        self.first = Energy.of(simulation, rollout, rollout.initial, 0)
+        self.last = Energy.of(simulation, rollout, last, taken - 1)
+        self.turned = bool(np.ptp(gravity[0, :taken], axis=0).any())
+        """Whether gravity changed during the run, and potential energies are those of other gravities."""
+        self.densities: tuple[float, float] | None = None
+        """The least and the greatest at the end [kg/m3], of particles that do not wait in an emitter; None of a solver
+        without particles."""
         if isinstance(solver, ParticleSolver):
-            densities = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
-            found = float(densities.min()), float(densities.max())
-        return cls(
-            steps=taken,
-            computed=taken - rollout.progress.step,
-            time=simulated(rollout),
-            sizes=sizes_in_words(rollout),
-            seconds=seconds,
-            first=Energy.of(simulation, rollout, rollout.initial, 0),
-            last=Energy.of(simulation, rollout, last, taken - 1),
-            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0, :taken], axis=0).any()),
-            densities=found,
-            spilt=_spilt(simulation, last),
-            particles=simulation.free_particles,
-            masses=simulation.masses,
-            readings=readings or {},
-        )
+            found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
+            self.densities = float(found.min()), float(found.max())
+        self.spilt = _spilt(simulation, last)
+        """Particles beside or below an open cup at the end."""
+        self.particles = simulation.free_particles
+        """That did not begin in an emitter."""
+        self.masses = simulation.masses
+        """Of the fluid at the start."""
 
     @property
     def milliseconds(self) -> float:

@@ -80,14 +80,10 @@ class Member:
         path = self.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
-    def time_step(self, combination: Combination) -> float:
-        """Of the scene [s]."""
-        return _time_step(self.file, combination)
-
     def steps(self, combination: Combination) -> int:
         """How many of them come nearest to the duration; at least one."""
         assert self.duration is not None
-        return check_steps(max(round(self.duration / self.time_step(combination)), 1))
+        return check_steps(max(round(self.duration / _time_step(self.file, combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
         """Compute a combination, or go on with it; the result reports a failure."""
@@ -219,7 +215,7 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
     duration = member.duration
     if duration is None or not done:
         return
-    ends = [member.steps(one) * member.time_step(one) for one in done]
+    ends = [member.steps(one) * _time_step(member.file, one) for one in done]
     off = max(ends, key=lambda end: abs(end - duration))
     if abs(off - duration) > SAME_TIME * duration:
         last = done[ends.index(off)].name
