@@ -593,7 +593,7 @@ def test_another_precision_or_picture_is_not_resumed(cortado_command):
     picture = ["optimise", "plane.toml", "--out", "drawn", "--set", "problem.picture=a.png"]
     Path("plane.toml").write_text(PLANE_PICTURE)
     for draw, options, code in ((heart, ["--set", "optimise.check={}"], 0), (rosetta, ["--resume"], 2)):
-        write_picture("a.png", draw(16))
+        write_picture("a.png", draw((20, 16)))
         result = cortado_command(*picture, "--set", "optimise.iterations=1", *options)
         assert result[0] == code, result
     assert_refused(result, "problem = target and loss ")

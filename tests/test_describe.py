@@ -28,7 +28,7 @@ def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cortado.cli.commands.describe.seconds_of_picture", lambda _: 0.5)  # drawing takes long
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 4)  # and so do 100 steps that are timed
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 4)  # and so do 100 steps that are timed
     return tmp_path
 
 
@@ -38,7 +38,7 @@ def described(capsys, *arguments):
 
 
 def test_it_says_what_the_scene_has(capsys, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 12)
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 12)
     found, scene = described(capsys, "scene.toml", "--steps", "30"), cortado.load_scene("scene.toml")
     simulation = cortado.Simulation(scene)
     assert found["particles"] == PARTICLES and found["wall_particles"] == len(simulation.walls)
@@ -179,7 +179,7 @@ def test_the_first_state_is_drawn(capsys):
 
 
 def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.describe.MOST", 100)
+    monkeypatch.setattr("cortado.cli.commands.describe.MOST_STEPS", 100)
     found = described(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
     assert "diverged in step" in found["diverged"] and "milliseconds_per_step" not in found
     main(["describe", "scene.toml", "--set", "fluid.0.velocity=[10,25]"])
