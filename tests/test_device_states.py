@@ -325,7 +325,8 @@ def test_a_layer_leaves_them_there(shape: tuple[int, ...], size: int | None) -> 
     own = simulation()
     layer, many = Steps(own, STEPS), () if size is None else (size,)
     layer = layer if size is None else layer.batched(size)
-    first = named(STATE, layer.states.of(own.state() if size is None else (own.state(),) * size, {}))
+    begun = layer._simulation.on_device(own.state() if size is None else (own.state(),) * size, parameters={})
+    first = named(STATE, layer.states.arrays(begun))
     bars, name = {STATE + "positions": numbers(1, *many, 25, 2)}, PARAMETER + "gravity"
     found = []
     for array in (on_device, np.asarray):

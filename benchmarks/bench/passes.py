@@ -14,6 +14,7 @@ from benchmarks.bench.timing import LaunchTimer
 from cortado.device.launching import watched
 from cortado.gradients import Exact
 from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.particle_kernels import MADE
 from cortado.rollout.rollout import Rollout
 
 LOG_ROWS = 100_000
@@ -137,6 +138,10 @@ class PassTimer:
 
 
 def _name(key: Key) -> str:
-    """The pass of a kernel, by the name of what made it: ``gravity_kernels.<locals>.accelerate`` is "gravity"."""
-    group = key[0].partition("__locals__")[0].strip("_").removesuffix("_kernels").removesuffix("_kernel")
+    """The pass of a kernel, by the name of what made it: ``gravity_kernels.<locals>.accelerate`` is "gravity", and so is
+    ``made_gravity_adjoint``."""
+    if key[0].startswith(MADE):
+        group = key[0].removeprefix(MADE).removesuffix("_adjoint").removesuffix("_tangent")
+    else:
+        group = key[0].partition("__locals__")[0].strip("_").removesuffix("_kernels").removesuffix("_kernel")
     return PASSES.get(group, group.replace("_", " "))
