@@ -138,8 +138,8 @@ class PassTimer:
 
 
 def _name(key: Key) -> str:
-    """The pass of a kernel, by the name of what made it: ``gravity_kernels.<locals>.accelerate`` is "gravity", and so is
-    ``made_gravity_adjoint``."""
+    """The pass of a kernel, by the name of what made it: ``gravity_kernels.<locals>.accelerate`` is "gravity", and
+    ``made_gravity_adjoint`` is too."""
     if key[0].startswith(MADE):
         group = key[0].removeprefix(MADE).removesuffix("_adjoint").removesuffix("_tangent")
     else:
