@@ -20,6 +20,10 @@ r = f(x_i, ..., time_step, ...) they are
 
 so that particles keep their shares of the adjoints of a scene's parameters, which are summed later. Both are exact; the
 tangent is put together of the gradients of the components of r.
+
+Two traps of Warp: after ``a, b = array[j], c`` the name ``a`` is no copy, and writing to its component writes to the
+array, where after ``a = array[j]`` it is one. And ``wp.grad`` stands in the function that a kernel calls: in one that
+this function calls it does not compile.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

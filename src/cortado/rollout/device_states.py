@@ -122,7 +122,9 @@ class HostStates:
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:
-    """Derivatives of a state but that of its time; raises `InputError` for anything but a table of its fields."""
+    """A table of derivatives with respect to fields of a state, without that of its time, which is none.
+
+    Raises `InputError` for anything but a table, and for names that are not fields of the state."""
     if not isinstance(given, Mapping):
         raise InputError(f"{what} is {shown(given)}, but must be a table of arrays by name, {{'positions': ...}}.")
     known = (*state.names, STATE_TIME)

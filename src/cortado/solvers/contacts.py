@@ -70,7 +70,7 @@ class Contact:
 
 
 class Seen:
-    """What a body's points find, or tangents of it, by a suffix."""
+    """How deep each point of a body is within another one, with normals and shares of the force; or their tangents."""
 
     def __init__(self, contact: Contact, layout: Layout, suffix: str = ""):
         real, vector = layout.precision.real, layout.precision.vector
@@ -81,7 +81,7 @@ class Seen:
         self._whole, self._sums = contact.total(real), [contact.total(vector) for _ in SHARES]
 
     def clear(self) -> None:
-        """Nothing is found."""
+        """Forget what points of the body found in the last step."""
         for array in (*self.numbers.values(), *self.normals.values()):
             array.zero_()
 
@@ -90,7 +90,7 @@ class Seen:
         return {f"whole{self._suffix}": self._whole(self.numbers[f"square{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """(members,) of what points push with."""
+        """The sums over the points of a body of each share of the contact force, (members,) vectors each."""
         shares = zip(self.shares.items(), self._sums, strict=True)
         names = [f"{name}_sum{self._suffix}" for name in SHARES]
         return dict(zip(names, (total(share) for (_, share), total in shares), strict=True))

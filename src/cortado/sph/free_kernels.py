@@ -256,7 +256,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         # out
         later: after,
     ):
-        """``moved``: V_1, W_1 and L_1."""
+        """Writes the pose and the velocities of each body at the end of the step; ``moved`` has V_1, W_1 and L_1."""
         b = wp.tid()
         dt = time_step[b]
         turning = rotation(dt * moved.W[b])

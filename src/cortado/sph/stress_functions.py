@@ -61,7 +61,7 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
     @wp.func
     def part(M: matrix) -> real:
-        """S"""
+        """S, how much of the viscous stress a particle with the moments M has: 0 in spray and 1 within the fluid."""
         return smoothstep(fullness(M), empty, full)
 
     @wp.func

@@ -117,8 +117,9 @@ def independent_frames(times: np.ndarray, correlation_time: float) -> float:
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """Of whitened residuals (F, m) and Jacobians (F, m, p), weighted as in N, whose inverse is given; ``frames`` as
-    `independent_frames`."""
+    """The covariance of a fit's score J^T r, from whitened residuals r (F, m) and Jacobians J (F, m, p) of F frames.
+
+    They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`."""
     F, products = len(r), Products.of(J, r)
     B = np.einsum("ffpq->pq", products.S)
     once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
@@ -268,7 +269,7 @@ def spread(r: np.ndarray) -> float:
 
 
 def _inflation(J: np.ndarray, r: np.ndarray) -> float:
-    """By how much correlation within frames makes the variance of the score larger than a count of numbers has it."""
+    """The variance of the score over the one that it would have if the residuals of a frame were independent."""
     counted = np.einsum("fmp,fmp->p", J, J) * np.mean(r**2)
     pooled = np.einsum("fmp,hm->fhp", J, r, optimize=True)
     has = counted > 0.0

@@ -138,7 +138,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         # out
         scaled_bar: wp.array(dtype=vector),
     ):
-        """From the adjoint r of n* to that of x*, and on to what x* was predicted from."""
+        """Adds what the adjoint r of the predicted density n* gives to positions, velocities and the time step."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

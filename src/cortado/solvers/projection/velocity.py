@@ -52,7 +52,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         gamma_i: vector,
         v_star_i: vector,
     ) -> tuple[vector, vector]:
-        """T is y L, and ``kick`` -D^T y / m."""
+        """The velocity u = v* + kick that the pressure y leaves, with the kick -D^T y / m; T is y L."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
 
