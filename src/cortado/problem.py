@@ -60,7 +60,7 @@ class ProblemForwardPass(Staying):
 
     @property
     def rollout(self) -> Rollout:
-        """The run."""
+        """The run of this forward pass."""
         return self._residual.rollout
 
     @property

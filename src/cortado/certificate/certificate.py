@@ -81,7 +81,7 @@ class Certificate:
         return f"Certificate({size}, {verdict}, use gradients.{self.estimator})"
 
     def __str__(self) -> str:
-        """As tables and sentences."""
+        """The certificate as tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
         lines = [size, _table(["parameter", "slope times a perturbation", "adjoint"], self._changes())]
         if not self.right:

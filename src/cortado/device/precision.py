@@ -32,7 +32,7 @@ class Precision:
 
     @property
     def bytes(self) -> int:
-        """Of a number."""
+        """Bytes of a number."""
         return np.dtype(self.numpy).itemsize
 
     @property

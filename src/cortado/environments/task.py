@@ -130,7 +130,7 @@ class Task(ABC):
 
     @property
     def time_step(self) -> float:
-        """Of the simulation [s]."""
+        """The time step of the simulation [s]."""
         return self.coarse_step / FINENESS[self.size]
 
     @property
@@ -141,7 +141,7 @@ class Task(ABC):
     @property
     @abstractmethod
     def scene(self) -> Scene:
-        """What is simulated."""
+        """The scene that the environment simulates."""
 
     @property
     @abstractmethod

@@ -120,7 +120,7 @@ class OverParticles:
         return 1.0
 
     def _arguments(self, at: StepEnd) -> dict[str, Any]:
-        """Those of both kernels."""
+        """The arguments that the forward and the adjoint kernel share."""
         raise NotImplementedError
 
     def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
@@ -268,7 +268,7 @@ class Reward:
 
     @WARP
     def adjoint(self, at: StepEnd, factor: float) -> State:
-        """The derivative times ``factor``."""
+        """The derivative of the reward with respect to the state, times ``factor``."""
         bar, each = at.state.like(), np.full(at.scenes, factor)
         for weight, term in self.terms:
             term.adjoint(at, weight * each, bar)
@@ -320,7 +320,7 @@ def _reals(at: StepEnd, values: NDArray) -> wp.array:
 
 
 def _vectors(at: StepEnd, values: NDArray) -> wp.array:
-    """Of (..., d)."""
+    """A Warp array of vectors with three components, from numbers (..., d)."""
     return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
         values.shape[:-1]
     )

@@ -89,7 +89,7 @@ class Differentiable(Protocol):
     simulation: Any
 
     def value(self, parameters: Values) -> float:
-        """The loss, forward only."""
+        """The loss of these parameters, by a run forward only."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
         """A forward run that reverse passes may follow."""

@@ -46,7 +46,7 @@ class Snapshot:
 
     @property
     def precision(self) -> Precision:
-        """Of the Warp arrays."""
+        """The precision of the Warp arrays."""
         return precision_of(self.state)
 
     @cached_property
@@ -87,7 +87,7 @@ class Snapshot:
 
     @property
     def container(self) -> Container:
-        """That of the scene."""
+        """The container of the scene."""
         return moment_of(self).container
 
     def _field(self, name: str) -> np.ndarray:
@@ -200,7 +200,7 @@ class Loss(Protocol):
     """
 
     def value(self, end: Snapshot) -> float:
-        """The loss."""
+        """The value of the loss for a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a table of
@@ -270,7 +270,7 @@ class SnapshotBatch(Sequence[Snapshot]):
 
     @property
     def precision(self) -> Precision:
-        """Of the Warp arrays."""
+        """The precision of the Warp arrays."""
         return precision_of(self.state)
 
     @property

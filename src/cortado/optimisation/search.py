@@ -113,7 +113,7 @@ class MemoryLog(list[LoggedEvaluation]):
         return self[index]
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing: no file is open."""
 
 
 class ReplayLog:

@@ -133,7 +133,7 @@ class Affine:
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        """Of u."""
+        """The shape of u."""
         return self.matrix.shape[self.base.ndim :]
 
 
@@ -143,11 +143,11 @@ class OtherParameters:
     problem: Problem
 
     def parameters(self, u: Values) -> Values:
-        """Those of the problem."""
+        """The parameters of the problem that is transformed."""
         raise NotImplementedError
 
     def value(self, u: Values) -> Any:
-        """The loss, forward only."""
+        """The loss of these parameters, by a run forward only."""
         return self.problem.value(self.parameters(u))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
@@ -282,7 +282,7 @@ class FixedParameters(OtherParameters):
         return f"{self.problem.fingerprint}; fixed {', '.join(self._fixed)}"
 
     def parameters(self, u: Values) -> Values:
-        """Those of the problem."""
+        """The parameters of the problem that are not fixed."""
         return {**self._fixed, **u}
 
     def forward_pass(self, parameters: Values) -> ForwardPass:

@@ -268,7 +268,7 @@ class Layout:
 
     @property
     def members(self) -> int:
-        """The number of scenes."""
+        """The number of scenes in the batch."""
         return self.batch or 1
 
     @property

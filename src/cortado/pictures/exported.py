@@ -141,7 +141,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a solid is."""
+    """Position and rotation of a solid."""
 
     turn: Points
     """(3, 3) rotation matrix"""

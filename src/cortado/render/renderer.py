@@ -154,7 +154,7 @@ class Renderer:
 
     @property
     def device(self) -> Any:
-        """Where it computes."""
+        """The device on which the renderer computes."""
         return self._device
 
     @property

@@ -185,7 +185,7 @@ class DeviceStates(HostStates):
     """Takes states as a `DeviceState` and derivatives as arrays that speak DLPack, and gives them so."""
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """As `HostStates.begin`."""
+        """Give a rollout a state on the device to begin at; see `HostStates.begin`."""
         self._require_taken(state)
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes, state.arrays)
@@ -213,7 +213,7 @@ class DeviceStates(HostStates):
         return DeviceState(own, tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """As `HostStates.write`."""
+        """Write derivatives of fields that are on the device; see `HostStates.write`."""
         fields = require_fields(what, given, to)
         to.clear()
         copy_to(to, what, fields)

@@ -54,7 +54,7 @@ class Simulated(Source, Protocol):
 
     @property
     def precision(self) -> Precision:
-        """Of the device's arrays."""
+        """The precision of the device's arrays."""
 
     @property
     def smoothing(self) -> SmoothingKernel:

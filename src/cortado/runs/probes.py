@@ -273,7 +273,7 @@ class Prepared(Cut, Protocol):
 
     @property
     def scene(self) -> Scene:
-        """What is simulated."""
+        """The scene that is simulated."""
 
     @property
     def positions(self) -> Points:

@@ -177,7 +177,7 @@ class WallLoads:
         return pushed + self._rubbing.value(at, sums, solid)
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
-        """That of f."""
+        """The tangent of the load f."""
         strength_dot = self._scale / at["n"] ** self._power * (dot.push - self._power * at.push * dot["n"] / at["n"])
         pushed = vectors(self._push.total(sums.context, solid))
         pushed_dot = vectors(self._push.tangent(sums.context, along, solid))

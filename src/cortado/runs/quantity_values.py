@@ -68,7 +68,7 @@ class Moment:
 
     @property
     def container(self) -> Container:
-        """That of the scene."""
+        """The container of the scene."""
         return self.evaluator().container
 
     def value(self, name: str) -> NDArray:

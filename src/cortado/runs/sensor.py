@@ -41,7 +41,7 @@ class Reading(Cut, Protocol):
 
     @property
     def container(self) -> Container:
-        """That of the scene."""
+        """The container of the scene."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of the state or a quantity of its particles, float64."""

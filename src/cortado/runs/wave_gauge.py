@@ -89,7 +89,7 @@ class Standing:
 
 @dataclass(frozen=True)
 class Axis:
-    """Where a column stands."""
+    """The line at which a gauge stands, upwards from its floor."""
 
     foot: tuple[float, ...]
     """(d,) where its axis meets its floor [m]"""
@@ -104,7 +104,7 @@ class Axis:
 
     @classmethod
     def of(cls, at: Reading, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
-        """Of a gauge."""
+        """The axis of a gauge."""
         in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
         foot = position + (floor - position @ up) * up

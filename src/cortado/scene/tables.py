@@ -209,7 +209,7 @@ def _limits(schema: Schema) -> str:
 
 
 def point_in_words(point: Iterable[float]) -> str:
-    """Its coordinates, in brackets."""
+    """The coordinates of a point, in brackets."""
     return f"({', '.join(f'{value:g}' for value in point)})"
 
 

@@ -174,7 +174,7 @@ class ContactsTangent:
         self._seen = [Seen(contact, contacts.layout, "_dot") for contact in contacts.contacts]
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """Of `Contacts.look`."""
+        """The tangent of `Contacts.look`."""
         contacts, kernels = self._contacts, self._contacts.kernels
         for own in self._changes:
             for array in own.given.values():

@@ -28,7 +28,7 @@ class ParticleTangent:
         finalize(self, solver.launch.forget)
 
     def sort(self, context: StepContext, state_dot: State) -> None:
-        """Of `ParticleSolver.sort`."""
+        """The tangent of `ParticleSolver.sort`."""
         solver, d = self._solver, self.dot.fields
         context.launch(
             solver.integration.sort,
@@ -47,7 +47,7 @@ class ParticleTangent:
             part.sort(context, self.dot, state_dot)
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """Of `ParticleSolver.accelerate`."""
+        """The tangent of `ParticleSolver.accelerate`."""
         for t, force in enumerate(self._solver.forces):
             force.tangent(context, self.dot, self._accelerations_dot[t], self._accelerations_dot[t + 1])
         return self._accelerations_dot[-1]
@@ -61,7 +61,7 @@ class ParticleTangent:
     def unsort(
         self, context: StepContext, x_dot: wp.array, v_dot: wp.array, state_dot: State, **carried_dot: wp.array
     ) -> None:
-        """Of `ParticleSolver.unsort`."""
+        """The tangent of `ParticleSolver.unsort`."""
         solver = self._solver
         scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
         context.launch(solver.integration.unsort, x=x_dot, v=v_dot, **scene)
@@ -139,17 +139,17 @@ class ParticleAdjoint:
             acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """Of the parts in `ParticleSolver.sort`."""
+        """The adjoint of how parts sort their fields in `ParticleSolver.sort`."""
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
 
     def begin_parts(self, context: StepContext, state_bar: State) -> None:
-        """Of how the parts begin."""
+        """The adjoint of how parts begin a step."""
         for part in self._parts:
             part.begin(context, self.bar, state_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """Of the rest of `ParticleSolver.sort`."""
+        """The adjoint of the rest of `ParticleSolver.sort`."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():

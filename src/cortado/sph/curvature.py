@@ -194,7 +194,7 @@ class CurvatureSums:
 
 @cache
 def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
-    """Of a discretisation."""
+    """The sums over neighbours of the curvature, for a discretisation."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), matrix_type(precision)

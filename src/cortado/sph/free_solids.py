@@ -65,7 +65,7 @@ class FreeSolids:
 
     @property
     def walls(self) -> MovingWalls:
-        """Those of the search."""
+        """The wall particles in which the search finds neighbours."""
         assert self.search.moving is not None
         return self.search.moving
 

@@ -51,7 +51,7 @@ class Symmetric:
 
 @cache
 def symmetric(precision: Precision) -> Symmetric:
-    """Of a precision."""
+    """How symmetric matrices are kept as six numbers, in a precision."""
     vector, matrix = precision.vector, matrix_type(precision)
     six = precision.six
 

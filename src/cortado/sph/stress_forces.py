@@ -41,7 +41,7 @@ class ContactFunctions:
 
 @cache
 def contact_functions(discretisation: Discretisation) -> ContactFunctions:
-    """Of a discretisation."""
+    """The Warp functions by which walls and particles hold each other in the viscous stress, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)

@@ -56,7 +56,7 @@ def power_law(shear_rate, viscosity, flow_index, least_shear_rate):
 
 
 def carreau(shear_rate, viscosity, relaxation_time, flow_index, infinite_viscosity):
-    """Of Carreau (1972)."""
+    """The viscosity law of Carreau (1972)."""
     turned = relaxation_time * shear_rate
     return infinite_viscosity + (viscosity - infinite_viscosity) * wp.pow(
         1.0 + turned * turned, 0.5 * (flow_index - 1.0)

@@ -61,7 +61,7 @@ class Member:
     precision: str
 
     def scene(self, number: int) -> Scene:
-        """That of a run."""
+        """The scene of the run."""
         return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
             steps=self.table.steps
         )

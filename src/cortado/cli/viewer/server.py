@@ -58,7 +58,7 @@ _silent.disabled = True
 
 
 class Door:
-    """Of one window."""
+    """Lets browsers into a window that know the token in its address."""
 
     def __init__(self) -> None:
         self._token = token_hex(16)

@@ -180,7 +180,7 @@ class LiveView:
         time.sleep(max(SHORTEST_PAUSE - (time.monotonic() - begun), 0.0))
 
     def _begin(self) -> None:
-        """The first state."""
+        """Shows the first state."""
         self._wish_to_begin = False
         self._nozzle = None if self.simulation.scene.emitter is None else np.array(self.simulation.scene.emitter.outlet)
         for sliders, values in ((self.gravity, self.simulation.scene.forces.gravity), (self.nozzle, self._nozzle)):

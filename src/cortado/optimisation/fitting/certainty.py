@@ -173,7 +173,7 @@ class FittedPart:
 
     @property
     def correlation_time(self) -> float:
-        """Of the residuals [s]."""
+        """The time [s] over which residuals are correlated."""
         return self.weighting.correlation_time
 
 
@@ -182,7 +182,7 @@ class Fitted(Protocol):
 
     @property
     def parts(self) -> list[Part]:
-        """The observations."""
+        """The part of the fit that belongs to each observation."""
 
     @property
     def labels(self) -> list[str]:

@@ -201,7 +201,7 @@ class Experiment:
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:
-        """Those of the simulation."""
+        """The values that are parameters of the simulation, and not of one observation alone."""
         own = self.start
         return {name: value for name, value in values.items() if name not in own}
 

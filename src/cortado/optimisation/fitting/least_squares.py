@@ -107,7 +107,7 @@ class Coordinates:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the vector that is searched."""
+        """Lower and upper bounds of the vector that is searched."""
         with np.errstate(divide="ignore"):
             logs = [np.where(self.logarithmic, np.log(np.maximum(e, 0.0)), e) for e in (self.lower, self.upper)]
         return logs[0][self.free], logs[1][self.free]
@@ -250,7 +250,7 @@ class LeastSquares:
         return self.coordinates.labels
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        """Of each part; raises `DivergedError`."""
+        """The residuals of each part; raises `DivergedError` where the run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
@@ -300,7 +300,7 @@ class LeastSquares:
         return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
     def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
-        """Of weighted residuals."""
+        """The sum of squares of weighted residuals."""
         return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
     def _run(

@@ -179,7 +179,7 @@ def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) ->
 
 
 def on_host(array: Array) -> np.ndarray:
-    """As a NumPy array."""
+    """The numbers of an array, on the host or on a device, as a NumPy array."""
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
@@ -238,7 +238,7 @@ class NamedStates:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of all arrays, by name."""
+        """The shapes of all arrays of a state, by name."""
         simulation = self._simulation
         members = () if simulation.batch is None else (simulation.batch,)
         last = {LAST_STEP: members} if simulation.scene.solver.chooses else {}
@@ -292,7 +292,7 @@ class NamedStates:
         return state
 
     def read(self, state: State) -> dict[str, Array]:
-        """The other way round."""
+        """Arrays by name, made from fields of a state as Cortado has them."""
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:

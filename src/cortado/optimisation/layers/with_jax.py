@@ -286,7 +286,7 @@ def _array(array: Any) -> Array:
 
 
 def _jax_array(found: Array, wanted: Any) -> Any:
-    """What a layer returned."""
+    """A JAX array of what a layer returned."""
     if isinstance(found, wp.array) and not found.device.is_cpu:
         return jnp.from_dlpack(found).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)

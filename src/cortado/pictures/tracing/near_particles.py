@@ -152,7 +152,7 @@ def bump(q: wp.float32):
 
 
 def bump_at(q: float) -> float:
-    """The same in Python."""
+    """`bump` of a Python number."""
     return 1.0 - 6.0 * q * q * (1.0 - q) if q < 0.5 else 2.0 * max(1.0 - q, 0.0) ** 3
 
 

@@ -133,7 +133,7 @@ class PcisphSteps(ParticleSolver):
             self.iterate(k, k + 1, context)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """The last prediction."""
+        """Writes the last prediction as the new state."""
         (iterations,) = counts
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
@@ -152,7 +152,7 @@ class PcisphSteps(ParticleSolver):
         return context
 
     def _relax(self, context: StepContext) -> None:
-        """The pressure relaxation."""
+        """Computes the relaxation of the pressure."""
         kernels = self.kernels
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if kernels.density_ratio:

@@ -41,7 +41,7 @@ class BodyKernels:
 
 @cache
 def body_kernels(discretisation: Discretisation) -> BodyKernels:
-    """Of a discretisation."""
+    """The kernels by which the projection moves bodies, for a discretisation."""
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)

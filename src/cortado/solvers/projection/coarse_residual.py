@@ -43,7 +43,7 @@ class CoarseSums:
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> CoarseSums:
-    """Of a discretisation."""
+    """The sums over neighbours that the coarse residual needs, for a discretisation."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)

@@ -125,7 +125,7 @@ class ProjectionTangent(ParticleTangent):
         return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """Of the velocities that y leaves."""
+        """The tangent of the velocities that the pressure y leaves."""
         solver, kernels = self._solver, self._solver.kernels.velocity
         pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
         context.launch(kernels.pull_tangent, *known, pull)

@@ -74,7 +74,7 @@ class ImageSums:
 
 @cache
 def image_sums(discretisation: Discretisation) -> ImageSums:
-    """Of a discretisation."""
+    """The sums over images of the fluid in flat walls, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product

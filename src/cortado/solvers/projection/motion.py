@@ -97,7 +97,7 @@ def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Call
 
 @cache
 def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """The kernels of delta."""
+    """The kernels of the shift delta, which spreads particles evenly."""
     make = partial(shift_of_particle, d.precision, dimension)
     modules = d.modules(f"projection_{dimension}d")
     return pointwise_kernels(d.precision, modules, make, ["delta"], numbers=["spacing"])

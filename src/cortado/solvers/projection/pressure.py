@@ -102,7 +102,7 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
 
 @dataclass(frozen=True)
 class PressureKernels:
-    """Of the projection."""
+    """The kernels of one iteration of the projection's pressure."""
 
     update: Kernels
     """k' and y'; its adjoint are three kernels, that of the clamp, and that of D without and with an adjoint of A from

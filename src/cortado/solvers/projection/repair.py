@@ -37,7 +37,7 @@ cube that falls they went 0.155 at most."""
 
 @dataclass(frozen=True)
 class RepairKernels:
-    """Of one iteration."""
+    """The kernels of one repair of the density."""
 
     measure: Kernels
     """lambda' from n(x_k)."""

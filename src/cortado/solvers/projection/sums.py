@@ -61,7 +61,7 @@ class ProjectionSums:
 
 @cache
 def projection_sums(discretisation: Discretisation) -> ProjectionSums:
-    """Of a discretisation."""
+    """The sums over neighbours of the projection, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)

@@ -19,7 +19,7 @@ from cortado.sph.moment_functions import matrix_type, moment_functions, symmetri
 
 @dataclass(frozen=True)
 class VelocityKernels:
-    """Of the velocity."""
+    """The kernels of the velocity that pressures leave."""
 
     velocity: Kernels
     """Its adjoint goes on from the f of all particles."""

@@ -98,7 +98,7 @@ def normal_part(discretisation: Discretisation) -> Any:
 
 @cache
 def beside_sums(discretisation: Discretisation) -> BesideSums:
-    """Of a discretisation."""
+    """The sums over wall particles of the projection, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
