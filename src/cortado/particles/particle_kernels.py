@@ -7,9 +7,9 @@
 is a kernel that sums ``spread`` over the neighbours of particle i, and then writes what the function returns to
 c_new[i]. Parameters of the function are results of its sums; entries c_i of arrays c; ``i``, and ``member``, the number
 of its scene; the neighbourhood ``s``; numbers and whole arrays of a launch; and all others, such as ``time_step``,
-entries of the particle's scene. A sum finds its arrays by
-the names that they have in its term, unless it is told others. A result "+x_bar" is added to what is there, and one
-"acceleration:acceleration_in" is what it is added to in another array.
+entries of the particle's scene. A sum finds its arrays by the names that they have in its term, unless it is told
+others. A result "+x_bar" is added to the array's entry, and "acceleration:acceleration_in" is the result added to the
+entry of acceleration_in.
 
 A sum whose derivatives are known needs no function where what is computed of it is a multiple (`sum_kernels`), and a
 function of a particle's own numbers none for its derivatives, which Warp makes (`pointwise_kernels`): of results
@@ -49,11 +49,9 @@ def {name}({parameters}):
 """
 MADE = "made_"
 """Begins the names of kernels that nobody has written."""
-MOST = 8
+MOST_ARRAYS = 8
 """Arrays of particles that a kernel which no tape differentiates takes one by one. More are bundles, as each takes 2 us
 of a launch on a CPU."""
-
-
 TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
@@ -234,7 +232,7 @@ class _Arguments:
         body = [f"i = s.first + wp.tid(){' // LANES' * bool(self._sums)}" if self._around else "i = wp.tid()"]
         if self._scenes or self._numbered:
             body.append(f"member = i // {'s.' * bool(self._around)}particles")
-        if len(own) + len(written) > MOST and not module.options["enable_backward"]:
+        if len(own) + len(written) > MOST_ARRAYS and not module.options["enable_backward"]:
             arrays = {label: bundle(**kinds) for label, kinds in (("at", own), ("to", written)) if kinds}
             body += [f"{each} = {label}.{each}" for label, kinds in (("at", own), ("to", written)) for each in kinds]
         else:
