@@ -38,9 +38,9 @@ from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.parts import Force, Part, PartMaker, Setting
 
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
-"""Of a `Force`."""
+"""Attributes that every `Force` must have."""
 PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
-"""Of a `Part`, which no `Force` has."""
+"""Methods of a `Part` that a `Force` alone does not have."""
 
 
 def first_capacity(support: float, dimension: int) -> int:
@@ -50,7 +50,7 @@ def first_capacity(support: float, dimension: int) -> int:
 
 
 def particle_system(setting: SolverSetting) -> ParticleSystem:
-    """A scene that is cut into particles, on a device, with the forces of the scene and those that it was given."""
+    """Cut the scene of a setting into particles on a device, with the scene's forces and those of the setting."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
@@ -81,7 +81,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
 def _search(
     scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, mirrored: bool
 ) -> NeighbourSearch:
-    """The search for neighbours within the support, and a little beyond."""
+    """Make the search for neighbours of particles within the support radius, and a little beyond."""
     support = discrete.lattice.support
     grid = Grid.around(
         discrete.near.lower,
@@ -104,7 +104,7 @@ def _search(
 def _forces(
     scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, makers: Sequence[ForceMaker]
 ) -> list[Force]:
-    """Those of the parameters that the scene has, in the order of the registry, and then those of the makers."""
+    """Make the forces of a scene's parameters, in the order of the registry, and after them those of the makers."""
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     replaced = {getattr(maker, "replaces", None) for maker in makers}
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
@@ -123,8 +123,8 @@ def _forces(
 
 
 def _check_force(force: Force, maker: Any) -> None:
-    """Raises `InputError` for what a maker made that lacks something of a `Force`, and for a part that would leave its
-    fields unwritten. So it does for a force that has methods of a part and is none, as no step would call them."""
+    """Raise `InputError` for a maker's result that lacks an attribute of a `Force`, or for a part that would leave its
+    fields unwritten. So it does for an object with methods of a part that is no force, as no step would call them."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
         made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
@@ -148,14 +148,14 @@ def _parts(
     search: NeighbourSearch,
     layout: Layout,
 ) -> list[PartMaker]:
-    """The parts that are no forces, in the order in which they end a step."""
+    """Make the parts of a solver that are no forces, in the order in which they end a step."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
     found += [_free_solids(scene, discrete, search, layout), _moving_solids(scene, search)]
     return [part for part in found if part is not None]
 
 
 def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
-    """The bodies that fluid moves; None without any."""
+    """Make the part that moves free bodies with the fluid; None for a scene without free bodies."""
     tables = [
         FreeTable(
             table.name, number, Mass.of(table.own_solid()).in_volumes(scene.discretisation.spacing**scene.dimension)
@@ -170,7 +170,8 @@ def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch,
 
 
 def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
-    """What each body that is free may touch: the container and solids at rest, and each other solid that moves."""
+    """List for each free body the solids that it may touch: container and solids at rest, and each other moving
+    solid."""
     moved, spacing, walls = moving(scene.solid), scene.discretisation.spacing, discrete.walls
     bodies = [number for number, table in enumerate(moved) if table.motion == "free"]
     sides = scene.container.solids(scene.dimension, discrete.lattice.support)
@@ -191,14 +192,14 @@ def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
 
 
 def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:
-    """The solids that move, which write the walls of all of these; None without any."""
+    """Make the part that moves solids and writes the walls of all moving solids; None where no solid moves."""
     tables = moving(scene.solid)
     numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
     return MovingSolids(numbers, scene.dimension, search) if tables else None
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
-    """The phases, and how they diffuse into one another."""
+    """Make the part for the phases of a mixture, with their diffusion into one another where there are several."""
     mixture, count = scene.mixture, len(scene.phase)
     if count == 1:
         return Phases(1, None, 0.0)
@@ -207,7 +208,7 @@ def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnerg
 
 
 def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
-    """The particles that wait in a nozzle; None without an emitter."""
+    """Make the part for the particles that wait in a nozzle; None for a scene without an emitter."""
     fluid, sample = discrete.fluid, discrete.fluid.emitter
     if scene.emitter is None or sample is None:
         return None
@@ -223,7 +224,7 @@ def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
 
 
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
-    """Where particles may go. Walls act through the pressure: without it they hold nothing."""
+    """Describe where particles may go: container and solids. Without pressure walls hold nothing and are left out."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)
     spacing = scene.discretisation.spacing
@@ -234,7 +235,7 @@ def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
 
 
 def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
-    """All of its solids."""
+    """Return the solids of a scene by name, each with the number of its wall particles and its middle."""
     numbers = wall_numbers(scene.solid)
     return {table.name: NamedSolid(numbers[table.name], padded(table.middle()[None])[0]) for table in scene.solid}
 

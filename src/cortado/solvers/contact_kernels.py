@@ -23,12 +23,12 @@ from cortado.particles.moving_walls import matrix_of
 from cortado.sph.free_kernels import free_module
 
 STIFFNESS = 0.04
-"""q"""
+"""The stiffness q of contacts [-]."""
 
 
 @cache
 def strength_kernels(precision: Precision) -> Kernels:
-    """What both get by the sums over the points of the body, with a thread for each scene."""
+    """Make kernels that turn sums over a body's points into the momenta of both bodies in contact; a thread a scene."""
     real, vector, pair = precision.real, precision.vector, precision.pair
     module, stiffness = free_module(precision), wp.constant(real(STIFFNESS))
     bars = bundle(**{f"{name}_bar": vector for name in ("push", "twist", "other")})
@@ -40,7 +40,8 @@ def strength_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def strength(dt: real, own: real, other: real, is_free: bool) -> real:
-        """q M / dt of the masses of both, of which the other counts if it is free."""
+        """Return q M / dt of a contact [kg / s]: M is the own mass, or the reduced mass if the other body is free
+        too."""
         mass = own
         if is_free:
             mass = own * other / (own + other)
@@ -48,7 +49,7 @@ def strength_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def part(own: real, other: real, is_free: bool) -> real:
-        """dM / d own"""
+        """Return the derivative of a contact's mass M with respect to the own mass: 1, or that of a reduced mass."""
         found = real(1.0)
         if is_free:
             found = (other / (own + other)) * (other / (own + other))
@@ -152,17 +153,17 @@ FAR = 1e6
 
 @dataclass(frozen=True)
 class ContactKernels:
-    """With a thread for each point of a body's surface in each scene."""
+    """Kernels of contact between a body and a solid, with a thread for each surface point in each scene."""
 
     look: Kernels
-    """n and d of a point."""
+    """These find the normal n and the depth d of a point."""
     push: Kernels
-    """f n, and its moments about the middles of both."""
+    """These compute the force f n of a point, and its moments about the middles of both bodies."""
 
 
 @cache
 def contact_kernels(precision: Precision) -> ContactKernels:
-    """In a precision."""
+    """Make the kernels of contacts between bodies and solids in a precision."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module = free_module(precision)
     seen = bundle(normal=vector, depth=real)
@@ -184,7 +185,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
 
     @wp.func
     def nearest(way: vector, period: vector) -> vector:
-        """To the nearest image."""
+        """Shorten a separation [m] to that of the nearest periodic image."""
         return vector(along(way[0], period[0]), along(way[1], period[1]), along(way[2], period[2]))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -205,8 +206,8 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         depth: wp.array(dtype=real),
         square: wp.array(dtype=real),
     ):
-        """Goes on from the deepest place so far; ``against`` is -1 of a solid that is at rest, ``period`` is 0 along an
-        axis without one. ``square`` is d^4."""
+        """Find normal and depth of each body point in a solid, where it is deeper than in those seen before.
+        ``against`` is -1 for a solid at rest, ``period`` is 0 along an axis without one, and ``square`` is d^4."""
         j = wp.tid()
         member = j // points
         x = after[member, number] + turns[member, number] * own[j - member * points]
@@ -280,7 +281,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         # out
         share: shares,
     ):
-        """``whole`` is S."""
+        """Write the contact force f n of each point and its moments about both middles; ``whole`` is S = sum d^4."""
         j = wp.tid()
         member = j // points
         r, d, S = turns[member, number] * own[j - member * points], of.depth[j], whole[member]
@@ -346,8 +347,8 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         work: wp.array(dtype=real),
         weighed: wp.array(dtype=real),
     ):
-        """What n . f_bar is for the adjoint f_bar of f n, and its product with d^3; ``share_bar`` are the adjoints
-        (members,) of the sums."""
+        """Compute n . f_bar for the adjoint f_bar of a point's contact force f n, and its product with d^3;
+        ``share_bar`` holds the adjoints (members,) of the sums."""
         j = wp.tid()
         member = j // points
         r, d, n = turns[member, number] * own[j - member * points], of.depth[j], of.normal[j]
@@ -375,7 +376,7 @@ def contact_kernels(precision: Precision) -> ContactKernels:
         # out
         moved: bundle(own_force=vector, own_torque=vector, other_force=vector, other_torque=vector, other_growth=real),
     ):
-        """To the adjoints of both poses, and of how the other solid grows, point by point."""
+        """Turn adjoints of normals and depths into those of both poses and of the other solid's growth."""
         j = wp.tid()
         member = j // points
         d, n = of.depth[j], of.normal[j]

@@ -24,21 +24,21 @@ SHARES = ("push", "twist", "other")
 
 @dataclass(frozen=True)
 class Touching:
-    """One body and what it may touch: solids at rest, or one that moves."""
+    """A free body and what it may touch: all solids at rest, or one solid that moves."""
 
     body: int
-    """Number of a free body among those."""
+    """Number of the body among the free bodies."""
     against: int
-    """Number of the other among the solids that move; -1 of those at rest."""
+    """Number of the other solid among the solids that move; -1 for solids at rest."""
     other: int
-    """Number of the other among the bodies that are free; -1 of others."""
+    """Number of the other solid among the free bodies; -1 for a solid that is not free."""
     obstacles: Sequence[Obstacle]
     points: NDArray[np.float64]
     """(n, d) of the surface of the body, in its frame [m]"""
 
 
 class Contact:
-    """One of them in the steps of a solver."""
+    """One contact between a body and other solids, with its arrays on the device, in the steps of a solver."""
 
     def __init__(self, touching: Touching, spacing: float, layout: Layout):
         self.touching, precision, device = touching, layout.precision, layout.device
@@ -57,15 +57,15 @@ class Contact:
         self.all = layout.members * self.count
 
     def arrays(self, names: Sequence[str], dtype: Any) -> Arrays:
-        """(members points,) by name, all 0."""
+        """Make arrays (members points,) of zeros, by name, all of one type."""
         return self.arrays_of(dict.fromkeys(names, dtype))
 
     def arrays_of(self, kinds: Mapping[str, Any]) -> Arrays:
-        """The same of several types."""
+        """Make arrays (members points,) of zeros, by name, each of its own type."""
         return {name: wp.zeros(self.all, dtype=kind, device=self._layout.device) for name, kind in kinds.items()}
 
     def total(self, dtype: Any) -> Any:
-        """What adds up values of points, scene by scene."""
+        """Make a function that adds up the values of a body's points, scene by scene."""
         return sum_of(dtype, self.count, self._layout.device, self._layout.members)
 
 
@@ -86,7 +86,7 @@ class Seen:
             array.zero_()
 
     def whole(self) -> Arrays:
-        """(members,) S"""
+        """Sum up S = sum d^4 over the points of a contact, (members,), by the name that kernels have for it."""
         return {f"whole{self._suffix}": self._whole(self.numbers[f"square{self._suffix}"])}
 
     def sums(self) -> Arrays:
@@ -97,7 +97,7 @@ class Seen:
 
 
 class Contacts:
-    """Those of the bodies of one solver; a step looks for them once poses are known."""
+    """The contacts between the bodies of one solver; each step looks for them once poses are known."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class Contacts:
         periods: NDArray[np.float64],
         layout: Layout,
     ):
-        """``periods`` (d,) [m] are 0 along axes without one."""
+        """Prepare contacts of a solver's bodies; ``periods`` (d,) [m] are 0 along axes without one."""
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.strength = strength_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
@@ -117,13 +117,13 @@ class Contacts:
         self._sums: list[Arrays] = [{} for _ in self.contacts]
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
-        """The body of a contact and the other one, or itself again."""
+        """Return the body of a contact and the other free body; the first one twice where the other is not free."""
         touching, bodies = self.contacts[number].touching, self.part.bodies
         own = bodies[touching.body]
         return own, own if touching.other < 0 else bodies[touching.other]
 
     def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
-        """What kernels know of a contact."""
+        """Return the arrays and constants of a contact by the names that kernels have for them."""
         contact, seen, (own, other) = self.contacts[number], self.seen[number], self.bodies(number)
         volumes = self.layout.precision.pair(own.table.mass.volume, other.table.mass.volume)
         constants: dict[str, Any] = {
@@ -141,7 +141,7 @@ class Contacts:
         return constants, *found, self.part.poses
 
     def look(self, step: StepContext) -> None:
-        """Write what bodies are pushed with."""
+        """Find the contacts of a step, and write the momenta that bodies get from them."""
         for body in self.part.bodies:
             for array in body.given.values():
                 array.zero_()
@@ -158,16 +158,16 @@ class Contacts:
             step.launch(self.strength.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
-        """Forward mode."""
+        """Return the tangent of the search for contacts, along changes of the bodies' poses."""
         return ContactsTangent(self, changes)
 
     def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
-        """Reverse mode."""
+        """Return the adjoint of the search for contacts, which adds to the bodies' changes."""
         return ContactsAdjoint(self, changes)
 
 
 class ContactsTangent:
-    """Forward mode."""
+    """The tangent of the contacts between bodies, for forward mode."""
 
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
@@ -193,7 +193,7 @@ class ContactsTangent:
 
 
 class ContactsAdjoint:
-    """Reverse mode."""
+    """The adjoint of the contacts between bodies, for reverse mode."""
 
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
@@ -208,7 +208,7 @@ class ContactsAdjoint:
         self._shares = {f"{name}_bar": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SHARES}
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Of `Contacts.look`, to the adjoints of poses."""
+        """Apply the adjoint of `Contacts.look`: from adjoints of the bodies' momenta to adjoints of their poses."""
         contacts, kernels = self._contacts, self._contacts.kernels
         for number, contact in enumerate(contacts.contacts):
             bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
@@ -233,5 +233,5 @@ def _both(contact: Contact, changes: Sequence[Changes]) -> tuple[Changes, Change
 
 
 def _of_other(given: Arrays) -> Arrays:
-    """``pushed_bar`` as ``pushed_other_bar``."""
+    """Rename a body's adjoints for kernels that take it as the other one: ``pushed_bar``, ``pushed_other_bar``."""
     return {f"{name.split('_')[0]}_other_{name.split('_')[1]}": array for name, array in given.items()}

@@ -19,12 +19,12 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""What stands for 'every particle is well' where the first bad one would be named."""
+"""Stands in place of the first lost particle's number while every particle is well."""
 
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    """The Warp struct of a `Region`, a tolerance included, and of how far particles may go."""
+    """Make the Warp struct of the region in which particles may be, with tolerance and greatest distance."""
     real, vector = precision.real, precision.vector
 
     class Bounds:
@@ -46,15 +46,15 @@ def bounds_type(precision: Precision) -> Any:
 
 @cache
 def solids_type(precision: Precision) -> Any:
-    """The Warp struct of solids, as meshes about their middles."""
+    """Make the Warp struct of the solids that particles must not enter, as meshes about their middles."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     class Solids:
         meshes: wp.array(dtype=wp.uint64)
         still: wp.int32
-        """How many do not move; the others come after them."""
+        """Number of solids that do not move, which come first."""
         middles: wp.array(dtype=vector)
-        """About which meshes are, of those at rest in space, of others in their own frame [m]."""
+        """Points that meshes are centred on, in space for solids at rest, in their own frames for others [m]."""
         before: wp.array2d(dtype=vector)
         """(members, solids) where the middles of those that move are before a step [m]."""
         turns_before: wp.array2d(dtype=matrix)
@@ -79,14 +79,14 @@ def solids_type(precision: Precision) -> Any:
 
 @cache
 def lost_kernel(precision: Precision) -> Any:
-    """The kernel that looks for particles that were lost in a step."""
+    """Make the kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
     bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), matrix_of(precision)
     module = kernel_module(f"containment_{precision.name}")
 
     @wp.func
     def between(x: vector, lower: vector, upper: vector) -> bool:
-        """False for what is not a number, too."""
+        """Test that a position lies in a box; False for one that is not a number."""
         return (
             x[0] >= lower[0]
             and x[1] >= lower[1]
@@ -121,7 +121,7 @@ def lost_kernel(precision: Precision) -> Any:
         turns: wp.array2d(dtype=matrix),
         solids: solids_struct,
     ) -> vector:
-        """Where x is for the mesh of solid k."""
+        """Return the position x in the frame of the mesh of solid k, as nearest periodic image."""
         if k < solids.still:
             return nearest_image(x - solids.middles[k], solids)
         away = nearest_image(x - positions[member, k - solids.still], solids)
@@ -129,8 +129,8 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
-        """Whether a place of the mesh of solid k is deeper in the solid than it may be; what is far from the surface is
-        not."""
+        """Test whether a place in the frame of solid k's mesh is deeper in the solid than its tolerance; False far from
+        the surface."""
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
         depth = real(0.0)
@@ -141,7 +141,7 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_free(x: vector, member: int, solids: solids_struct) -> bool:
-        """Whether x was not deep in any solid before the step."""
+        """Test that position x was not deep in any solid before the step."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.before, solids.turns_before, solids)
             if is_deep(y, k, scale_of(k, member, solids), solids):
@@ -150,9 +150,8 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
-        """Whether x is deep in a solid, and was not in any before the step. Depths change by no more than the way that
-        was gone, so that what is further from the surface than that and the tolerance need not be looked at: which side
-        it is on takes long to find out."""
+        """Test whether a particle is deep in a solid now and was in none before the step. Depths change by no more than
+        the way gone, so only surfaces within that way and the tolerance are looked at, as telling sides takes long."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.after, solids.turns, solids)
             gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
@@ -188,8 +187,8 @@ def lost_kernel(precision: Precision) -> Any:
         bad: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
     ):
-        """``bad``: the first particle of a scene, in its order, that is lost; ``count``: how many are. After a bad step
-        nothing is looked for.
+        """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
+        ones. After a bad step nothing is looked for.
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
         inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may
@@ -240,7 +239,7 @@ Distance = Callable[[Points], Points]
 
 @dataclass(frozen=True)
 class Walled:
-    """Where particles may go."""
+    """The places where particles may go: the region of the container and the solids in it."""
 
     region: Region
     """The container, without the sides that nothing closes: along a period, or where no pressure acts."""
@@ -257,16 +256,16 @@ class Walled:
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return len(self.near.lower)
 
     def tolerance(self, one: Obstacle) -> float:
-        """How deep in a solid a particle may be [m]."""
+        """Return how deep in a solid a particle may be [m]: a spacing, or 0.45 of a thin solid's thickness."""
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves; what
-        is spilled over the rim of an open cup may fall on."""
+        """Return the box that positions must not leave [m]: far away, within the distance from the origin that a
+        precision resolves; what is spilled over the rim of an open cup may fall on."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
@@ -285,13 +284,13 @@ class Lost:
 
 
 class Containment:
-    """What one solver asks at the end of each step."""
+    """The search for lost particles that one solver runs at the end of each step."""
 
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle; ``moving`` knows
-        where solids that move are."""
+        """Prepare the search: ``first_waiting`` is the first particle, in the scene's order, that may wait in a nozzle,
+        and ``moving`` has the poses of moving solids."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
@@ -316,7 +315,7 @@ class Containment:
         self._seen = HostCopy(self.bad_step)
 
     def reset(self, step: int = 0) -> None:
-        """Forget what was lost from a step on; from the first on, an earlier run."""
+        """Forget the particles that were lost from a step on; with step 0, all of an earlier run."""
         steps = self.bad_step.numpy() if step > 0 else np.array([-1])
         kept = (steps >= 0) & (steps < step)
         for array, well in ((self.bad_step, -1), (self.bad_particle, NO_PARTICLE), (self._count, 0)):
@@ -328,8 +327,8 @@ class Containment:
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
     ) -> None:
-        """Look at the end of a step: sorted positions and rest densities before it, sorted positions and velocities
-        after it without what a nozzle leads, and the state with it."""
+        """Look for particles that a step has lost. It takes sorted positions and rest densities before the step, sorted
+        positions and velocities after it without what a nozzle leads, and the new state."""
         self._launch(
             self._kernel,
             self._constants,
@@ -345,7 +344,7 @@ class Containment:
         )
 
     def lost(self) -> dict[int, Lost]:
-        """Which particles were lost since `reset`, by the number of their scene; reads from the device."""
+        """Return the particles lost since `reset` by the number of their scene; reads from the device."""
         steps = self._seen.read()
         members = np.flatnonzero(steps >= 0).tolist()
         if not members:
@@ -354,12 +353,12 @@ class Containment:
         return {b: Lost(int(steps[b]), int(particles[b]), int(counts[b]) - 1) for b in members}
 
     def is_imprecise(self, position: np.ndarray) -> bool:
-        """Whether a position (d,) [m] is further from the origin than the precision resolves."""
+        """Test whether a position (d,) [m] is further from the origin than the precision resolves."""
         distance = float(np.abs(position).max())
         return self._precision.furthest * self.walled.spacing < distance < np.inf
 
     def where(self, position: np.ndarray) -> str:
-        """What happened to a lost particle that is now at a position (d,) [m], in words."""
+        """Tell in words what happened to a lost particle that is now at a position (d,) [m]."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
         if not np.isfinite(position).all():
             return "has no finite position"
@@ -375,22 +374,22 @@ class Containment:
         return f"at {place} has no finite velocity or no volume"
 
     def walls(self, member: int) -> Iterator[tuple[str, Distance]]:
-        """What closes a scene of a batch, each with its name in words: the sides of the container, and solids, those
-        that move as they are after the last step."""
+        """Yield the sides of the container and the solids of one scene, each with its name in words and a function of
+        distance; moving solids are where they are after the last step."""
         for side in self.walled.region.sides():
             yield "the container", side
         for one, distance in self._solids(member):
             yield f"the solid {one.name!r}", distance
 
     def _entered(self, position: np.ndarray) -> str | None:
-        """The name of the solid that holds a position (d,) [m]; of a batch, as they are in its first scene."""
+        """Name the solid that holds a position (d,) [m], as solids are in the first scene; None where none does."""
         for one, distance in self._solids(0):
             if distance(position[None])[0] < -self.walled.tolerance(one):
                 return one.name
         return None
 
     def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
-        """Solids as they are in a scene of a batch after the last step."""
+        """Yield the solids of a scene as they are after the last step, each with a function of distance from it."""
         yield from ((one, one.solid.distance) for one in self.walled.solids)
         after = self._poses[1]
         poses = (after.positions.numpy()[member], after.turns.numpy()[member], self._scales.numpy()[member])
@@ -432,6 +431,6 @@ class Containment:
 
 
 def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: float, points: Points) -> Points:
-    """(n,) how far points (n, d) [m] are outside of a solid [m] whose middle is there, turned and scaled."""
+    """Return distances (n,) of points (n, d) [m] outside of a solid that is turned, scaled and moved to ``middle``."""
     d = points.shape[1]
     return np.asarray(scale * one.solid.distance((points - middle[:d]) @ turn[:d, :d] / scale))

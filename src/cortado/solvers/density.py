@@ -12,10 +12,10 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 class Density:
-    """Writes the n of particles, once their neighbours are listed."""
+    """The measurement of the number density n of particles, once their neighbours are listed."""
 
     def __init__(self, discretisation: Discretisation, topic: str, kernels: Kernels | None = None):
-        """With ``kernels``, or those of the density alone, in the Warp modules of a topic."""
+        """Take given ``kernels``, or make those of the density alone, in the Warp modules of a topic."""
         self.discretisation, self.topic = discretisation, topic
         self.kernels = kernels or density_kernels(discretisation, topic)
 
@@ -30,7 +30,7 @@ class Density:
 
 
 class DensityTangent:
-    """Forward mode."""
+    """The tangent of the measured number density, for forward mode."""
 
     def __init__(self, density: Density):
         self._density = density
@@ -40,16 +40,16 @@ class DensityTangent:
 
 
 class DensityAdjoint:
-    """Reverse mode."""
+    """The adjoint of the measured number density, for reverse mode."""
 
     def __init__(self, density: Density):
         self._density = density
 
     def begin(self) -> None:
-        """Forget what an earlier step back has left."""
+        """Forget the adjoints that an earlier step back has left."""
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """From the adjoint of n to those of positions and of solids."""
+        """Turn the adjoint of the number density n into those of positions and of solids."""
         density = self._density
         context.launch(density.kernels.adjoint, *bar.named)
         kernel = partial(density_solid_kernel, density.discretisation, density.topic)

@@ -20,15 +20,15 @@ from cortado.solvers.containment import NO_PARTICLE, Containment
 from cortado.solvers.solver import Counts
 
 UNKNOWN = 2**31 - 1
-"""What stands for the number of rounds of a loop before it is known."""
+"""Stands in place of a loop's number of rounds before it is known."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What the errors of particles, in pairs, come to in a step."""
+    """A rule that reduces the errors of all particles, which come in pairs, to one or two numbers a step."""
 
     columns: tuple[str, ...]
-    """Names in the diagnostics of a run, made of that of the loop; the first is what a tolerance bounds."""
+    """Names of these numbers in a run's diagnostics, made from the loop's name; a tolerance bounds the first."""
     is_weighted: bool
     """Whether a pair is a weighted square and its weight, of which the root of the mean is taken. Otherwise both are
     the error, of which the average and the maximum are."""
@@ -40,21 +40,21 @@ ROOT_MEAN_SQUARE = Measure(("{}",), is_weighted=True)
 
 @dataclass(frozen=True)
 class ConvergenceKernels:
-    """The kernels of one thread a scene that count iterations and steps."""
+    """Kernels that count iterations and steps on the device, with one thread a scene."""
 
     decide: Any
-    """Whether to go on iterating."""
+    """Decides whether to go on iterating."""
     record: Any
-    """A loop that has ended; the last one of a step ends the step."""
+    """Records a loop that has ended; the last loop of a step ends the step."""
     count_step: Any
-    """The end of a step without loops."""
+    """Ends a step without loops."""
     note: Any
-    """The iterations that a force took in a step to solve its equations."""
+    """Records the iterations that a force took in a step to solve its equations."""
 
 
 @cache
 def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> ConvergenceKernels:
-    """The kernels for a precision and what is measured."""
+    """Make the kernels that count and stop iterations, for a precision and a measure of errors."""
     real, pair = precision.real, precision.pair
     module = kernel_module(f"convergence_{precision.name}{'_weighted' * measure.is_weighted}")
 
@@ -64,7 +64,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
 
     @wp.func
     def root_of_mean(sums: pair, particles: int) -> pair:
-        """Without any weight, 0."""
+        """Return the root of the weighted mean square, and 0, from sums of weighted squares and weights."""
         mean = real(0.0)
         if sums[1] != real(0.0):
             mean = sums[0] / sums[1]
@@ -85,8 +85,8 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
         rounds: wp.array(dtype=wp.int32),
         active: wp.array(dtype=wp.int32),
     ):
-        """``done`` iterations are added to the count of each scene that has not come to an end; ``rounds`` becomes
-        known where the error is below the tolerances, and ``active`` counts the scenes where it is not."""
+        """Decide which scenes go on iterating: add ``done`` iterations to their counts, set ``rounds`` where the error
+        is below the tolerances, and count the other scenes in ``active``."""
         b = wp.tid()
         if rounds[b] != wp.static(UNKNOWN):
             return
@@ -122,8 +122,8 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
         iterations: wp.array2d(dtype=wp.int32),
         errors: wp.array2d(dtype=pair),
     ):
-        """Record the loop's iterations, those that were ``undecided`` included, and what its errors come to, and after
-        the last loop count the step. The next loop begins with all scenes."""
+        """Record a loop's iterations, with those that were ``undecided``, and its errors; after the last loop count the
+        step. The next loop begins with all scenes."""
         b = wp.tid()
         n = step[b]
         iterations[n, b] = iteration[b] + undecided
@@ -158,16 +158,16 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
 
 
 class IterativeSolve(Protocol):
-    """What solves it, the ``solve`` of a force."""
+    """The iterative solution of a force's equations, which a force has as ``solve``."""
 
     name: str
-    """That of its iterations in the diagnostics of a run."""
+    """Name of its number of iterations in the diagnostics of a run."""
     count: wp.array
     """(members,) iterations of the last solve."""
 
 
 class SolveRecord:
-    """The iterations of every step, on the device until they are read."""
+    """The number of iterations of a force's solve in every step, on the device until it is read."""
 
     def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
         self.iterations = wp.zeros((max(steps, 1), layout.members), dtype=wp.int32, device=layout.device)
@@ -177,35 +177,35 @@ class SolveRecord:
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Read so many steps from the device."""
+        """Read the iteration counts of the first ``steps`` steps from the device."""
         self.found: NDArray = self._seen.read(steps).astype(int)[self._kept]
         """(steps,), in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "SolveRecord") -> None:
-        """Hold what another has read, on the device and off it."""
+        """Copy the counts that another record has read, on the device and off it."""
         wp.copy(self.iterations, other.iterations)
         self.found = other.found
 
     def note(self, launch: KernelLauncher, step: wp.array) -> None:
-        """Record the solve of a step, given the number of it in each scene."""
+        """Record the iterations of a step's solve, given the number of the step in each scene."""
         members = self.iterations.shape[1]
         launch(self._note, count=self.solve.count, step=step, iterations=self.iterations, threads=members)
 
 
 @dataclass(frozen=True)
 class LoopLimits:
-    """When a loop may stop."""
+    """Bounds on the iterations and the errors of a loop, which say when it stops."""
 
     minimum_iterations: int
     maximum_iterations: int
     tolerance: float
     """Bound on the average of the particles' errors, or on what else the loop's measure has first."""
     greatest_tolerance: float
-    """Bound on the maximum of the same; infinite where none is asked for."""
+    """Bound on the maximum of the particles' errors; infinite where none is asked for."""
 
 
 class LoopRecord:
-    """What is noted of one loop in every step of a run, on the device until it is read."""
+    """The iterations and errors of one loop in every step of a run, on the device until they are read."""
 
     def __init__(self, steps: int, loop: "Loop"):
         shape, layout = (max(steps, 1), loop.layout.members), loop.layout
@@ -218,7 +218,7 @@ class LoopRecord:
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Read so many steps from the device."""
+        """Read the iterations and errors of the first ``steps`` steps from the device."""
         loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
         iterations, errors = (copy.read(steps) for copy in self._seen)
         iterations = iterations.astype(int)
@@ -230,15 +230,15 @@ class LoopRecord:
         """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
 
     def assign(self, other: "LoopRecord") -> None:
-        """Hold what another has read, on the device and off it."""
+        """Copy the iterations and errors that another record has read, on the device and off it."""
         wp.copy(self.iterations, other.iterations)
         wp.copy(self.errors, other.errors)
         self.counts, self.diagnostics = other.counts, other.diagnostics
 
     @property
     def converged(self) -> NDArray:
-        """(steps,) or (steps, batch) whether the errors came below the tolerances; always, with a fixed number of
-        iterations."""
+        """Return (steps,) or (steps, batch) booleans: the errors came below the tolerances; all True with a fixed
+        number of iterations."""
         limits, found = self.loop.limits, [self.diagnostics[name] for name in self.loop.columns]
         if limits is None or limits.minimum_iterations == limits.maximum_iterations:
             return np.ones(found[0].shape, dtype=bool)
@@ -247,8 +247,8 @@ class LoopRecord:
 
 
 class IterationLog:
-    """The records of a step's loops, and of what its forces solve: a `StepLog`. A solver that has neither has only to
-    say that it converged."""
+    """The records of a step's loops and of the equations that forces solve: a `StepLog`. A solver that has neither has
+    only to say that it converged."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
@@ -285,7 +285,7 @@ class IterationLog:
 
 
 class Loop:
-    """A loop over all particles, which the device ends."""
+    """A loop of iterations over all particles that ends on the device, once errors are small enough."""
 
     def __init__(
         self,
@@ -296,7 +296,7 @@ class Loop:
         errors_name: str = "density_errors",
         measure: Measure = AVERAGE,
     ):
-        """``limits`` None: it never goes round. The names are those of the diagnostics of a run."""
+        """Prepare a loop; with ``limits`` None it never goes round. The names are used in the diagnostics of a run."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [column.format(errors_name) for column in measure.columns]
@@ -320,14 +320,14 @@ class Loop:
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
     def reset(self) -> None:
-        """Forget the count of a step that was interrupted."""
+        """Forget the iteration count of a step that was interrupted."""
         self._iteration.zero_()
         self.rounds.fill_(UNKNOWN)
         self._active.fill_(self.layout.members)
 
     def seek(self, record: LoopRecord, step: int) -> int:
-        """Make ready to go round as often as in a recorded step, and return how often that is. Only in a batch do
-        scenes differ in that."""
+        """Prepare the loop to go round as often as in a recorded step, and return that number. Only in a batch do
+        scenes differ."""
         if self.layout.members > 1:
             wp.copy(self.rounds, record.iterations[step])
         return int(record.counts[step])
@@ -353,7 +353,7 @@ class Loop:
             wp.capture_while(self._active, once_more)
 
     def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
-        """Record what the loop did in this step; the last loop of a step counts it."""
+        """Record the iterations and errors of this step's loop; the last loop of a step counts the step."""
         self._launch.join()
         self._launch(
             self._kernels.record,

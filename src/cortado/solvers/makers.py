@@ -22,7 +22,7 @@ from cortado.sph.viscosity_law import LAWS
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """What a solver is made for: ``particle_system(setting)`` of `cortado.solvers.build` is all of it on a device."""
+    """The arguments from which a solver is made; `cortado.solvers.build.particle_system` makes particles of them."""
 
     scene: Scene
     discrete: DiscreteScene
@@ -31,13 +31,13 @@ class SolverSetting:
     device: Any
     batch: int | None
     forces: Sequence[ForceMaker]
-    """Make the forces that are not the scene's."""
+    """Makers of the forces that are not named in the scene."""
     known: Known
     """The parameters of the simulation, those of these forces and of the solver among them."""
     called: str
-    """What sentences call the solver."""
+    """The name of the solver in messages."""
     lanes: int | None = None
-    """Threads of a GPU that share a particle, if not as many as suit the scene: see `cortado.device.lanes`."""
+    """Threads of a GPU that share a particle; None takes a number that suits the scene, see `cortado.device.lanes`."""
 
 
 class SolverMaker(Protocol):
@@ -48,14 +48,14 @@ class SolverMaker(Protocol):
     """
 
     def build(self, setting: SolverSetting) -> Solver:
-        """The solver in one precision and on one device."""
+        """Make the solver for a setting, in one precision and on one device."""
 
 
 WANTED = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
 
 
 def checked_solver(solver: Any) -> SolverMaker:
-    """What a user gives as ``solver``; raises `InputError`."""
+    """Return what a user gives as ``solver`` if it is a maker of solvers; else raise `InputError`."""
     if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
         raise InputError(f"solver is {shown(solver)}, but must be {WANTED}.")
     checked_parameters("solver", solver, getattr(solver, "parameters", ()))
@@ -63,7 +63,7 @@ def checked_solver(solver: Any) -> SolverMaker:
 
 
 def called(table: SolverTable, given: SolverMaker | None) -> str:
-    """What sentences call the solver of a scene with this table, or the one that is given."""
+    """Return the name of a solver in messages, from the scene's table or from the maker that is given in its place."""
     return f'solver.kind "{table.kind}"' if given is None else f"the solver {type(given).__name__}"
 
 
@@ -72,7 +72,7 @@ NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "st
 
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
-    """The solver that a maker makes; raises `InputError` where it does not fit the simulation."""
+    """Let a maker build its solver; raise `InputError` where the solver does not fit the simulation."""
     if setting.batch is not None and not getattr(maker, "batches", False):
         raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
     solver = maker.build(setting)
@@ -88,11 +88,11 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
 
 
 MODULES = {kind: f"cortado.solvers.{kind}.solver" for kind in OWN}
-"""By the kind of Cortado's own, the module whose ``maker`` takes the table."""
+"""The module of each of Cortado's own kinds of solvers, whose ``maker`` takes the table of a scene."""
 
 
 def solver_named(table: SolverTable) -> SolverMaker:
-    """What builds the solver of a scene with this table."""
+    """Return the maker of the solver that the table of a scene names."""
     if isinstance(table, PackageSolver):
         return checked_solver(table.make())
     made: SolverMaker = import_module(MODULES[table.kind]).maker(table)
@@ -100,7 +100,7 @@ def solver_named(table: SolverTable) -> SolverMaker:
 
 
 def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
-    """What makes the forces that a scene names by their kinds: laws of viscosity, and those of installed packages."""
+    """Return makers of the forces that a scene names by kind: laws of viscosity and forces of installed packages."""
     laws = [
         Rheology(LAWS[phase.rheology.kind], None, **phase.rheology.numbers(phase.viscosity))
         for phase in scene.phase
@@ -110,8 +110,8 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """The parameters of a scene by itself, those of parts of packages and of solids that move among them; raises
-    `InputError` where two of them have one name."""
+    """Return the parameters of a scene, with those of parts of packages and of moving solids; raise `InputError` where
+    two have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or moving(scene.solid)):
         return REGISTRY

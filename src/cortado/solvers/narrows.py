@@ -16,8 +16,8 @@ STEP = 1e-3
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Between which walls of a scene of a batch some of the points (n, d) [m] are shut in, in words; None where there
-    is room around all. Solids that move are where they are after the last step."""
+    """Name in words the walls of a scene between which some of the points (n, d) [m] are shut in; None with room around
+    all. Moving solids are where they are after the last step."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [
@@ -39,6 +39,6 @@ def shut_in(containment: Containment, member: int, points: Points) -> str | None
 
 
 def _normals(distance: Distance, points: Points, step: float) -> Points:
-    """(n, d) out of a wall at points (n, d) [m], from distances half a step [m] away on both sides."""
+    """Return normals (n, d) out of a wall at points (n, d) [m], by central differences of distances over a step [m]."""
     moves = step * np.eye(points.shape[1])
     return np.stack([(distance(points + move) - distance(points - move)) / (2.0 * step) for move in moves], axis=1)

@@ -12,7 +12,7 @@ from cortado.discretise.solid import Solid
 FINE = 0.2
 """In spacings: the width of faces by which round solids are looked at."""
 HEIGHT = 100.0
-"""Of a mesh that stands for a plane shape, over its width."""
+"""Height over width of the mesh that stands for a plane shape."""
 
 
 @dataclass(frozen=True)
@@ -22,29 +22,29 @@ class Obstacle:
     name: str
     solid: Solid
     is_hollow: bool
-    """Whether fluid is inside of the shape."""
+    """True where fluid is inside of the shape."""
     thickness: float
-    """Of its thinnest part [m], as far as it is known; infinite otherwise."""
+    """Thickness of its thinnest part [m], as far as it is known; infinite otherwise."""
 
 
 @dataclass(frozen=True)
 class NamedSolid:
-    """A solid of a scene."""
+    """A solid of a scene, by the number of its wall particles and its middle at the start."""
 
     number: int
-    """Of its wall particles (`cortado.scene.motions.wall_numbers`)."""
+    """Number of its wall particles (`cortado.scene.motions.wall_numbers`)."""
     middle: NDArray
     """(3,) where its middle is at the start [m]"""
 
 
 def middle_of(one: Obstacle) -> Points:
-    """(d,) of the box around its shape [m]."""
+    """Return the middle (d,) of the box around the shape of an obstacle [m]."""
     lower, upper = one.solid.extent()
     return np.asarray(0.5 * (lower + upper))
 
 
 def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
-    """The surface of its shape about its middle; in the plane, where it is as high as it is far from anything else."""
+    """Make the surface mesh of an obstacle about its middle; a plane shape becomes a prism of great height."""
     faces = one.solid.faces(FINE * spacing)
     faces = faces.reversed() if one.is_hollow else faces
     vertices, corners = faces.vertices - middle_of(one), faces.corners

@@ -14,7 +14,7 @@ from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
 
 class ParticleTangent:
-    """Forward mode of a step along tangents of the parameters, part by part, in the order of the step."""
+    """The tangent of a step along tangents of the parameters, part by part, in the order of the step."""
 
     def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
         self._solver = solver
@@ -28,7 +28,7 @@ class ParticleTangent:
         finalize(self, solver.launch.forget)
 
     def sort(self, context: StepContext, state_dot: State) -> None:
-        """The tangent of `ParticleSolver.sort`."""
+        """Apply the tangent of `ParticleSolver.sort`: neighbours, density and parts at the beginning of a step."""
         solver, d = self._solver, self.dot.fields
         context.launch(
             solver.integration.sort,
@@ -47,13 +47,13 @@ class ParticleTangent:
             part.sort(context, self.dot, state_dot)
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """The tangent of `ParticleSolver.accelerate`."""
+        """Return the tangent of the explicit accelerations that `ParticleSolver.accelerate` computes, (n,) vectors."""
         for t, force in enumerate(self._solver.forces):
             force.tangent(context, self.dot, self._accelerations_dot[t], self._accelerations_dot[t + 1])
         return self._accelerations_dot[-1]
 
     def predict(self, context: StepContext, v_star: wp.array, x_star_dot: wp.array, v_star_dot: wp.array) -> None:
-        """Of `accelerate`, and of a prediction v* = v + dt a, x* = x + dt v*, which are written."""
+        """Write the tangents of accelerations and of a prediction v* = v + dt a, x* = x + dt v*, and v* itself."""
         accelerations = {"acceleration": self._solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
         out = {"v_star": v_star, "x_star_dot": x_star_dot, "v_star_dot": v_star_dot}
         context.launch(self._solver.integration.predict_tangent, *self.dot.named, **accelerations, **out)
@@ -61,7 +61,7 @@ class ParticleTangent:
     def unsort(
         self, context: StepContext, x_dot: wp.array, v_dot: wp.array, state_dot: State, **carried_dot: wp.array
     ) -> None:
-        """The tangent of `ParticleSolver.unsort`."""
+        """Write the tangent of the new state from those of sorted positions and velocities."""
         solver = self._solver
         scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
         context.launch(solver.integration.unsort, x=x_dot, v=v_dot, **scene)
@@ -71,8 +71,8 @@ class ParticleTangent:
 
 
 class ParticleAdjoint:
-    """Reverse mode of steps, part by part, in the reverse order of a step; every neighbour sum is a gather, so that no
-    atomics are needed."""
+    """The adjoint of steps, part by part, in the reverse order of a step; sums over neighbours are gathers without
+    atomics."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout = solver.layout
@@ -100,13 +100,13 @@ class ParticleAdjoint:
         self.bar.solids.clear()
 
     def collect(self) -> Parameters:
-        """The adjoints of the parameters, of all steps since `begin`."""
+        """Return the adjoints of the parameters, summed over all steps since `begin`."""
         self.bar.shares.collect(self.bar.parameters)
         return self.bar.parameters
 
     def unsort(self, context: StepContext, state_bar: State) -> State:
-        """Of `ParticleSolver.unsort`: the adjoints of positions and velocities without what parts prescribe, in the
-        scene's order."""
+        """Apply the adjoint of `ParticleSolver.unsort`: return adjoints of positions and velocities without what parts
+        prescribe, in the scene's order."""
         self.carried_bar.sort(context, state_bar)
         free_bar = state_bar
         for part in self._parts:
@@ -114,14 +114,14 @@ class ParticleAdjoint:
         return free_bar
 
     def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
-        """Of a step that ends with x' = x + dt v', where v' is the ``v_star`` of an explicit prediction, given what
-        `unsort` returns: the adjoints of the fields, without what they had before."""
+        """Write the adjoints of the fields of a step that ends with x' = x + dt v', given the result of `unsort`. v' is
+        the ``v_star`` of an explicit prediction; earlier values are overwritten."""
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
         context.launch(begin_adjoint_kernel(self._solver.layout.precision), *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Of a prediction v* = v + dt a, of which the adjoint is what that of velocities is by then, and of
-        `accelerate`; with adjoints ``within`` the step."""
+        """Apply the adjoint of a prediction v* = v + dt a, taken from the adjoint of velocities at that point, and of
+        `accelerate`; adjoints ``within`` the step are added."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])
@@ -133,23 +133,23 @@ class ParticleAdjoint:
                 add(given, total)
 
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
-        """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""
+        """Apply the adjoint of `ParticleSolver.accelerate`, given the adjoint of its accelerations, (n,) vectors."""
         for force in reversed(self._solver.forces):
             passed = force.adjoint(context, acceleration_bar, self.bar)
             acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """The adjoint of how parts sort their fields in `ParticleSolver.sort`."""
+        """Apply the adjoint of the sorting of parts' fields in `ParticleSolver.sort`."""
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
 
     def begin_parts(self, context: StepContext, state_bar: State) -> None:
-        """The adjoint of how parts begin a step."""
+        """Apply the adjoint of the parts' work at the beginning of a step."""
         for part in self._parts:
             part.begin(context, self.bar, state_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """The adjoint of the rest of `ParticleSolver.sort`."""
+        """Apply the adjoint of `ParticleSolver.sort`, but for the work of parts."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():

@@ -36,10 +36,10 @@ from cortado.sph.walls import WallAction, WallSums, wall_slope_term
 
 @dataclass(frozen=True)
 class ParticleSystem:
-    """A scene as a solver of particles takes it, on a device: `cortado.solvers.build.particle_system` makes it."""
+    """A scene cut into particles on a device, as solvers take it: `cortado.solvers.build.particle_system` makes it."""
 
     called: str
-    """What sentences call the solver."""
+    """The name of the solver in messages."""
     discretisation: Discretisation
     layout: Layout
     lattice: Lattice
@@ -48,7 +48,7 @@ class ParticleSystem:
     periods: Sequence[float]
     """(3,) [m], 0 along an axis that is not periodic."""
     parts: Sequence[PartMaker]
-    """Of its parts that are no forces."""
+    """Makers of the parts that are no forces."""
     waiting: int
     """Number of the first particle of a scene that may wait in a nozzle."""
     walled: Walled
@@ -56,22 +56,22 @@ class ParticleSystem:
     """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
     does."""
     solids: Mapping[str, NamedSolid]
-    """By their names."""
+    """The solids of the scene by their names."""
     of_one_lane: Callable[[], "ParticleSystem"]
-    """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
+    """Makes a system over this search for neighbours, with kernels that Warp's tape can differentiate."""
 
 
 class ParticleSolver(Staying):
-    """The steps of one set of particles on one device; their arrays are reused by every step.
+    """The base of solvers that take steps of one set of particles on one device; every step reuses its arrays.
 
     The methods that `Solver` has are explained there. A solver of this kind has `step`, `replay` and `write_state`
     of its own, with loops also `reserve`, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
-    """What the solver itself carries from step to step, of particles."""
+    """Fields of particles that the solver itself carries from step to step."""
     topic = "density"
-    """Of the Warp modules that have the kernels of the density."""
+    """Topic of the Warp modules that have the kernels of the density."""
     density_power = 2
     """The pressure force of a pair has p_i over this power of its number density n_i."""
     shares: tuple[str, ...] = ()
@@ -115,26 +115,26 @@ class ParticleSolver(Staying):
         self.resize(search.capacity)
 
     def new_density(self) -> Density:
-        """What measures the number density in `sort`."""
+        """Make the object that measures the number density in `sort`."""
         return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
-        """What a particle's pressure pushes walls along: with V^2 p_i / n_i^2, or what `density_power` says."""
+        """Return the sums over walls, along which a particle's V^2 p_i / n_i^`density_power` pushes them."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def vectors(self) -> wp.array:
-        """(n,) vectors for a step or its derivative to work in, all 0."""
+        """Make an array (n,) of zero vectors for a step or its derivative to work in."""
         return self._array(self.discretisation.precision.vector)
 
     def numbers(self) -> wp.array:
-        """(n,) numbers for a step or its derivative to work in, all 0."""
+        """Make an array (n,) of zeros for a step or its derivative to work in."""
         return self._array(self.discretisation.precision.real)
 
     def _array(self, dtype: Any) -> wp.array:
         return wp.zeros(self.layout.all_particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
 
     def resize(self, capacity: int) -> None:
-        """Make room for neighbour lists of that length."""
+        """Make room for lists of up to ``capacity`` neighbours."""
         if capacity != self.search.capacity:
             self.search.allocate(capacity)
             self.generation += 1
@@ -175,7 +175,7 @@ class ParticleSolver(Staying):
             wp.copy(own.rounds, given.rounds)
 
     def reserve(self, counts: Counts) -> None:
-        """Nothing, of a step without loops."""
+        """Do nothing: a step without loops keeps no iterates."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
@@ -193,7 +193,7 @@ class ParticleSolver(Staying):
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
-        """Neighbours, density and parts: how a step begins. It reads all of the state."""
+        """Begin a step, which reads all of a state: sort particles, list neighbours, measure density, begin parts."""
         context = self.context(parameters)
         for part in self.parts:
             part.begin(context, state)
@@ -211,14 +211,14 @@ class ParticleSolver(Staying):
         return context
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """(n,) vectors of the explicit forces [m / s2]."""
+        """Return the accelerations (n,) by all explicit forces [m / s2], vectors of sorted particles."""
         for t, force in enumerate(self.forces):
             force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
         return self.accelerations[-1]
 
     def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
-        """Write the new state from sorted positions and velocities, but for what parts prescribe, and from what is
-        ``carried`` to the next step, one array for each of `carried_fields`."""
+        """Write the new state from sorted positions and velocities, but for what parts prescribe, and from the
+        ``carried`` arrays, one for each of `carried_fields`."""
         free, ends = new_state, []
         for part in reversed(self.parts):
             ends.append((part, free))
@@ -247,8 +247,8 @@ class ParticleSolver(Staying):
             )
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """(n,) of a state, in the scene's order, of a batch one scene behind the other [kg / m3]. Solids are where they
-        are at the end of a ``step``, counted from 0. What the solver keeps of a step is overwritten."""
+        """Return densities (n,) of a state in the scene's order, of a batch one scene behind the other [kg / m3].
+        Solids are where they are at the end of a ``step``, counted from 0. The solver's arrays are overwritten."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():
@@ -256,16 +256,16 @@ class ParticleSolver(Staying):
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
     def sorted_pressures(self) -> NDArray | None:
-        """(n,) with which sorted particles push walls in the last `step`, unless one was replayed since [Pa]; None of a
-        solver or a scene without pressures."""
+        """Return the pressures (n,) with which sorted particles push walls in the last `step` [Pa], unless one was
+        replayed since; None of a solver or a scene without pressures."""
         return None
 
     def sorted_stresses(self) -> NDArray | None:
-        """(n,) what a gauge would read there [Pa]."""
+        """Return the pressures (n,) that a gauge would read at sorted particles [Pa]."""
         return self.sorted_pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
-        """(n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""
+        """Return (n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""
         found = np.empty(self.layout.all_particles)
         found[self.search.order.numpy()[: len(found)]] = values
         return found
@@ -293,7 +293,7 @@ class ParticleSolver(Staying):
 
 
 def _neighbourhood(system: ParticleSystem) -> Any:
-    """What particles see, with the present arrays of the search."""
+    """Make the struct by which kernels read a particle's neighbours, with the present arrays of the search."""
     search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
     s = neighbourhood_type(precision)()
     s.particles = system.layout.particles

@@ -19,95 +19,93 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext, Tangents
 
 Counts = tuple[int, ...]
-"""How often each loop of a step went round: with it the step can be taken again, bit for bit."""
+"""Numbers of rounds of each loop of a step, with which the step can be taken again, bit for bit."""
 
 
 class StepLog(Protocol):
-    """What a solver notes of each step of a run, on the device until it is read."""
+    """The notes of a solver on each step of a run, on the device until they are read."""
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
-        """(steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has ``converged``;
-        PCISPH also ``iterations``, ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and
-        ``greatest_density_errors``. The projection has ``divergence`` too. Reports draw ``density_errors``, and whole
-        numbers as the iterations of loops.
-        """
+        """Return diagnostics (steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has
+        ``converged``; PCISPH also ``iterations``, ``density_errors``, the average of the compressions (rho* - rho_0)+ /
+        rho_0, and ``greatest_density_errors``. The projection has ``divergence`` too. Reports draw ``density_errors``,
+        and whole numbers as the iterations of loops."""
 
     def read(self, steps: int) -> None:
-        """Read so many steps from the device."""
+        """Read the notes of the first ``steps`` steps from the device."""
 
     def assign(self, other: Self) -> None:
-        """Hold what another of as many steps of the same solver has read."""
+        """Hold the notes that another log of the same solver and length has read."""
 
     def seek(self, step: int) -> Counts:
-        """Make the loops of the solver ready to take a step again that was read, from 0. Of a batch the counts are
-        those of the scene that went round most often."""
+        """Prepare the solver's loops to repeat a step that was read, from 0, and return their counts. Of a batch these
+        are the counts of the scene that went round most often."""
 
 
 class StepTangent(Protocol):
-    """Forward mode of a step that a solver has replayed, along tangents of the parameters."""
+    """The tangent of steps that a solver has replayed, along tangents of the parameters (forward mode)."""
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        """Replace the tangent of the step's state by that of its result."""
+        """Replace the tangent of the replayed step's state by that of its result."""
 
 
 class StepAdjoint(Protocol):
-    """Reverse mode of steps that a solver has replayed."""
+    """The adjoint of steps that a solver has replayed (reverse mode)."""
 
     def begin(self) -> None:
         """Forget the adjoints of the parameters of an earlier way back."""
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Replace the adjoint of the step's result by that of its state."""
+        """Replace the adjoint of the replayed step's result by that of its state."""
 
     def collect(self) -> Parameters:
-        """The adjoints of the parameters, of all steps since `begin`."""
+        """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
 class ResumingAdjoint(StepAdjoint, Protocol):
-    """The same where the pressure of a step is taken from the state that the step led to."""
+    """An adjoint of steps that takes the pressure of a step from the state that the step led to."""
 
     def arrive(self, state: State) -> None:
-        """The state after the step that comes next."""
+        """Take the state after the step that is to be replayed next."""
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
-        """As that of `Solver`, but without the iterations of the pressure. The step before comes next."""
+        """Replay a step as `Solver.replay` does, without the pressure iterations; the step before comes next."""
 
 
 class PressureTangent(StepTangent, Protocol):
-    """That of a solver with pressures, which quantities and sensors can be differentiated through."""
+    """The tangent of a solver with pressures, through which quantities and sensors can be differentiated."""
 
     dot: Tangents
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Tangents (n,) of the pressures of the last step, of sorted particles, with which they push walls; its first
-        loop went round so often in each scene."""
+        """Return tangents (n,) of the pressures of the last step, of sorted particles, with which they push walls;
+        ``rounds`` has the rounds of its first loop in each scene."""
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """The same of what a gauge would read."""
+        """Return tangents (n,) of the pressures that a gauge would read, of sorted particles."""
 
 
 @dataclass(frozen=True)
 class WithinBar:
-    """Adjoints of what a step computes, of sorted particles."""
+    """Adjoints of sorted particles' quantities within a step."""
 
     fields: Fields
-    """Of the fields at its start."""
+    """Adjoints of the fields at the start of the step."""
     p: wp.array
-    """(n,) of the pressures with which they push walls."""
+    """Adjoint (n,) of the pressures with which particles push walls."""
     stress: wp.array | None
-    """(n,) of what a gauge would read; None where it has none."""
+    """Adjoint (n,) of the pressures that a gauge would read; None where there is none."""
     v_star: wp.array
-    """(n,) of the velocities v* = v + dt a that the explicit forces lead to; what they depend on dt is counted
-    elsewhere."""
+    """Adjoint (n,) of the velocities v* = v + dt a by explicit forces; their dependence on dt is counted elsewhere."""
 
 
 class PressureAdjoint(StepAdjoint, Protocol):
-    """The same in reverse mode."""
+    """The adjoint of a solver with pressures, through which quantities and sensors can be differentiated."""
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints ``within`` the step, with none
-        of its result."""
+        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints ``within`` the step and none of
+        its result."""
 
 
 class Solver(Protocol):
@@ -123,61 +121,61 @@ class Solver(Protocol):
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """(members,) of the step to take, which `step` counts; the same for all scenes of a batch."""
+    """The number (members,) of the step to take, which `step` counts; it is equal in all scenes of a batch."""
     generation: int
-    """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
+    """How often arrays, or the work of a step, were replaced; graphs captured before are stale."""
 
     def new_state(self, requires_grad: bool = False) -> State:
-        """A state of this solver's particles, all 0."""
+        """Make a state of this solver's particles, all 0."""
 
     def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
-        """Parameters of a run of so many steps, all 0."""
+        """Make the parameters of a run of ``steps`` steps, all 0."""
 
     def new_log(self, steps: int) -> StepLog:
-        """Room for what is noted of so many steps."""
+        """Make a log with room for ``steps`` steps."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Take so many explicit substeps of diffusion in each step from now on."""
+        """Take ``substeps`` explicit substeps of diffusion in each step from now on."""
 
     def reset(self, step: int = 0) -> None:
-        """Be ready to take a step, and forget the counts and flags of those from it on, also of an interrupted run."""
+        """Prepare to take a step; forget the counts and flags from that step on, also of an interrupted run."""
 
     def make_room(self) -> bool:
-        """Whether the lists of neighbours were too short; they are longer now, and what used them must be repeated."""
+        """Lengthen lists of neighbours that were too short, and return True if so: what used them must be repeated."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """One step, noted in a log of `new_log`. The two states may be one and the same."""
+        """Take one step, and note it in a log of `new_log`; the two states may be one object."""
 
     def reserve(self, counts: Counts) -> None:
         """Make room for all intermediate values of a step."""
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
-        """The same step again, bit for bit, with every intermediate value kept."""
+        """Take a step again, bit for bit, and keep every intermediate value."""
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """The result of the step that was replayed."""
+        """Write the result of the step that was replayed."""
 
     def context(self, parameters: Parameters) -> StepContext:
-        """The present step as its parts see it."""
+        """Return the present step as its parts see it."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
-        """Forward mode along tangents of the parameters."""
+        """Return the tangent of steps along tangents of the parameters (forward mode)."""
 
     def adjoint(self, steps: int) -> StepAdjoint:
-        """Reverse mode of a run of so many steps."""
+        """Return the adjoint of the steps of a run of ``steps`` steps (reverse mode)."""
 
     def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
-        """The same with the pressure as the fixed point of its iterations, whose adjoint is solved for until the
-        residual has fallen to ``tolerance`` of the first, in ``iterations`` at most: for `ImplicitPressure`."""
+        """Return the adjoint of steps with the pressure as a fixed point of its iterations, for `ImplicitPressure`. Its
+        system is solved until the residual has fallen to ``tolerance`` of the first, in ``iterations`` at most."""
 
     def differentiable(self) -> Self:
-        """The same solver, with arrays that Warp's tape can differentiate."""
+        """Return a copy of this solver with arrays that Warp's tape can differentiate."""
 
     def match(self, other: Self) -> None:
-        """Have the room and the substeps of another that is the same but for its arrays."""
+        """Take over the room and the substeps of another solver, which is equal but for its arrays."""
 
     def follow(self, other: Self) -> None:
-        """Be ready to replay the step that another, that is the same but for its arrays, is ready to replay."""
+        """Prepare to replay the step that another solver, equal but for its arrays, is ready to replay."""
 
     def gradient_memory(self, log: Any) -> Mapping[str, float]:
-        """[bytes] by what they are for, that going back through the steps of a log takes."""
+        """Return the memory [bytes] that going back through the steps of a log takes, by purpose."""

@@ -20,7 +20,7 @@ from cortado.sph.walls import wall_slope_term
 
 
 class PcisphAdjoint(ParticleAdjoint):
-    """Reverse mode, one step at a time, of a run with some parameters."""
+    """The adjoint of PCISPH steps, one step at a time, of a run with some parameters."""
 
     def __init__(self, solver: PcisphSteps, steps: int):
         super().__init__(solver, steps)
@@ -35,7 +35,7 @@ class PcisphAdjoint(ParticleAdjoint):
         self._finish(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """As that of `PressureAdjoint`."""
+        """Write the adjoint of a replayed step's state, for adjoints ``within`` the step (`PressureAdjoint`)."""
         state_bar.clear()
         self._begin(counts, state_bar, parameters)
         add(within.p, self._p_bar)
@@ -44,7 +44,7 @@ class PcisphAdjoint(ParticleAdjoint):
         self._finish(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the result to that of the last prediction."""
+        """Go back from the adjoint of a step's result to that of the last prediction."""
         (iterations,) = counts
         solver = self._solver
         context = solver.context(parameters)
@@ -63,7 +63,7 @@ class PcisphAdjoint(ParticleAdjoint):
     def _finish(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """From the adjoint of the last prediction to that of the state."""
+        """Go back from the adjoint of the last prediction to that of the state before the step."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
@@ -98,12 +98,12 @@ class PcisphAdjoint(ParticleAdjoint):
         self.sort(context, state_bar)
 
     def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
-        """What the pressure force of an iteration gives to solids that move."""
+        """Add the adjoints that the pressure force of an iteration gives to moving solids."""
         kernel, pushed = partial(pressure_solid_kernel, self._solver.discretisation), {"scaled_bar": self._scaled_bar}
         self.bar.solids.add(context.launch, kernel, going, pushed, *self.bar.named, c=c)
 
     def relax_beside_walls(self, context: StepContext) -> None:
-        """Of the relaxation beside walls, which depends on positions alone."""
+        """Apply the adjoint of the pressure relaxation beside walls, which depends on positions alone."""
         solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
         context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
         slopes = wall_slope_term(solver.discretisation).solid_kernel
@@ -111,7 +111,7 @@ class PcisphAdjoint(ParticleAdjoint):
 
 
 class PcisphTangent(ParticleTangent):
-    """Forward mode, one step at a time, of a run along tangents of its parameters."""
+    """The tangent of PCISPH steps, one step at a time, of a run along tangents of its parameters."""
 
     def __init__(self, solver: PcisphSteps, parameters_dot: Parameters):
         super().__init__(solver, parameters_dot)
@@ -155,14 +155,14 @@ class PcisphTangent(ParticleTangent):
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """As that of `PressureTangent`."""
+        """Return the tangents (n,) of the pressures of the last step; see `PressureTangent`."""
         own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
         return np.concatenate([own[(k - 1) % 2][b] for b, k in enumerate(rounds)])
 
     stresses = pressures
 
     def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
-        """The tangent of the pressure relaxation."""
+        """Compute the tangent of the pressure relaxation."""
         solver, kernels = self._solver, self._solver.kernels
         y_dot = self._wall_y_dot if kernels.density_ratio else self._y_dot
         context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)

@@ -29,7 +29,7 @@ from cortado.sph.integration import prediction_share
 
 @cache
 def pressure_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure from the predicted density."""
+    """Make kernels ``forward``, ``tangent``, ``adjoint`` of the pressure from the predicted density."""
     real, vector, pair_of = (
         discretisation.precision.real,
         discretisation.precision.vector,
@@ -62,7 +62,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c: wp.array(dtype=real),
         error: wp.array(dtype=pair_of),
     ):
-        """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
+        """Correct pressures by the predicted density; ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -138,7 +138,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         # out
         scaled_bar: wp.array(dtype=vector),
     ):
-        """Adds what the adjoint r of the predicted density n* gives to positions, velocities and the time step."""
+        """Add to adjoints of positions, velocities and time step the part by r, the adjoint of n*."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -157,8 +157,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
 
 def pressure_solid_kernel(discretisation: Discretisation) -> Any:
-    """The kernel of what the pressure force of an iteration gives to solids that move, for its adjoint ``scaled_bar``
-    (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the kernel that adds to the adjoints of moving solids the part due to the pressure force's adjoint
+    ``scaled_bar`` (`cortado.particles.wall_terms.solid_kernel`)."""
     return solid_kernel(discretisation, "pcisph", _work, looped=True)
 
 
@@ -173,7 +173,7 @@ def _work(d: Discretisation) -> Any:
 
 @cache
 def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
+    """Make kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -189,7 +189,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def adjoin_pressure(
         i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
     ) -> real:
-        """Add to the adjoints of a pressure's inputs, and return r, the adjoint of n*."""
+        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of n*."""
         n_i = at.n[i]
         m_i = at.m[i]
         p_i = at.p_out[i]
@@ -222,7 +222,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def force_adjoint(
         x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
     ) -> tuple[vector, real, real]:
-        """Hessian products, divergence, and the work of the own share."""
+        """Return a pair's Hessian product, its divergence, and the work of the own share c_i."""
         a = slope(x_ij, s)
         c_ij = c_i + c_j
         change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
@@ -311,8 +311,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         # out
         r: wp.array(dtype=real),
     ):
-        """From ``scaled_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
-        sum a gather."""
+        """Turn ``scaled_bar``, the adjoint of the pressure acceleration over m, into those of c, p and (r) of n*; every
+        sum is a gather."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

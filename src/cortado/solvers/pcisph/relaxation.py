@@ -36,12 +36,12 @@ from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.walls import wall_slope_sums
 
 SOFTNESS = 0.2
-"""a [-]"""
+"""The softness a of the density-ratio relaxation [-]."""
 
 
 @dataclass(frozen=True)
 class DensityRatioKernels(Kernels):
-    """The kernels, two of them for the way back."""
+    """The kernels of the relaxation by density ratios in PCISPH; the adjoint has two of them."""
 
     factor_adjoint: Any
     """Comes before ``adjoint``."""
@@ -49,7 +49,7 @@ class DensityRatioKernels(Kernels):
 
 @cache
 def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels:
-    """The kernels for a smoothing kernel and a precision."""
+    """Make the kernels of the density-ratio relaxation for a smoothing kernel and a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -59,7 +59,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
 
     @fluid_sum(discretisation)
     def density_ratio_sum(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> real:
-        """t_i / V"""
+        """Return a pair's term W_ij (m_i / m_j - 1) of t_i / V."""
         return weight(x_ij, s) * (m_i / m_j - real(1.0))
 
     @tangent_of(density_ratio_sum)
@@ -82,14 +82,14 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
 
     @wp.func
     def excess(t: real) -> real:
-        """e(t)"""
+        """Return e(t) = t^2 / (2 (t + a)) for t > 0, else 0."""
         if t > real(0.0):
             return real(0.5) * t * t / (t + a)
         return real(0.0)
 
     @wp.func
     def excess_derivative(t: real) -> real:
-        """e'(t)"""
+        """Return the derivative e'(t) of `excess`."""
         if t > real(0.0):
             return real(0.5) * t * (t + real(2.0) * a) / ((t + a) * (t + a))
         return real(0.0)
@@ -105,7 +105,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
 
     @particle_kernel(adjoint_module, "y_bar t_bar")
     def factor_adjoint(t_i: real, y_i: real, y_bar_i: real) -> tuple[real, real]:
-        """That of the pressure relaxation beside walls takes the place of that of y."""
+        """Turn the adjoint of the relaxation y into those of the wall relaxation and of t."""
         part = real(1.0) / (real(1.0) + excess(t_i))
         return y_bar_i * part, -y_bar_i * y_i * part * excess_derivative(t_i)
 
@@ -117,7 +117,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
 
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = wall_slope_sums(discretisation)
@@ -146,7 +146,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         # out
         slope_bar: wp.array(dtype=vector),
     ):
-        """``slope_bar`` is the adjoint of S."""
+        """Add to the adjoint of positions from that of y; ``slope_bar`` gets the adjoint of S."""
         i = s.first + wp.tid() // LANES
         total = s.response_scale * slope(i, x, s)
         along = (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total

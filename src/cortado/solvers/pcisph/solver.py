@@ -14,10 +14,10 @@ from cortado.solvers.solver import Solver, StepAdjoint, StepTangent
 
 
 class Pcisph(PcisphSteps):
-    """Predictive-corrective incompressible SPH; see `Solver`."""
+    """The solver by predictive-corrective incompressible SPH, with its derivatives; see `Solver`."""
 
     def differentiable(self) -> Self:
-        """The same solver over the same neighbour search, with other arrays."""
+        """Return a solver over this neighbour search with arrays of its own that Warp's tape can differentiate."""
         return type(self)(self.system.of_one_lane(), self.limits, requires_grad=True)
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
@@ -28,7 +28,7 @@ class Pcisph(PcisphSteps):
 
 
 class PcisphMaker:
-    """Makes the solver as the table [solver] of a scene says."""
+    """A maker of the PCISPH solver that the table [solver] of a scene describes."""
 
     batches = True
 
@@ -36,7 +36,7 @@ class PcisphMaker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """The solver of a scene that is cut into particles, on a device."""
+        """Make the PCISPH solver of a scene that is cut into particles, on a device."""
         limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
         return Pcisph(particle_system(setting), limits)
 
@@ -45,7 +45,7 @@ maker = PcisphMaker
 
 
 def pressure_limits(table: PcisphSolver) -> LoopLimits:
-    """When the pressure loop may stop."""
+    """Return the bounds on iterations and density errors at which PCISPH's pressure loop stops."""
     greatest = table.maximum_density_tolerance
     return LoopLimits(
         table.minimum_iterations,

@@ -27,7 +27,7 @@ from cortado.sph.parts import StepContext
 
 @cache
 def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
-    """Does in one launch what that of `cortado.sph.begin_adjoint` does, and begins the adjoints of PCISPH's own."""
+    """Make the kernel that begins the adjoint of a step, with PCISPH's own (see `cortado.sph.begin_adjoint`)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     adjoin_new_state, vectors = new_state_adjoint(discretisation.precision), wp.array(dtype=vector)
 
@@ -56,7 +56,7 @@ def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
 
 @dataclass(frozen=True)
 class PcisphKernels:
-    """The kernels that only PCISPH needs, each topic with its forward, tangent and adjoint."""
+    """The kernels that only PCISPH needs, by topic, each with its forward, tangent and adjoint."""
 
     wall_relaxation: Kernels
     density_ratio: DensityRatioKernels | None
@@ -68,7 +68,7 @@ class PcisphKernels:
 
     @classmethod
     def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
-        """Those for a smoothing kernel, a precision and a number of phases."""
+        """Make the kernels of PCISPH for a smoothing kernel, a precision and a number of phases."""
         return cls(
             wall_kernels(discretisation),
             density_ratio_kernels(discretisation) if phases > 1 else None,
@@ -82,7 +82,7 @@ class Iterates:
     """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
 
     def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
-        """Both make arrays (n,) of zeros."""
+        """Allocate one iteration by two functions, which make arrays (n,) of zero numbers and zero vectors."""
         self._numbers, self._vectors = numbers, vectors
         self.x_star: list[wp.array] = []
         self.v_star: list[wp.array] = []
@@ -92,7 +92,7 @@ class Iterates:
         self.reserve(1)
 
     def reserve(self, iterations: int) -> None:
-        """Room for every value of so many iterations."""
+        """Make room for the values of ``iterations`` iterations."""
         while len(self.x_star) <= iterations:
             self.x_star.append(self._vectors())
             self.v_star.append(self._vectors())
@@ -101,12 +101,12 @@ class Iterates:
 
 
 class PcisphSteps(ParticleSolver):
-    """The steps of one set of particles, forward."""
+    """The forward steps of PCISPH for one set of particles."""
 
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
-        """``limits`` None leaves the pressure out."""
+        """Prepare steps of a system; ``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)
         self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.layout.phases)
         self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
@@ -133,7 +133,7 @@ class PcisphSteps(ParticleSolver):
             self.iterate(k, k + 1, context)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """Writes the last prediction as the new state."""
+        """Write the last prediction as the new state."""
         (iterations,) = counts
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
@@ -142,7 +142,7 @@ class PcisphSteps(ParticleSolver):
         return None if self.limits is None else self.iterates.p[1].numpy()
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Everything but the pressure, and the first prediction."""
+        """Do all of a step before the pressure: sort, relax and make the first prediction."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             self._relax(context)
@@ -152,7 +152,7 @@ class PcisphSteps(ParticleSolver):
         return context
 
     def _relax(self, context: StepContext) -> None:
-        """Computes the relaxation of the pressure."""
+        """Compute the relaxation of the pressure beside walls and among lighter neighbours."""
         kernels = self.kernels
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if kernels.density_ratio:
@@ -164,7 +164,7 @@ class PcisphSteps(ParticleSolver):
             )
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
-        """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""
+        """Take pressure iteration k, from the predicted state of the slot before to ``slot`` (0: the only one)."""
         it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
         going = {"k": k, "rounds": self.pressure_loop.rounds}
         context.launch(

@@ -20,28 +20,28 @@ Arrays = dict[str, wp.array]
 
 @dataclass(frozen=True)
 class Start:
-    """What the velocities of a body are before pressures push it, or tangents or adjoints of that."""
+    """The velocities of a body before pressures push it in a step, or tangents or adjoints of these velocities."""
 
     motion: Arrays
-    """V_0, W_0 and L_0, as kernels call them; it goes before all else that a step has."""
+    """V_0, W_0 and L_0 by the names that kernels have for them; they precede all other arrays of a step."""
     given: Arrays
-    """What contact gives to both momenta."""
+    """The parts of both momenta that contact gives."""
 
     @classmethod
     def of(cls, body: FreeBody | Changes) -> "Start":
-        """Those of a step."""
+        """Return the start of a body in a step, from its velocities before and its momenta by contact."""
         return cls({f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}, body.given)
 
     @classmethod
     def at_rest(cls, layout: Layout, suffix: str) -> "Start":
-        """None, in a step of no length, in which nothing falls; what adjoints add up there is not read."""
+        """Return zero velocities, for a step of no length without gravity; its adjoints are never read."""
         kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), layout.precision.vector), "time_step": layout.precision.real}
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         return cls(zeros(sizes, layout.device), {})
 
 
 class Held:
-    """What particles know of one body in a step, or tangents or adjoints of it, by a ``suffix`` of their names."""
+    """The arrays by which particles know a body in a step, or their tangents or adjoints with a ``suffix`` of names."""
 
     def __init__(self, body: FreeBody, layout: Layout, start: Start, suffix: str = ""):
         self.body, self.start, self._layout = body, start, layout
@@ -56,23 +56,23 @@ class Held:
         """The sums of the sizes."""
 
     def at_rest(self) -> "Held":
-        """The same, with the same arrays, of a body that begins at rest."""
+        """Return a copy that shares the arrays of this body but begins at rest."""
         other = copy(self)
         other.start = Start.at_rest(self._layout, self._suffix)
         return other
 
     def add_sizes(self) -> None:
-        """Of all particles of a scene."""
+        """Sum up the sizes of the pushes gamma and of their torques over all particles of a scene."""
         self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """(members,) those of y gamma and of y r x gamma."""
+        """Return the sums of y gamma and of y r x gamma over all particles, (members,) vectors each."""
         found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 
 
 class Bodies:
-    """Those of one solver, forward."""
+    """The free bodies of one solver of the projection, forward."""
 
     def __init__(self, part: FreeSolidsPart, discretisation: Any, layout: Layout):
         self.part, self.layout = part, layout
@@ -81,25 +81,25 @@ class Bodies:
         self.drift = wp.zeros(layout.all_particles, dtype=layout.precision.real, device=layout.device)
 
     def at_rest(self) -> "Bodies":
-        """The same bodies, which begin at rest and are pushed by pressures alone: `drifted` is linear in these."""
+        """Return these bodies beginning at rest, pushed by pressures alone: `drifted` is linear in the pressures."""
         other = copy(self)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
         return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
-        """What kernels know of a body."""
+        """Return the arrays and constants of a body by the names that kernels have for them."""
         own = held.known, held.shares, held.whole, held.start.motion, self.part.poses
         return *own, *held.body.known(context)
 
     def begin(self, context: StepContext, around: Arrays) -> None:
-        """Look at what is around them, and add to the diagonal."""
+        """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal."""
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
             held.add_sizes()
             context.launch(self.kernels.weigh.forward, *self.known(context, held), a=around["a"])
 
     def move(self, context: StepContext, held: Held, y: wp.array, moved: Arrays) -> Arrays:
-        """Write V, W and L by pressures y, and return the sums of these."""
+        """Write V, W and L of a body pushed by pressures y, and return the sums of y gamma and y r x gamma."""
         known = self.known(context, held)
         context.launch(self.kernels.pull.forward, *known, y=y)
         sums = held.sums()
@@ -109,7 +109,7 @@ class Bodies:
         return sums
 
     def drifted(self, context: StepContext, drift: wp.array, y: wp.array) -> wp.array:
-        """The drift of walls with the velocities that pressures y give to bodies."""
+        """Return the drift of walls where bodies have the velocities that pressures y give them."""
         for held in self.held:
             self.move(context, held, y, held.moved)
             context.launch(
@@ -119,13 +119,13 @@ class Bodies:
         return drift
 
     def settle(self, context: StepContext, y: wp.array) -> None:
-        """Have bodies end with the velocities that pressures y give them."""
+        """Write the velocities that pressures y give to bodies as those at the end of the step."""
         for held in self.held:
             self.move(context, held, y, held.body.moved)
 
 
 class BodiesTangent:
-    """Forward mode."""
+    """The tangent of free bodies in a step of the projection, for forward mode."""
 
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
@@ -133,7 +133,7 @@ class BodiesTangent:
         self.drift = wp.zeros_like(bodies.drift)
 
     def at_rest(self, bodies: Bodies) -> "BodiesTangent":
-        """Of ``bodies``, which are at rest."""
+        """Return the tangent of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
         other.drift = wp.zeros_like(self.drift)
@@ -184,7 +184,7 @@ class BodiesTangent:
 
 
 class BodiesAdjoint:
-    """Reverse mode."""
+    """The adjoint of free bodies in a step of the projection, for reverse mode."""
 
     def __init__(self, bodies: Bodies, changes: list[Changes]):
         self._bodies, self._changes = bodies, changes
@@ -206,13 +206,13 @@ class BodiesAdjoint:
         return *bars, *bar.named, *self._bodies.known(context, held)
 
     def at_rest(self, bodies: Bodies) -> "BodiesAdjoint":
-        """Of ``bodies``, which are at rest."""
+        """Return the adjoint of ``bodies`` that begin at rest."""
         other = copy(self)
         other._bodies, other._held = bodies, [own.at_rest() for own in self._held]
         return other
 
     def begin(self) -> None:
-        """Of a step."""
+        """Set the adjoints of the bodies' arrays to 0 at the beginning of a step back."""
         for own in self._held:
             for array in own.known.values():
                 array.zero_()
@@ -220,7 +220,7 @@ class BodiesAdjoint:
     def _move(
         self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array
     ) -> None:
-        """From the adjoints of V, W and L to that of y."""
+        """Turn the adjoints of V, W and L of a body into that of the pressures y."""
         bodies, held = self._bodies, self._bodies.held[k]
         sums = bodies.move(context, held, y, moved)
         known = self._known(context, bar, k)
@@ -235,13 +235,13 @@ class BodiesAdjoint:
             self._move(context, bar, k, y, held.body.moved, self._changes[k].moved, y_bar)
 
     def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Of `Bodies.drifted`, for ``self.drift_bar``, which goes to ``drift_bar``, too, and is 0 again."""
+        """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add it to ``drift_bar`` and set it to 0."""
         self.carried(context, bar, self.drift_bar, y, y_bar)
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()
 
     def carried(self, context: StepContext, bar: Adjoints, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Of what `Bodies.drifted` adds to the drift."""
+        """Apply the adjoint of the part that `Bodies.drifted` adds to the drift."""
         bodies = self._bodies
         (adjoint, slower) = bodies.motion.carry.adjoint
         for k, held in enumerate(bodies.held):
@@ -255,7 +255,7 @@ class BodiesAdjoint:
             self._move(context, bar, k, y, held.moved, bars, y_bar)
 
     def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
-        """Of `Bodies.begin`, to what particles and poses are given."""
+        """Apply the adjoint of `Bodies.begin`: add to the adjoints of particles, surroundings and poses."""
         bodies, a_bar = self._bodies, around_bar["a_bar"]
         edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
         share, weigh, end = bodies.kernels.weigh.adjoint

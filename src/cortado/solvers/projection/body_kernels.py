@@ -29,19 +29,19 @@ from cortado.solvers.projection.walls import normal_part
 
 @dataclass(frozen=True)
 class BodyKernels:
-    """With their tangents and adjoints."""
+    """Kernels by which particles of the projection push rigid bodies, with their tangents and adjoints."""
 
     hold: Kernels
-    """gamma, r, and their sizes."""
+    """The push gamma, the arm r, and the sizes of gamma and r x gamma of each particle."""
     weigh: Kernels
-    """What is added to a."""
+    """The part of bodies in the diagonal a."""
     pull: Kernels
-    """y gamma and y r x gamma."""
+    """The momenta y gamma and y r x gamma that the pressure impulse y of each particle gives."""
 
 
 @cache
 def body_kernels(discretisation: Discretisation) -> BodyKernels:
-    """The kernels by which the projection moves bodies, for a discretisation."""
+    """Make the kernels by which the projection moves bodies, for a discretisation."""
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)
@@ -52,7 +52,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
-        """The part along the normal of a wall, and of the rest as much as e says."""
+        """Return the part of a vector along the normal of a wall plus the part across it times the edge factor e."""
         part = normal(a, foot)
         return part + edge * (a - part)
 
@@ -118,8 +118,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     def hold_adjoint(
         total: vector, edge_part: real, gamma_of_i: vector, arm_i: vector, gamma_of_bar_i: vector, arm_bar_i: vector
     ) -> tuple[real, vector, vector, vector]:
-        """Of gamma, whose sizes have given to its adjoint; a further turn of the body turns gamma and takes it
-        along."""
+        """Apply the adjoint of gamma and r, once the sizes have added to theirs; turning a body turns gamma."""
         torque = wp.cross(gamma_of_i, gamma_of_bar_i) - wp.cross(arm_i, total)
         return edge_part, total + arm_bar_i, -total - arm_bar_i, torque
 
@@ -131,7 +130,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
 
     @particle_kernel(module, "+a", numbers=numbers)
     def weigh(density: real, volume: real, greatest: real, sizes_i: pair_of, whole: pair_of) -> real:
-        """``whole`` has the sums of the sizes."""
+        """Add a body's part to the diagonal a of a particle; ``whole`` has the sums of the sizes."""
         return wp.dot(sizes_i, stiff(density, volume, greatest, whole))
 
     @particle_kernel(tangent_module, "+a_dot", numbers=numbers)
@@ -164,7 +163,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
         weighed: pair_of,
         a_bar_i: real,
     ) -> tuple[vector, vector]:
-        """``weighed`` is the sum of a_bar times the sizes."""
+        """Add to the adjoints of gamma and r from that of a; ``weighed`` is the sum of a_bar times the sizes."""
         own = stiff(density, volume, greatest, a_bar_i * whole + weighed)
         torque_bar = own[1] * direction(wp.cross(arm_i, gamma_of_i))
         gamma_part = own[0] * direction(gamma_of_i) + wp.cross(torque_bar, arm_i)
@@ -199,7 +198,7 @@ def body_kernels(discretisation: Discretisation) -> BodyKernels:
     def pull_adjoint(
         y_i: real, gamma_of_i: vector, arm_i: vector, pulled_sum_bar: vector, twisted_sum_bar: vector
     ) -> tuple[real, vector, vector]:
-        """From the adjoints (members,) of the sums."""
+        """Add to the adjoints of y, gamma and r from the adjoints (members,) of the summed momenta."""
         by_y = wp.dot(gamma_of_i, pulled_sum_bar) + wp.dot(wp.cross(arm_i, gamma_of_i), twisted_sum_bar)
         by_gamma = pulled_sum_bar + wp.cross(twisted_sum_bar, arm_i)
         return by_y, y_i * by_gamma, y_i * wp.cross(gamma_of_i, twisted_sum_bar)

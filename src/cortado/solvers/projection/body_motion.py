@@ -16,17 +16,17 @@ from cortado.sph.free_kernels import free_module, rate_function
 
 @dataclass(frozen=True)
 class MotionKernels:
-    """With their tangents and adjoints."""
+    """Kernels that move rigid bodies by pressures and gravity, with their tangents and adjoints."""
 
     move: Kernels
     """V, L and W from the sums of y gamma and y r x gamma, with a thread for each scene."""
     carry: Kernels
-    """The drift that V - V_0 and W - W_0 are."""
+    """The drift of walls by the velocity changes V - V_0 and W - W_0."""
 
 
 @cache
 def motion_kernels(precision: Precision) -> MotionKernels:
-    """In a precision."""
+    """Make the kernels that move rigid bodies by pressures and gravity, in a precision."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module, rate = free_module(precision), rate_function(precision)
     moving = bundle(V=vector, W=vector, L=vector)
@@ -50,7 +50,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
         pulled_sum_i: vector,
         twisted_sum_i: vector,
     ) -> tuple[vector, vector, vector]:
-        """A thread is a scene, as in the next two."""
+        """Return V, L and W of a body from its momenta by pressures; a thread is a scene, also in the next two."""
         L = L_0_i + twisted_sum_i
         V = V_0_i + time_step_i * gravity[i, step_i] + pulled_sum_i / (density_i * volume)
         return V, L, rate(turns[i, number], inverse, L) / density_i
@@ -104,7 +104,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
         ),
         gravity_bar: wp.array2d(dtype=vector),
     ):
-        """The adjoints of the sums are written, others added to; ``turned_bar`` is that of a further turn of R'."""
+        """Write adjoints of the summed momenta, add to others; ``turned_bar`` is that of a further turn of R'."""
         b = wp.tid()
         k, V_bar, W_bar, rho = step[b], later_bar.V_bar[b], later_bar.W_bar[b], density[b]
         spun = rate(turns[b, number], inverse, W_bar) / rho
@@ -146,7 +146,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
     def carry_adjoint(
         V: vector, V_0: vector, W: vector, W_0: vector, gamma_of_i: vector, arm_i: vector, carried_bar_i: real
     ) -> tuple[vector, vector, vector, vector]:
-        """For the adjoint of the drift; ``pulled`` and ``twisted`` are the shares of those of V and W."""
+        """Apply the adjoint of the drift; ``pulled`` and ``twisted`` are a particle's shares of V's and W's."""
         faster = V - V_0 + wp.cross(W - W_0, arm_i)
         by_arm = wp.cross(gamma_of_i, W - W_0)
         return (
@@ -158,7 +158,7 @@ def motion_kernels(precision: Precision) -> MotionKernels:
 
     @particle_kernel(module, "+V_0_bar +W_0_bar")
     def slower(V_bar_i: vector, W_bar_i: vector) -> tuple[vector, vector]:
-        """Of the velocities that walls have, which the drift does without; a thread is a scene."""
+        """Subtract from the adjoints of V_0 and W_0 those of V and W, as the drift has V - V_0; a thread is a scene."""
         return -V_bar_i, -W_bar_i
 
     return MotionKernels(

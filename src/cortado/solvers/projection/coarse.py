@@ -30,17 +30,17 @@ from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 LEAST = 1e-5
-"""eps of all particles around a node over what A_II is on the lattice. It takes 0.7 % off the correction of the longest
-wave in water that is 100 spacings deep, and 3 % where it is 200 deep."""
+"""The regularisation eps of all particles around a node, relative to A_II on the lattice. It takes 0.7 % off the
+correction of the longest wave in water that is 100 spacings deep, and 3 % where it is 200 deep."""
 CLOSE = 1e-3
-"""Of the first residual of a solve in float32, in the norm of A^-1, where it ends. From 3e-7 to 1e-3 the gradient of a
-dam's place after 80 steps with respect to gravity differs by less than 4e-7, beside float64 too."""
+"""The part of the first residual, in the norm of A^-1, at which a solve in float32 ends. From 3e-7 to 1e-3 the gradient
+of a dam's place after 80 steps with respect to gravity differs by less than 4e-7, beside float64 too."""
 MOST = 1_000
-"""Iterations of a solve."""
+"""Greatest number of iterations of a solve."""
 
 
 class Coarse:
-    """The grid and the matrix of the particles of one solver, and the solves with it."""
+    """The grid and the matrix of the coarse pressure correction for the particles of one solver, and its solves."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class Coarse:
         bodies: Bodies | None,
         endless: bool,
     ):
-        """Of particles with a ``spacing`` [m], and of free ``bodies``; without a correction in an ``endless`` scene."""
+        """Allocate a correction for particles with a ``spacing`` [m] and free ``bodies``, none if ``endless``."""
         self.endless = endless
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector
@@ -93,17 +93,17 @@ class Coarse:
         """What is spread."""
 
     def numbers(self) -> wp.array:
-        """(nodes,) of all scenes."""
+        """Make an array (nodes,) of zeros for the nodes of all scenes."""
         return wp.zeros_like(self._levels.r)
 
     def room(self) -> dict[str, wp.array]:
-        """For what a correction leaves besides a new iterate: r, e, d, the thrust and the sums of alpha."""
+        """Make arrays for a correction's results besides a new iterate: r, e, d, the thrust and the sums of alpha."""
         layout, (real, vector, pair) = self._particles, self._kinds
         kept = layout.arrays(r=real, change=real, thrust=vector)
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, around: Named) -> None:
-        """The matrix of a step, and whether it is to be solved before the first iteration."""
+        """Compute the matrix of a step, and note whether all scenes are warm and need no first correction."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
@@ -119,8 +119,8 @@ class Coarse:
             self.bodies.begin(context, self.grid, around, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
-        """``correct`` before iteration k, before the first one only if a scene is cold; never in an endless scene,
-        where the level that it would give to pressures moves particles that are not on a lattice."""
+        """Call ``correct`` before iteration k, before the first one only if a scene is cold. An endless scene has no
+        correction, as the level that it would give to pressures moves particles that are not on a lattice."""
         if self.endless:
             return
         if k > 0:
@@ -129,14 +129,14 @@ class Coarse:
             wp.capture_if(self._all_warm, on_false=correct)
 
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
-        """Write to ``e`` (nodes,) what solves A e = the `source`, spread with the e ``before``."""
+        """Write to ``e`` (nodes,) the solution of A e = the `source`, spread with the e ``before``."""
         r = self._levels.r
         context.launch(self.nodes.spread, self.grid, self.source, r=r, e=before, threads=len(r))
         self._levels.solve(e, self._tolerance, MOST)
 
     def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
-        """Before iteration k, from an iterate ``at``, whose A and divergence are written, to k, y and u of a ``new``
-        one, which has `room` for the rest; ``around`` has the drift of walls, and ``T`` is overwritten."""
+        """Correct the pressure before iteration k: from an iterate ``at`` with A and divergence, write k, y and u of a
+        ``new`` one, which has `room` for the rest. ``around`` has the drift of walls; ``T`` is overwritten."""
         context.launch(self.residual.residual, around, at, self.source, r=new["r"])
         self.solve(context, self._none, new["e"])
         own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -151,12 +151,12 @@ class Coarse:
         context.launch(self.length.apply, out, own, at)
 
     def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
-        """G d of free bodies."""
+        """Return the divergence G d that a pressure change d takes away by moving free bodies."""
         return self.unmoved if self.bodies is None else {"carried": self.bodies.carried(context, change)}
 
 
 class CoarseTangent:
-    """Forward mode."""
+    """The tangent of the coarse pressure correction, for forward mode."""
 
     def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, dot: Tangents):
         precision = layout.precision
@@ -171,13 +171,12 @@ class CoarseTangent:
         self._T = layout.arrays(T=six)
 
     def begin(self, context: StepContext, known: tuple[Named, ...]) -> None:
-        """``known`` has the particles, what surrounds them, and the tangents of both."""
+        """Compute tangents of the coarse push; ``known`` has particles and surroundings with their tangents."""
         for kernel in self._coarse.push.tangent:
             context.launch(kernel, *known, self._coarse.pushed, self._change)
 
     def correct(self, context: StepContext, k: int, known: tuple[Named, ...], at: Named, new: Named) -> None:
-        """Before iteration k. ``at``: the iterate before, and k_dot, y_dot and u_dot, which become those of the ``new``
-        one."""
+        """Write k_dot, y_dot and u_dot of the ``new`` iterate from those of the iterate ``at``, before iteration k."""
         own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
         found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
@@ -203,7 +202,7 @@ class CoarseTangent:
 
 
 class CoarseAdjoint:
-    """Reverse mode."""
+    """The adjoint of the coarse pressure correction, for reverse mode."""
 
     def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints):
         precision = layout.precision
@@ -231,9 +230,9 @@ class CoarseAdjoint:
         steps: Named,
         u_bar: wp.array,
     ) -> None:
-        """Before iteration k, from the adjoints k_bar and y_bar of the ``new`` iterate, in ``steps``, and ``u_bar``, to
-        those of k and y of the one before, ``at``. It adds to d_bar and S there, too, from which u before has what it
-        has not from u_bar."""
+        """Apply the adjoint of the correction before iteration k: from k_bar and y_bar of the ``new`` iterate, in
+        ``steps``, and ``u_bar``, to k and y of the iterate ``at``. It adds to d_bar and S there, which give the rest of
+        the adjoint of u."""
         own, through, found = self._coarse, self._through, self._steps
         left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
         context.launch(own.length.along_adjoint, steps, left, u_bar=u_bar, alpha_bar=found["alpha_bar"])
@@ -255,6 +254,6 @@ class CoarseAdjoint:
         context.launch(own.residual.residual_adjoint, steps, found, at, *known)
 
     def finish(self, context: StepContext, known: tuple[Named, ...]) -> None:
-        """From the adjoints of h and N to those of particles and of what surrounds them."""
+        """Turn the adjoints of the coarse push h and N into those of particles and their surroundings."""
         for kernel in self._coarse.push.adjoint:
             context.launch(kernel, *known, self._bars, self._coarse.pushed)

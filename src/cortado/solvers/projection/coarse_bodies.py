@@ -31,22 +31,22 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @dataclass(frozen=True)
 class CoarseBodyKernels:
-    """By what they do."""
+    """Kernels of free bodies on the coarse grid of the pressure."""
 
     gather: Any
-    """The rows of one body."""
+    """The rows of one body in the matrix B."""
     lift: Any
-    """c E, the part of a pressure on the grid that particles feel, times a factor."""
+    """The pressure c E that particles feel from the grid, times a factor."""
     lift_tangent: Any
     source_tangent: Any
-    """What the tangent of c G c E takes from what is spread for that of e."""
+    """The part of c G c E in the source that is spread for the tangent of e."""
     source_adjoint: Any
-    """From the adjoint of c E to those of c and x."""
+    """The adjoints of c and x from that of c E."""
 
 
 @cache
 def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of free bodies on the coarse grid, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, corner_step = hats.hat, hats.at, hats.corner_step
@@ -69,7 +69,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         # out
         B: wp.array2d(dtype=real),
     ):
-        """From row ``first`` on; ``root`` is a square root of I^-1."""
+        """Write a body's rows of B from row ``first`` on, by node; ``root`` is a square root of I^-1."""
         node = wp.tid()
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes
@@ -109,7 +109,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         coarse_dot_i: real,
         e: values,
     ) -> real:
-        """Of c E, with e as it is."""
+        """Return the tangent of the lifted pressure c E for fixed node values e."""
         f = at(i, particles, x_i, e, grid)
         return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
 
@@ -131,7 +131,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         carried_i: real,
         lifted_bar_i: real,
     ) -> tuple[real, vector]:
-        """``multiplier`` is lambda, and ``carried`` G c E."""
+        """Add to the adjoints of c and x; ``multiplier`` is lambda, and ``carried`` G c E."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
         slope = lifted_bar_i * f.slope - carried_i * g.slope
         return lifted_bar_i * f.value - carried_i * g.value, coarse_i * slope
@@ -140,10 +140,10 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
 
 
 class CoarseBodies:
-    """Their rows of a step, and G."""
+    """The free bodies' rows of the matrix B on the coarse grid, and their operator G."""
 
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
-        """``layout`` of particles."""
+        """Prepare rows for a solver's bodies, given the ``layout`` of its particles."""
         precision, matrix = layout.precision, matrix_type(layout.precision)
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
         self._each = 3 * dimension - 3
@@ -153,25 +153,25 @@ class CoarseBodies:
         self._none = layout.arrays(none=precision.real)["none"]
 
     def begin(self, context: StepContext, grid: Named, around: Named, B: wp.array) -> None:
-        """Write those of a step to ``B`` (rows, nodes)."""
+        """Write the bodies' rows of a step to ``B`` (rows, nodes)."""
         for number, (held, root) in enumerate(zip(self.bodies.held, self._roots, strict=True)):
             own, known = {"first": self._each * number, "root": root}, self.bodies.known(context, held)
             context.launch(self.kernels.gather, grid, own, around, *known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:
-        """G y, which the next call overwrites."""
+        """Return G y, the divergence that pressures y take away by moving bodies; the next call overwrites it."""
         return self.bodies.drifted(context, self._none, y)
 
 
 def _root(inertia: np.ndarray) -> np.ndarray:
-    """S, without turns about axes that have no inertia."""
+    """Return the square root S of I^-1, with 0 for turns about axes that have no inertia."""
     values, axes = np.linalg.eigh(np.linalg.pinv(inertia))
     found: np.ndarray = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
     return found
 
 
 class CoarseBodiesTangent:
-    """Forward mode."""
+    """The tangent of free bodies on the coarse grid, for forward mode."""
 
     def __init__(self, own: CoarseBodies, bodies: BodiesTangent, dot: Tangents):
         self._own, self._bodies, self._dot = own, bodies.at_rest(own.bodies), dot
@@ -179,13 +179,13 @@ class CoarseBodiesTangent:
         self._lifted = {"lifted": wp.zeros_like(self._none), "lifted_dot": wp.zeros_like(self._none)}
 
     def carried(self, context: StepContext, y: wp.array, y_dot: wp.array) -> dict[str, wp.array]:
-        """G y and its tangent, which the next call overwrites."""
+        """Return G y and its tangent, which the next call overwrites."""
         carried = self._own.carried(context, y)
         change = self._bodies.drifted(context, self._dot, self._none, y, y_dot)
         return {"carried": carried, "carried_dot": change}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], source: Named) -> None:
-        """Of c G c E, to what is spread for the tangent of e."""
+        """Add the tangent of c G c E to the source that is spread for the tangent of e."""
         kernels, lifted = self._own.kernels, self._lifted
         context.launch(kernels.lift, *known, lifted, factor=1.0)
         context.launch(kernels.lift_tangent, *known, lifted)
@@ -194,7 +194,7 @@ class CoarseBodiesTangent:
 
 
 class CoarseBodiesAdjoint:
-    """Reverse mode."""
+    """The adjoint of free bodies on the coarse grid, for reverse mode."""
 
     def __init__(self, own: CoarseBodies, bodies: BodiesAdjoint, bar: Adjoints):
         self._own, self._bodies, self._bar = own, bodies.at_rest(own.bodies), bar
@@ -202,11 +202,11 @@ class CoarseBodiesAdjoint:
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
 
     def carried(self, context: StepContext, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Of G y."""
+        """Apply the adjoint of G y: add to ``y_bar`` and to the adjoints of bodies and particles."""
         self._bodies.carried(context, self._bar, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """Of - lambda . c G c E, given the ``multiplier`` lambda, to all adjoints."""
+        """Add the adjoints of - lambda . c G c E, given the ``multiplier`` lambda, to those of all inputs."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

@@ -21,12 +21,12 @@ from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_
 from cortado.sph.parts import StepContext
 
 FEWEST = 4
-"""Nodes along an axis below which it is not halved."""
+"""Fewest nodes along an axis that a coarser grid may halve."""
 W = wp.constant(1.9)
 
 
 class LevelKernels(NamedTuple):
-    """By what they do."""
+    """Kernels that make the matrices of ever coarser grids."""
 
     coarsen: Any
     """The matrix of a level from that of the ``fine`` one."""
@@ -36,7 +36,7 @@ class LevelKernels(NamedTuple):
 
 @cache
 def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels for the matrices of coarser grids, in 2 or 3 dimensions."""
     real = precision.real
     module = kernel_module(f"coarse_levels_{dimension}d_{precision.name}")
     AROUND, among = wp.constant(3**dimension), node_functions(dimension)
@@ -52,17 +52,17 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.func
     def weight_of(step: wp.vec3i) -> real:
-        """Of R, for a fine node that is a step, 0 or 1 along each axis, from where the coarse one is."""
+        """Return the weight in R of a fine node a step, 0 or 1 along each axis, from the coarse one."""
         return side(step[0]) * side(step[1]) * side(step[2])
 
     @wp.func
     def least(left: int, factor: int) -> int:
-        """The first step along an axis from a fine node that ends within reach of one ``left`` away."""
+        """Return the first step along an axis from a fine node that ends within reach of a node ``left`` away."""
         return wp.max(-1, left + 1 - factor)
 
     @wp.func
     def most(left: int, factor: int) -> int:
-        """One more than the last."""
+        """Return one more than the last step from a fine node that ends within reach of a node ``left`` away."""
         return wp.min(2, left + factor)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -74,7 +74,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         # out
         A: wp.array2d(dtype=real),
     ):
-        """With a thread for each of the first half of the offsets of each node, itself among them; A is symmetric."""
+        """Compute a coarser symmetric matrix A, with a thread for each of the first half of each node's offsets."""
         offset = wp.tid() // A.shape[1]
         node = wp.tid() - offset * A.shape[1]
         nodes = shape[0] * shape[1] * shape[2]
@@ -117,18 +117,18 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
 
 class Level(NamedTuple):
-    """One grid, with what is its own of the arrays of all levels."""
+    """One of the multigrid's grids, with its part of the arrays of all levels."""
 
     shape: wp.vec3i
     factor: wp.vec3i
-    """By how much the finer grid has more nodes along each axis."""
+    """Ratio of the finer grid's number of nodes to this grid's, along each axis."""
     A: wp.array
     """(3^d, nodes) for each offset from a node and each node, of all scenes."""
     weight: wp.array
 
 
 class Levels:
-    """All grids of the matrix of a solver."""
+    """All grids of the multigrid for a solver's coarse pressure matrix."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class Levels:
         device: Any,
         rows: int = 0,
     ):
-        """``shape``: of the finest, to whose matrix B^T B with so many ``rows`` is added."""
+        """Allocate all levels below a finest grid of a ``shape``, to whose matrix B^T B with ``rows`` rows is added."""
         self._kernels, self._device = level_kernels(precision, dimension), device
         self._solve = solve_kernel(precision, dimension, device.is_cpu)
         factors: list[tuple[int, ...]] = [(1, 1, 1)]
@@ -183,7 +183,7 @@ class Levels:
         system.gate = wp.zeros(2 * teams, dtype=wp.int32, device=device)
 
     def begin(self, context: StepContext) -> None:
-        """All that follows from the matrix."""
+        """Compute the matrices and weights of all coarser levels from the finest matrix."""
         for finer, level in zip([None, *self.levels], self.levels, strict=False):
             if finer is not None:
                 both = {"fine": finer.shape, "shape": level.shape, "factor": level.factor, "A_fine": finer.A}
@@ -192,6 +192,6 @@ class Levels:
             context.launch(self._kernels.weigh, level._asdict(), threads=len(level.weight))
 
     def solve(self, e: wp.array, tolerance: float, most: int) -> None:
-        """Write to ``e`` (nodes,) what solves (A + B^T B) e = `r`, which is overwritten."""
+        """Write to ``e`` (nodes,) the solution of (A + B^T B) e = `r`, which is overwritten."""
         limits = {"tolerance": tolerance, "most": most}
         launch(self._solve, self._threads, self._device, limits, system=self._system, e=e, block=BLOCK)

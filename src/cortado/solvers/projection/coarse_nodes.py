@@ -20,31 +20,31 @@ from cortado.device.precision import Precision
 from cortado.sph.moment_functions import matrix_type
 
 ALONE = 0.01
-"""Of h^2, in what holds the nodes around a particle."""
+"""The factor of h^2 in the term that holds the nodes around a particle."""
 
 
 def source_type(precision: Precision) -> Any:
-    """The bundle of what is spread."""
+    """Return the type of the bundle of particle values that are spread to nodes."""
     return bundle(s_value=precision.real, s_slope=precision.vector, s_bent=precision.vector, s_own=precision.real)
 
 
 @dataclass(frozen=True)
 class NodeFunctions:
-    """Warp functions of the nodes of a grid of some shape, which wraps around."""
+    """Warp functions that number the nodes of a grid of some shape, which wraps around."""
 
     number_of: Any
-    """Of a node, which may be as far outside as the grid is wide."""
+    """The number of a node, which may be as far outside as the grid is wide."""
     node_of: Any
-    """Of a number."""
+    """The node of a number."""
     step_of: Any
-    """From a node to one of those around it, itself among them."""
+    """The step from a node to one of its neighbours, itself among them, by the number of the step."""
     offset_of: Any
-    """The number of such a step."""
+    """The number of a step to a neighbour."""
 
 
 @cache
 def node_functions(dimension: int) -> NodeFunctions:
-    """In 2 or 3 dimensions."""
+    """Make Warp functions that number nodes and steps between them, in 2 or 3 dimensions."""
     flat = wp.constant(dimension == 2)
 
     @wp.func
@@ -74,25 +74,25 @@ def node_functions(dimension: int) -> NodeFunctions:
 
 @dataclass(frozen=True)
 class HatFunctions:
-    """Warp functions."""
+    """Warp functions that evaluate hat functions of a grid's nodes at particles."""
 
     hat: Any
     """phi, its gradient and its mixed second derivatives, of one of the nodes at the corners of a position's cell."""
     at: Any
-    """The same of a sum of hats at a particle: E, G and H of values e at nodes."""
+    """A sum of hats at a particle with its derivatives: E, G and H of values e at nodes."""
     products: Any
     """The sum of e u over the nodes that a particle touches."""
     bend: Any
     """H v"""
     corner_step: Any
-    """To one of the corners of a cell."""
+    """The step to one of the corners of a cell."""
     held: Any
-    """eps + h^2 / 100, by which a particle holds the nodes around it."""
+    """The term eps + h^2 / 100, by which a particle holds the nodes around it."""
 
 
 @cache
 def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
-    """In 2 or 3 dimensions."""
+    """Make Warp functions of the hats of nodes, in 2 or 3 dimensions."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
     number_of = node_functions(dimension).number_of
@@ -102,7 +102,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.struct
     class Hat:
-        """phi, its gradient and its mixed second derivatives yz, xz and xy."""
+        """The value phi of a hat function, its gradient and its mixed second derivatives yz, xz and xy."""
 
         value: real
         slope: vector
@@ -118,7 +118,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def hat(x: vector, corner: int, grid: grid_type) -> Hat:
-        """That of one of the nodes at the corners of a position's cell."""
+        """Return value and derivatives at x of the hat of the node at one of the corners of x's cell."""
         s = wp.cw_mul(x - grid.origin, grid.frequency)
         t = s - vector(wp.floor(s[0]), wp.floor(s[1]), wp.floor(s[2]))
         f, found = grid.frequency, Hat()
@@ -140,12 +140,12 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def first_corner(i: int, particles: int, x: vector, grid: grid_type):
-        """The cell of a particle, and the first node of its scene."""
+        """Return the cell of a particle and the first node of its scene."""
         return cell_of(x, grid), (i // particles) * (grid.shape[0] * grid.shape[1] * grid.shape[2])
 
     @wp.func
     def at(i: int, particles: int, x: vector, e: wp.array(dtype=real), grid: grid_type) -> Hat:
-        """E, G and H of particle i."""
+        """Return the sum of hats with node values e at particle i: value E, gradient G, mixed second derivatives H."""
         own, first = first_corner(i, particles, x, grid)
         found = Hat()
         for corner in range(CORNERS):
@@ -160,7 +160,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     def products(
         i: int, particles: int, x: vector, e: wp.array(dtype=real), u: wp.array(dtype=real), grid: grid_type
     ) -> real:
-        """The sum of e u over the nodes that particle i touches."""
+        """Return the sum of e u over the nodes whose hats reach particle i."""
         own, first = first_corner(i, particles, x, grid)
         total = real(0.0)
         for corner in range(CORNERS):
@@ -170,7 +170,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
     @wp.func
     def bend(bent: vector, v: vector) -> vector:
-        """H v"""
+        """Return H v for a matrix H of mixed second derivatives yz, xz and xy, with a diagonal of 0."""
         return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
 
     @wp.func
@@ -182,19 +182,19 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
 
 @dataclass(frozen=True)
 class NodeKernels:
-    """By what they do."""
+    """Kernels that sum over the particles around each node of the coarse grid."""
 
     add_up: Any
-    """The part of A that the particles of a cell have, for each two of its corners."""
+    """The part of A by the particles of a cell, for each two of its corners."""
     fill: Any
     """A, for each node and each of its neighbours, itself among them."""
     spread: Any
-    """A sum over particles."""
+    """The sum over the particles around each node."""
 
 
 @cache
 def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels that sum over the particles around nodes, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, source, own = cell_grid_type(precision), source_type(precision), hat_functions(precision, dimension)
     hat, corner_step, held, among = own.hat, own.corner_step, own.held, node_functions(dimension)
@@ -206,7 +206,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
 
     @wp.func
     def pair_of(a: int, b: int) -> int:
-        """The number of two corners of a cell, in any order."""
+        """Return the number of a pair of a cell's corners, in any order."""
         i, j = wp.min(a, b), wp.max(a, b)
         return i * (2 * CORNERS - 1 - i) // 2 + j
 
@@ -222,7 +222,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         # out
         cells: wp.array2d(dtype=real),
     ):
-        """With a thread for each cell."""
+        """Sum the particles of each cell into the matrix entries of its pairs of corners; a thread is a cell."""
         cell = wp.tid()
         total, own = square(), pushes()
         for p in range(grid.starts[cell], grid.starts[cell + 1]):
@@ -246,7 +246,7 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         # out
         A: wp.array2d(dtype=real),
     ):
-        """With a thread for each node, which has half of the offsets and itself; A is symmetric."""
+        """Put the cells' entries together to the symmetric A; a thread is a node and writes half of its offsets."""
         node = wp.tid()
         nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
         member = node // nodes

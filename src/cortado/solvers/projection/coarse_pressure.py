@@ -41,22 +41,22 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, symm
 
 @dataclass(frozen=True)
 class CoarsePressureKernels:
-    """Of d, given e; `LengthKernels` has those of alpha."""
+    """Kernels of the pressure change d by a coarse pressure e; `LengthKernels` has those of its length alpha."""
 
     correct: Any
     correct_tangent: Any
-    """Given the tangent of e."""
+    """The tangent of d, given that of e."""
     source_tangent: Any
-    """What is spread for the tangent of e."""
+    """The source that is spread for the tangent of e."""
     correct_adjoint: Any
-    """From the adjoint of d to what is spread for that of e."""
+    """From the adjoint of d to the source that is spread for the adjoint of e."""
     source_adjoint: Any
-    """From lambda, A lambda = the adjoint of e, to all adjoints."""
+    """From lambda, A lambda = the adjoint of e, to the adjoints of all inputs."""
 
 
 @cache
 def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePressureKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of the pressure change by the coarse grid, in 2 or 3 dimensions."""
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
     at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
@@ -78,7 +78,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         y_i: real,
         e: values,
     ) -> tuple[real, six]:
-        """T is d L."""
+        """Return the clamped change d of a particle's pressure y by the coarse pressure e, and T = d L."""
         z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
         new = z
         if z < least:
@@ -189,7 +189,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         e: values,
         multiplier: values,
     ) -> tuple[real, real, vector, matrix, real, vector]:
-        """``multiplier`` is lambda."""
+        """Add to the adjoints of r, c, h, N, m and x, given the ``multiplier`` lambda."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
         w, u = (N_i * f.slope + f.value * h_i) / m_i, (N_i * g.slope + g.value * h_i) / m_i
         both = products(i, particles, x_i, e, multiplier, grid)
@@ -209,38 +209,38 @@ SMALL = 1e-6
 
 @dataclass(frozen=True)
 class LengthKernels:
-    """Of alpha, given d, the thrust -D^T d / m, and as ``carried`` the G d of free bodies, see
-    `cortado.solvers.projection.coarse_bodies`."""
+    """Kernels of the length alpha of a coarse correction, given the pressure change d, the thrust -D^T d / m, and as
+    ``carried`` the G d of free bodies, see `cortado.solvers.projection.coarse_bodies`."""
 
     share: Any
     share_tangent: Any
-    """What particles add to both sums of alpha."""
+    """The tangent of a particle's share of both sums of alpha."""
     apply: Any
     apply_tangent: Any
     apply_adjoint: Any
-    """Of y' and u', given both sums."""
+    """The adjoint of y' and u', given both sums."""
     along_adjoint: Any
-    """What the adjoint of y' and u' gives to alpha."""
+    """The part of the adjoint of alpha by y' and u'."""
     every: Any
-    """Whether all scenes of a batch are warm."""
+    """Tells whether all scenes of a batch are warm."""
 
 
 @cache
 def length_kernels(precision: Precision) -> LengthKernels:
-    """The same in 2 and in 3 dimensions."""
+    """Make the kernels of the length alpha of a coarse correction, in any dimension."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     small = wp.constant(real(SMALL))
     module = kernel_module(f"coarse_length_{precision.name}")
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """alpha; NaN stays NaN, which must not be hidden."""
+        """Return alpha, the ratio of both sums within 0 and 1; NaN stays NaN, which must not be hidden."""
         found = sums[0] / sums[1]
         return wp.where(found < real(0.0), real(0.0), wp.where(found > real(1.0), real(1.0), found))
 
     @wp.func
     def bends(sums: pair_of) -> bool:
-        """Whether alpha is between its ends, and follows the sums."""
+        """Test whether alpha is between 0 and 1, where it depends on the sums."""
         return sums[0] > real(0.0) and sums[0] < sums[1]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -252,7 +252,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
 
     @wp.func
     def least(m: real, spacing: real, dt: real) -> real:
-        """What a particle adds to the sums in any case."""
+        """Return m (1e-6 s / dt)^2, the energy that a particle adds to the sums of alpha in any case."""
         v = small * spacing / dt
         return m * v * v
 
@@ -268,7 +268,7 @@ def length_kernels(precision: Precision) -> LengthKernels:
         carried_i: real,
         thrust_i: vector,
     ) -> pair_of:
-        """In a scene that ``stays`` as it is alpha is 0."""
+        """Return a particle's share of both sums of alpha; a scene that ``stays`` uncorrected has an alpha of 0."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
         own = least(m_i, spacing, time_step)
@@ -346,8 +346,8 @@ def length_kernels(precision: Precision) -> LengthKernels:
         k_bar_i: real,
         y_bar_i: real,
     ) -> tuple[real, real, real, real, real, real, vector, real]:
-        """``alpha_bar`` is that of each scene. The adjoints of k' and y' become those of k and y; that of u' is that of
-        u, too."""
+        """Turn the adjoints of k', y' and u' into those of k, y, u and the inputs of alpha. Those of k' and y' are
+        overwritten; that of u' is that of u, too. ``alpha_bar`` is that of each scene."""
         alpha, along_bar, energy_bar = length(sums), real(0.0), real(0.0)
         if bends(sums):
             along_bar = alpha_bar / sums[1]

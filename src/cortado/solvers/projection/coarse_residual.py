@@ -31,19 +31,19 @@ from cortado.sph.moment_functions import cross_terms_function, matrix_type, mome
 
 @dataclass(frozen=True)
 class CoarseSums:
-    """Warp functions."""
+    """Warp functions of the sums over neighbours for the push by a coarse pressure."""
 
     push: Any
-    """sum T_j g_ij, which T_i g_i and c_i gamma_i complete, and the rows of N, for T = c L."""
+    """sum T_j g_ij, which T_i g_i and c_i gamma_i complete to h, and the rows of N, for T = c L."""
     push_tangent: Any
     push_back: Any
-    """For adjoints of h and N: the symmetric part of that of T, as its diagonal and its other entries, and what x is
-    given."""
+    """From adjoints of h and N: the symmetric part of the adjoint of T, as its diagonal and its other entries, and that
+    of x."""
 
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> CoarseSums:
-    """The sums over neighbours that the coarse residual needs, for a discretisation."""
+    """Make the sums over neighbours of the push by a coarse pressure, for a discretisation."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, pair = neighbourhood_type(precision), pair_functions(discretisation)
@@ -88,7 +88,7 @@ def coarse_sums(discretisation: Discretisation) -> CoarseSums:
 
 @cache
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of h and N in 2 or 3 dimensions: each time that of T comes first."""
+    """Make the kernels of the coarse push h and N in 2 or 3 dimensions; the kernel of T comes first in each."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     sums, packed = coarse_sums(discretisation), symmetric(precision)
@@ -160,17 +160,17 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 @dataclass(frozen=True)
 class ResidualKernels:
-    """Of r, what of the divergence a coarse pressure is to take away."""
+    """Kernels of the residual r, the part of the divergence that a coarse pressure is to take away."""
 
     residual: Any
     residual_tangent: Any
     residual_adjoint: Any
-    """To the adjoint d_bar of D u and to S = d_bar L, with which that of the pressure's update goes on."""
+    """From the adjoint of r to d_bar of D u and to S = d_bar L, which the adjoint of the pressure's update uses."""
 
 
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> ResidualKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of the divergence that a coarse pressure takes away, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     sums = projection_sums(discretisation)
@@ -183,9 +183,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
 
     @wp.func
     def counts(y: real, tension: real, left: real) -> real:
-        """Which part of a divergence does. Where iterations let through but a part of a tension, they leave one that
-        the coarse grid must not take away; at the corner between it is the mean of both sides. NaN counts, which must
-        not be hidden."""
+        """Return the part of a divergence that counts in the residual. Iterations that let through a part of a tension
+        leave a divergence that the coarse grid must not take away; the corner between has the mean. NaN counts."""
         if y > real(0.0) or tension >= real(1.0) or not (left <= real(0.0)):
             return real(1.0)
         return wp.where(left == real(0.0), real(0.5), real(0.0))
@@ -209,7 +208,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
         u_i: vector,
         y_i: real,
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
-        """Writes A and the divergence too."""
+        """Return A, the divergence, the residual r and the source c r of a particle."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         left = D - wanted(n_i, weights_i[1], time_step)

@@ -19,9 +19,9 @@ from cortado.device.precision import Precision
 BLOCK = 512
 """Threads of a block on a GPU."""
 ALONE = 4 * BLOCK
-"""Nodes of a level that one block works on, at most."""
+"""Greatest number of nodes of a level that one block works on alone."""
 SWEEPS = 8
-"""Smoothings of the coarsest level, an even number."""
+"""Number of smoothings of the coarsest level, an even number."""
 
 ON_A_CPU = """
     const int first = thread, teams = system.members;
@@ -34,8 +34,8 @@ ON_A_CPU = """
         return T(total);
     };
 """
-"""What the text of a solve needs: the scenes of a thread, `each` and `sum` over nodes, and `meet`, after which all see
-what others wrote."""
+"""Macros that the text of a solve needs: the scenes of a thread, `each` and `sum` over nodes, and `meet`, a barrier
+after which all see what others wrote."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;
@@ -217,26 +217,26 @@ SOLVE = """
         if (lead) system.count.data[member] = done;
     }
 """
-"""Everything here is about one scene after the other. An iteration ends where r z, of what nearly solves A z = r, has
-fallen by the square of a tolerance; nodes without a matrix have no weight, and get 0."""
+"""The native code of a solve, one scene after the other. An iteration ends where r z, of what nearly solves A z = r,
+has fallen by the square of a tolerance; nodes without a matrix have no weight, and get 0."""
 
 
 @cache
 def system_type(precision: Precision) -> Any:
-    """The struct of what a solve is about: the matrices and the room of all levels, one behind the other, each with the
-    nodes of all scenes."""
+    """Make the struct of a solve's system: the matrices and the work arrays of all levels, one behind the other, each
+    with the nodes of all scenes."""
     numbers = wp.array(dtype=precision.real)
 
     @wp.struct
     class System:
         shapes: wp.array(dtype=wp.int32)
-        """Six numbers for each level: nodes along each axis, and by how much the finer one has more."""
+        """Six numbers for each level: nodes along each axis, and the ratios of the finer grid's numbers to them."""
         starts: wp.array(dtype=wp.int64)
         """The first node of each level."""
         members: wp.int32
-        """Scenes."""
+        """Number of scenes."""
         team: wp.int32
-        """Blocks for each scene."""
+        """Number of blocks for each scene."""
         A: numbers
         weight: numbers
         """w of nodes, see `cortado.solvers.projection.coarse_levels`."""
@@ -249,13 +249,13 @@ def system_type(precision: Precision) -> Any:
         image: numbers
         """(A + B^T B) p"""
         rows: wp.int32
-        """Of B."""
+        """Number of rows of B."""
         B: numbers
         """Row by row, each with the nodes of all scenes."""
         partial: numbers
-        """Parts of sums."""
+        """Partial sums of blocks."""
         gate: wp.array(dtype=wp.int32)
-        """For each team, how many blocks wait, and how often all have."""
+        """For each team, how many blocks wait at a barrier, and how often all have met."""
         count: wp.array(dtype=wp.int32)
         """(members,) iterations of the last solve."""
 
@@ -264,7 +264,7 @@ def system_type(precision: Precision) -> Any:
 
 @cache
 def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
-    """The kernel of a solve, in 2 or 3 dimensions."""
+    """Make the kernel that solves for the coarse pressure by conjugate gradients, in 2 or 3 dimensions."""
     real, system_kind = precision.real, system_type(precision)
     module = kernel_module(f"coarse_solve_{dimension}d_{precision.name}" + ("" if is_cpu else "_blocks"))
     text = f"typedef wp::{real.__name__} T;\n" + (ON_A_CPU if is_cpu else ON_A_GPU) + SOLVE
@@ -283,7 +283,7 @@ def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
         # out
         e: wp.array(dtype=real),
     ):
-        """Conjugate gradients end at a ``tolerance`` or after ``most`` iterations."""
+        """Solve for ``e`` by conjugate gradients, to a relative ``tolerance`` or for ``most`` iterations."""
         solve_all(wp.tid(), system, tolerance, most, e)
 
     if not is_cpu:

@@ -22,7 +22,7 @@ from cortado.sph.parts import StepContext
 
 
 class ProjectionTangent(ParticleTangent):
-    """Forward mode, one step at a time, of a run along tangents of its parameters."""
+    """The tangent of steps of the projection, one step at a time, along tangents of a run's parameters."""
 
     density: SurroundingsTangent
 
@@ -73,25 +73,25 @@ class ProjectionTangent(ParticleTangent):
         self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """As that of `PressureTangent`."""
+        """Return the tangents (n,) of the pressures of the last step; see `PressureTangent`."""
         return self._over_time(self._solver.iterates[rounds[0]]["k"], self._k_dot.numpy())
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """As that of `PressureTangent`."""
+        """Return the tangents (n,) of the mean stresses of the last step; see `PressureTangent`."""
         solver, at = self._solver, {**self._pull, "k": self._solver.iterates[rounds[0]]["k"], "k_dot": self._k_dot}
         context, around = solver.context(solver.parameters), (solver.around, self._around)
         change = solver.mean_stress.tangent(context, self.dot, around, at)
         return self._over_time(solver.mean_stress.impulses(context, solver.around, at), change)
 
     def _over_time(self, impulses: wp.array, change: NDArray) -> NDArray:
-        """The tangent of impulses over the time step, from that of impulses."""
+        """Return the tangent of impulses over the time step, given the impulses' tangent."""
         particles = self._solver.layout.particles
         dt, dt_dot = (of.parameters["time_step"].numpy().repeat(particles) for of in (self._solver, self.dot))
         found: NDArray = change / dt - impulses.numpy() * dt_dot / dt**2
         return found
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """The first k and the iterations."""
+        """Take the tangents of the first pressure impulse k and of the iterations."""
         solver, kernels = self._solver, self._solver.kernels.pressure
         beginning = solver.kernels.beginning
         before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
@@ -112,20 +112,20 @@ class ProjectionTangent(ParticleTangent):
             self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int, change: dict[str, wp.array]) -> None:
-        """The coarse correction before iteration k."""
+        """Take the tangent of the coarse correction before iteration k."""
         before = {**self._solver.iterates[k], **change}
         drift = self._drift(context, before)
         self._coarse.correct(context, k, (drift, *known), before, self._solver.corrected[k])
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> dict[str, wp.array]:
-        """The tangent of the drift of walls where bodies move; what surrounds particles has that of others."""
+        """Return the tangent of the drift of walls that free bodies move; empty without free bodies."""
         if self._bodies is None:
             return {}
         drift_dot = self._around["drift_dot"]
         return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        """The tangent of the velocities that the pressure y leaves."""
+        """Write the tangent of the velocities that the pressure y of an iterate leaves."""
         solver, kernels = self._solver, self._solver.kernels.velocity
         pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
         context.launch(kernels.pull_tangent, *known, pull)
@@ -135,7 +135,7 @@ class ProjectionTangent(ParticleTangent):
 
 
 class ProjectionAdjoint(ParticleAdjoint):
-    """Reverse mode, one step at a time, of a run with some parameters."""
+    """The adjoint of steps of the projection, one step at a time, of a run with some parameters."""
 
     density: SurroundingsAdjoint
 
@@ -162,7 +162,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._finish(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """As that of `PressureAdjoint`."""
+        """Write the adjoint of a replayed step's state, for adjoints ``within`` it (`PressureAdjoint`)."""
         solver = self._solver
         state_bar.clear()
         self._begin(state_bar, parameters)
@@ -177,15 +177,15 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._finish(counts, state_bar, parameters, within)
 
     def _last(self, counts: Counts) -> dict[str, wp.array]:
-        """The iterate of the replayed step after all iterations."""
+        """Return the iterate of the replayed step after all pressure iterations."""
         return self._solver.iterates[counts[0]]
 
     def _last_gradient(self, counts: Counts) -> wp.array:
-        """A of its last iteration."""
+        """Return the velocity gradient sums A of the replayed step's last pressure iteration."""
         return self._solver.last_gradient(counts[0])
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the result to those of the last positions, velocities and k."""
+        """Go back from the adjoint of a step's result to those of the last positions, velocities and k."""
         solver, context = self._solver, self._solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
         scene = {
@@ -207,7 +207,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _finish(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """From there to the adjoint of the state."""
+        """Go back from the adjoints of the last positions, velocities and k to that of the state."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
         flow = {"A": self._last_gradient(counts), "A_bar": self._A_bar}
@@ -233,7 +233,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
 
     def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
-        """Of the repairs, to the adjoint of the positions before them."""
+        """Apply the adjoint of the density repairs, to the adjoint of the positions before them."""
         solver, kernels = self._solver, self._solver.kernels.repair
         begin, move = kernels.move.adjoint
         for k in reversed(range(repairs)):
@@ -250,7 +250,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Of the iterations, to the adjoints of v* and of the first k and u."""
+        """Apply the adjoint of the pressure iterations, to those of v*, of the first k and of the first u."""
         solver = self._solver
         if self._bodies is not None:
             self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
@@ -262,7 +262,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._coarse.finish(context, known)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
-        """Of the coarse correction before iteration k, from the adjoints of its k, y and u to those before."""
+        """Apply the adjoint of the coarse correction before iteration k to those of k, y and u."""
         solver, at = self._solver, self._solver.iterates[k]
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
@@ -272,7 +272,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         add(self._f, self._u_bar)
 
     def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], y_bar: wp.array) -> None:
-        """Of the velocities that y leaves, to the adjoints of v* and of y."""
+        """Apply the adjoint of the velocities that the pressure y leaves, to those of v* and of y."""
         solver, velocity = self._solver, self._solver.kernels.velocity
         found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
         steps = {"f": self._f, "T": self._pull, "y": at["y"]}
@@ -282,8 +282,8 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _back(
         self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
     ) -> None:
-        """Of one iteration, from the adjoints of k' and y' to those of k, y and u. Its A ``moves`` particles, or only
-        has a divergence."""
+        """Apply the adjoint of one pressure iteration, from those of k' and y' to those of k, y and u. With ``moves``
+        its A has an adjoint of its own, as it moves particles."""
         solver, pressure = self._solver, self._solver.kernels.pressure
         clamp, divergence, whole = pressure.update.adjoint
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
@@ -297,7 +297,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _diverge(
         self, context: StepContext, known: tuple[Named, ...], kernel: wp.Kernel, at: dict[str, wp.array], steps: Named
     ) -> None:
-        """From d_bar and S in ``steps`` to the adjoint of u, by the kernel of one of the two kinds of S."""
+        """Turn the adjoints d_bar and S in ``steps`` into that of u, by a kernel for one of the two kinds of S."""
         context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
         if self._bodies is not None:
             self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)

@@ -31,7 +31,7 @@ from cortado.sph.moment_functions import matrix_type, moment_functions
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
 """The fullness below which nothing, and above which all is done."""
 SHARED = (0.7, 0.95)
-"""The same of the share of a coarse pressure, of H + 2 nu."""
+"""Fullness H + 2 nu below which the share of a coarse pressure is 0, and above which it is 1."""
 WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
 APART = 0.005
@@ -42,27 +42,27 @@ MIRRORED = 9.0
 """How many times more walls that mirror count in B. Images make up for what is missing beside them, which K would make
 up for too, and a block that falls from a lid has no tension to an image of its own."""
 REGULAR = 0.05
-"""What is added to the diagonal of M before it is inverted."""
+"""The number that is added to the diagonal of M before it is inverted."""
 NEWTON = 0.033
 """Two thirds of a step of Newton's method towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Inside of the
 fluid, where M is nearly I, J follows its changes for 95 % only: rows that pass one another seem to be squeezed, which
 holds back films on a gentle slope. With a whole step they flow 1 to 2 % too fast, and water at rest moves faster. At
 surfaces, where M is far from I, it would widen jets."""
 ALONG = 0.2
-"""How much of what gradients along a wall lack beside it is made up. On the lattice, with Wendland C2, the first row
-lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
+"""The part of what gradients along a wall lack beside it that is made up. On the lattice, with Wendland C2, the first
+row lacks 25 % of a pressure's gradient along the wall. With 0 water at rest sinks along upright walls, in a lasting
 vortex, and with 1, where divergences are right, the second row has 6 % too much and rises."""
 
 
 @cache
 def weights_type(precision: Precision) -> Any:
-    """The Warp type of (sigma, f, u, r)."""
+    """Return the Warp type of a particle's four weights (sigma, f, u, r)."""
     return wp.types.vector(length=4, dtype=precision.real)
 
 
 @cache
 def away_function(precision: Precision) -> Any:
-    """The Warp function 1 / (1 + (nu / half)^4) of nu and half, which is 0 beside walls."""
+    """Make the Warp function 1 / (1 + (nu / half)^4) of nu and half, which is near 0 beside walls."""
     real = precision.real
 
     @wp.func
@@ -75,7 +75,7 @@ def away_function(precision: Precision) -> Any:
 
 @dataclass(frozen=True)
 class EffectFunctions:
-    """Warp functions of one particle."""
+    """Warp functions of the weights, the gradient correction and the diagonal of one particle in the projection."""
 
     weights: Any
     """(sigma, f, u, r) of M, nu and that of walls that mirror."""
@@ -88,13 +88,12 @@ class EffectFunctions:
     share: Any
     """c of M and nu."""
     back: Any
-    """The adjoints of M, Q, g, gamma, that of walls that mirror, nu, that of those walls and m, for those of L, a, the
-    weights and c."""
+    """From adjoints of L, a, weights and c to those of M, Q, g, gamma, nu, of walls that mirror, and m."""
 
 
 @cache
 def effect_functions(precision: Precision, dimension: int, module: Any) -> EffectFunctions:
-    """In 2 or 3 dimensions, in a Warp module."""
+    """Make the functions of a particle's weights and corrections in 2 or 3 dimensions, in a Warp module."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
@@ -125,7 +124,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def walled_correction(M: matrix, gamma: vector, least: real) -> matrix:
-        """t P - (1 + t) C; M_zz = 1 of the plane does not count."""
+        """Return the correction t P - (1 + t) C along a wall; M_zz = 1 of the plane does not count."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
         P, whole = unit() - N, real(1.0) + regular
@@ -143,7 +142,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Effec
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
-        """L and Q are symmetric: tr(L Q L) = (L L) : Q."""
+        """Return the diagonal a of the pressure matrix; L and Q are symmetric: tr(L Q L) = (L L) : Q."""
         own_part = L * g + gamma
         return (wp.dot(own_part, own_part) + least) / m + wp.ddot(L * L, Q)
 

@@ -40,21 +40,21 @@ from cortado.sph.parts import Carried, StepContext
 
 @dataclass(frozen=True)
 class FixedPointKernels:
-    """The kernels, by what they do."""
+    """Kernels of the linear system that the adjoint of the converged pressure solves."""
 
     pull: Any
     """y = sqrt(c) p, and T = y L."""
     linearise: Any
     """D v, sqrt(c), (1 - c) a / omega, w and the right-hand side at the fixed point."""
     multiply: Any
-    """The operator over w, given -D^T y / m."""
+    """The operator over w applied to a vector, given -D^T y / m."""
     recover: Any
-    """lambda of the solution q."""
+    """The adjoint lambda from the solution q."""
 
 
 @cache
 def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
-    """The same in 2 and in 3 dimensions."""
+    """Make the kernels of the implicit pressure adjoint's linear system, in any dimension."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     weights4, packed = weights_type(precision), symmetric(precision)
@@ -112,14 +112,14 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         w_i: real,
         p_i: real,
     ) -> tuple[real, real]:
-        """``u`` is -D^T y / m."""
+        """Apply the adjoint system's operator over w to p; ``u`` is -D^T y / m."""
         total = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + image_i * widened
         found = rest_i * p_i - root_i * (total + wp.dot(gamma_i, u_i))
         return found / w_i, p_i * found
 
     @particle_kernel(module, "k_bar y_bar", numbers=["omega"])
     def recover(omega: real, a_i: real, root_i: real, q_i: real) -> tuple[real, real]:
-        """Where c is 0, so are sigma and its derivatives, and nothing depends on lambda."""
+        """Return lambda from q. Where c is 0, so are sigma and its derivatives, and nothing depends on lambda."""
         found = real(0.0)
         if root_i > real(0.0):
             found = a_i * q_i / (omega * root_i)
@@ -129,11 +129,11 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
 
 
 class FixedPointAdjoint(ProjectionAdjoint):
-    """Reverse mode of steps whose pressure is known from what they led to: neither its work nor its memory depends on
-    the number of iterations. It is a `ResumingAdjoint`."""
+    """The adjoint of steps that takes the pressure as a fixed point: neither its work nor its memory depends on the
+    number of iterations. It is a `ResumingAdjoint`."""
 
     def __init__(self, solver: ProjectionSteps, steps: int, tolerance: float, most: int):
-        """As `Solver.implicit_adjoint` says."""
+        """Prepare the way back over ``steps`` steps; `Solver.implicit_adjoint` explains the arguments."""
         super().__init__(solver, steps)
         layout, precision = solver.layout, solver.layout.precision
         self._own = fixed_point_kernels(solver.discretisation)
@@ -147,11 +147,11 @@ class FixedPointAdjoint(ProjectionAdjoint):
         self._solution = ConjugateGradients(layout, precision.real, tolerance, most)
 
     def arrive(self, state: State) -> None:
-        """As that of `ResumingAdjoint`."""
+        """Keep k of the state that the next step to go back through led to; see `ResumingAdjoint`."""
         wp.copy(self._after[IMPULSE], state[IMPULSE])
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
-        """As that of `ResumingAdjoint`."""
+        """Replay a step without pressure iterations, from k of the state after it; see `ResumingAdjoint`."""
         solver, repairs = self._solver, counts[1]
         solver.reserve((0, repairs))
         context, at = solver.begin(state, parameters), solver.iterates[0]
@@ -177,7 +177,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         context.launch(self._own.pull, self._solver.around, p=p, root=self._root, y=y, T=T)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        """Of the new velocities and of the fixed point, to the adjoint of v*."""
+        """Apply the adjoint of the fixed point and of the new velocities, to the adjoint of v*."""
         solver, at = self._solver, self._solver.iterates[0]
         flow = {"v_flow": at["u"], "v_flow_bar": self._u_bar, "A_bar": self._A_bar}
         context.launch(self._gradient.adjoint, *known, flow)

@@ -31,19 +31,19 @@ from cortado.solvers.projection.walls import normal_part
 from cortado.sph.moment_functions import moment_functions
 
 CONTAINER = -1
-"""The number of the container among solids."""
+"""Number of the container in place of a solid's."""
 NOTHING = -(2**31)
-"""Of no solid."""
+"""A number that no solid has."""
 EVEN = (0.7, 0.9)
 """The images' part in the density over that of wall particles, below which images do not count, and above which they
 count wholly. From 0.5 to 0.8 waves are the same, but spray that is thrown at a wall in long steps passes it."""
 LEAST = 1e-6
-"""nu below which a wall is out of reach."""
+"""Wall coverage nu below which a wall is out of reach."""
 
 
 @dataclass(frozen=True)
 class ImageSums:
-    """Warp functions."""
+    """Warp functions of the sums over images of the fluid in flat walls, and over the walls that mirror."""
 
     weights: Any
     """sum V W_i'"""
@@ -59,22 +59,22 @@ class ImageSums:
     """sum (u_i - R u_j) . g_i'"""
     spread_tangent: Any
     walls: Any
-    """Of the walls that mirror, the solid ``mirror_of`` a position: the sum along their normals and nu."""
+    """Sums over the walls of the solid ``mirror_of`` a position, which mirror: along their normals, and nu."""
     walls_tangent: Any
     walls_back: Any
-    """What adjoints of both give to x."""
+    """The adjoint of x from those of both sums over mirroring walls."""
     behind: Any
-    """nu alone."""
+    """The wall coverage nu alone."""
     behind_tangent: Any
     behind_back: Any
-    """Its gradient."""
+    """The gradient of nu."""
     mirror_of: Any
     """The number of the container, or of nothing where no wall mirrors."""
 
 
 @cache
 def image_sums(discretisation: Discretisation) -> ImageSums:
-    """The sums over images of the fluid in flat walls, for a discretisation."""
+    """Make the sums over images of the fluid in flat walls, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -138,7 +138,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
     def mirror_walls_tangent(
         x_ij: vector, x_dot_i: vector, foot: vector, solid: int, s: neighbourhood
     ) -> tuple[vector, real]:
-        """They are at rest."""
+        """Return the tangent of the sums over mirroring walls, which are at rest."""
         bent = normal(hessian_product(x_ij, x_dot_i, s), foot)
         return s.volume * bent, s.volume * wp.dot(gradient(x_ij, s), x_dot_i)
 
@@ -173,8 +173,7 @@ def image_sums(discretisation: Discretisation) -> ImageSums:
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """The Warp functions of h, of the images' part in the density, nu of the walls that mirror and of all, and of its
-    gradient."""
+    """Make the Warp functions of an image's share h, by its part in the density and nu of walls, and of its slope."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
     away = away_function(precision)
     first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))

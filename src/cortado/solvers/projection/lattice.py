@@ -16,14 +16,14 @@ from cortado.scene.scene import Scene
 MARGIN = 1.05
 """By how much the relaxation stays below that of the lattice's stiffest wave."""
 SMOOTHED = 1.0 / 3.0
-"""From which part of the stiffest wave's stiffness on waves of the density are repaired evenly."""
+"""Part of the stiffest wave's stiffness above which waves of the density are repaired evenly."""
 DEPARTURE = 0.05
 """Part of a_0 that is added to the diagonal: particles with few neighbours have a small one."""
 
 
 @dataclass(frozen=True)
 class ProjectionConstants:
-    """Of a smoothing kernel and a spacing."""
+    """The constants of the projection for a smoothing kernel and a particle spacing."""
 
     spacing: float
     """[m]"""
@@ -36,7 +36,9 @@ class ProjectionConstants:
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
-        """On a lattice with a spacing [m], for a support radius [m].
+        """Compute the constants on a lattice with a spacing [m], for a support radius [m]. One undamped Jacobi
+        iteration goes lambda times too far in the stiffest pressure wave exp(i q . x), lambda = max_q |sum_j g_j sin(q
+        . x_j)|^2 / a_0.
 
         lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is how many times too far one undamped Jacobi iteration goes in
         the stiffest pressure wave exp(i q . x) of the lattice.
@@ -51,31 +53,31 @@ class ProjectionConstants:
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
     def repair_relaxations(self, repairs: int) -> list[float]:
-        """omega of each of so many repairs of the density, by Chebyshev's roots (Golub and Varga 1961): of the errors
-        of all waves between `SMOOTHED` and 1 of the stiffest they leave the least part that so many Jacobi iterations
-        can. The longest comes first, as the last ones smooth what it stirs up."""
+        """Return omega of each repair of the density, by Chebyshev's roots (Golub and Varga 1961). Of the errors of all
+        waves between `SMOOTHED` and 1 of the stiffest, these leave the least part that Jacobi iterations can. The
+        longest comes first, as the last ones smooth what it stirs up."""
         middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
         roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
         return [self.relaxation / float(middle - half * root) for root in roots]
 
 
 def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
-    """Those of the lattice of a scene."""
+    """Compute the projection's constants on the rest lattice of a scene."""
     lattice = discrete.kernel, scene.discretisation.spacing, discrete.lattice.support, scene.dimension
     return ProjectionConstants.of(*lattice)
 
 
 SPACING = 2.0
-"""Distance of nodes, in spacings of particles."""
+"""Distance of the coarse grid's nodes, in spacings of particles."""
 
 
 def endless(discrete: DiscreteScene) -> bool:
-    """Whether all axes are periodic: such a scene has no coarse correction, as nothing sets its level of pressure."""
+    """Return True if all axes are periodic: nothing sets such a scene's level of pressure for a coarse correction."""
     return bool((np.asarray(discrete.periods) > 0.0).all())
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """The nodes of the coarse correction: about everything that can be reached; what goes further wraps around. Along
+    """Make the grid of the coarse correction about everything that particles can reach; beyond, it wraps around. Along
     each axis there are 4 to 7 times a power of two, so that coarser grids have half as many.
 
     Nodes lie on the lower walls of a container, and the first row of particles half a spacing above them. If one row

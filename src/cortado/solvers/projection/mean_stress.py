@@ -37,12 +37,12 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 from cortado.sph.walls import WallSums
 
 TOPIC = "mean_stress"
-"""Of its Warp modules, with the dimension behind it where that counts."""
+"""Topic of its Warp modules, to which the dimension is appended where it counts."""
 
 
 class MeanStress:
-    """dt p of the sorted particles of a step, with its derivatives. ``around`` is what surrounds them
-    (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last iteration."""
+    """The mean normal stress dt p of the sorted particles of a step, with its derivatives. ``around`` is what surrounds
+    them (`cortado.solvers.projection.surroundings`), and ``at`` has k and T of the last iteration."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int):
         self._kernels = mean_stress_kernels(discretisation, dimension)
@@ -51,14 +51,14 @@ class MeanStress:
         self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
 
     def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
-        """(n,) dt p [Pa s]"""
+        """Return the mean normal stress times the time step, dt p (n,) [Pa s]."""
         found, reach = self._arrays["q"], self._reach.total(context, ALL_WALLS, around)
         mirrors = self._mirrors.total(context, CONTAINER, around)
         context.launch(self._kernels.forward, around, at, reach=reach, mirrors=mirrors, q=found)
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
-        """(n,) that of dt p; ``around`` and ``at`` with their tangents."""
+        """Return the tangent (n,) of the stress impulses dt p; ``around`` and ``at`` come with their tangents."""
         reach = self._reach.total(context, ALL_WALLS, *around)
         reach_dot = self._reach.tangent(context, dot, ALL_WALLS, *around)
         mirrors = self._mirrors.total(context, CONTAINER, *around)
@@ -69,7 +69,7 @@ class MeanStress:
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
-        """From ``q_bar`` in ``at`` add to ``k_bar`` there, to the adjoints of particles, and to those of ``around``."""
+        """Add to the adjoints of k, of particles and of ``around`` from that of the stress, ``q_bar`` in ``at``."""
         own, pairs = self._kernels.adjoint
         reach, reach_bar = self._reach.total(context, ALL_WALLS, *around), self._arrays["reach_bar"]
         mirrors = self._mirrors.total(context, CONTAINER, *around)
@@ -80,7 +80,7 @@ class MeanStress:
 
 
 def spread_term(d: Discretisation) -> Any:
-    """The term -1/2 x_ij . (T_i + T_j) g_ij of a pair."""
+    """Return the pair's term -1/2 x_ij . (T_i + T_j) g_ij of the mean stress."""
     real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
     six, times = symmetric(d.precision).kind, symmetric(d.precision).times
 
@@ -92,7 +92,7 @@ def spread_term(d: Discretisation) -> Any:
 
 @cache
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of dt p, given r as the first component of the sum of the arrays ``reach`` and ``mirrors``."""
+    """Make the kernels of dt p, given r as the first component of the sum of the arrays ``reach`` and ``mirrors``."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
@@ -156,7 +156,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @particle_kernel(adjoint_module, "q_bar +k_bar reach_bar")
     def own_adjoint(k_i: real, reach_i: vector, mirrors_i: vector, q_bar_i: real) -> tuple[real, real, vector]:
-        """The adjoint of the sum over neighbours takes the place of that of q."""
+        """Replace the adjoint of q by that of the sum over neighbours, and add to those of k and r."""
         bar = per * q_bar_i
         return bar, -bar * (reach_i[0] + mirrors_i[0]), vector(-bar * k_i, real(0.0), real(0.0))
 
@@ -166,7 +166,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def mean_stress_adjoint(
         x_part: vector, T_part: six, x_lift: vector, lifted: real, k_i: real, L_i: matrix, image_i: real
     ) -> tuple[vector, real, real, matrix]:
-        """T is k L."""
+        """Add to the adjoints of x, image shares, k and L; T is k L."""
         diagonal, others = vector(T_part[0], T_part[1], T_part[2]), vector(T_part[3], T_part[4], T_part[5])
         k_part = wp.dot(T_part, pack(L_i)) + image_i * lifted
         return x_part + x_lift, k_i * lifted, k_part, k_i * whole(diagonal, real(0.5) * others)
@@ -175,7 +175,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 def reach_term(discretisation: Discretisation) -> WallTerm:
-    """(r, 0, 0) of the walls of a solid, with the adjoint ``reach_bar``."""
+    """Return the wall term (r, 0, 0) of the mean stress by a solid's walls, with the adjoint ``reach_bar``."""
     return WallTerm(discretisation, TOPIC, _reach_work, "reach_bar")
 
 
@@ -193,7 +193,7 @@ def _reach_work(d: Discretisation) -> Any:
 
 
 def mirror_term(discretisation: Discretisation) -> WallTerm:
-    """(-h r, 0, 0) of walls that mirror, which count 1 - h times, with the same adjoint."""
+    """Return the wall term (-h r, 0, 0) by which mirroring walls count 1 - h times, with the adjoint ``reach_bar``."""
     return WallTerm(discretisation, TOPIC, _mirror_work, "reach_bar")
 
 
@@ -210,7 +210,7 @@ def _mirror_work(d: Discretisation) -> Any:
 
 @cache
 def pressed_adjoint_kernel(precision: Precision) -> Any:
-    """From the adjoint of a pressure to those of its impulse and of dt."""
+    """Make the kernel that turns the adjoint of a pressure k / dt into those of its impulse k and of dt."""
     real = precision.real
 
     @particle_kernel(integration_module(precision, False), "+impulse_bar +time_step_bar")

@@ -41,25 +41,25 @@ from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type
 
 RATE = 20.0
-"""How fast particles are shifted."""
+"""Factor of dt |grad v| in the rate r of the shift."""
 GREATEST = 0.5
-"""Of 20 dt |grad v|, softly: beyond it a shift goes too far, and its derivatives grow from step to step."""
+"""The greatest 20 dt |grad v|, softly: beyond it a shift goes too far, and its derivatives grow from step to step."""
 FARTHEST = 0.1
-"""In spacings: how far a particle is shifted in a step, at most."""
+"""In spacings: the greatest shift of a particle in a step."""
 SURFACE = 0.03
 """|g| s below which the direction of a surface is not known."""
 AWAY = 4.0
-"""How much faster pairs that are near are moved apart."""
+"""Factor by which pairs that are near are moved apart faster than others are shifted."""
 LEAST = 1e-5
-"""e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
+"""The softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
 PULLED = 60.0
-"""How fast particles are shifted where the pressure pulls."""
+"""Factor of the rate of the shift where the pressure pulls."""
 WEAK = 0.004
-"""Of c, below which a pull counts with its square."""
+"""The c below which a pull counts with its square."""
 
 
 def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
-    """delta of A = sum_j v_ij g_ij^T, k = dt p, and what surrounds a particle; ``beside`` is gamma."""
+    """Make the function of the shift delta by A = sum_j v_ij g_ij^T, k = dt p and surroundings; ``beside`` is gamma."""
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     inverse = effect_functions(precision, dimension, module).inverse
     rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
@@ -97,14 +97,14 @@ def shift_of_particle(precision: Precision, dimension: int, module: Any) -> Call
 
 @cache
 def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """The kernels of the shift delta, which spreads particles evenly."""
+    """Make the kernels of the shift delta, which spreads particles evenly."""
     make = partial(shift_of_particle, d.precision, dimension)
     modules = d.modules(f"projection_{dimension}d")
     return pointwise_kernels(d.precision, modules, make, ["delta"], numbers=["spacing"])
 
 
 def followed_velocity(precision: Precision, dimension: int, module: Any) -> Callable[..., Any]:
-    """v' of velocities that follow."""
+    """Make the function of the velocity v' that follows the shift and the repairs of a particle."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     inverse = effect_functions(precision, dimension, module).inverse
 
@@ -117,15 +117,14 @@ def followed_velocity(precision: Precision, dimension: int, module: Any) -> Call
 
 @cache
 def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """The kernels of v'; its adjoint is where that of v is written."""
+    """Make the kernels of velocities v' that follow; the adjoint of v' is stored where that of v is written."""
     make, modules = partial(followed_velocity, d.precision, dimension), d.modules(f"projection_following_{dimension}d")
     return pointwise_kernels(d.precision, modules, make, ["v_end"], {"v_end": "v_new"})
 
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """The kernels of the positions before the first repair; that of the adjoint leaves the adjoint of delta, which is
-    that of these positions."""
+    """Make the kernels of the positions before the first repair; the adjoint of these is that of delta too."""
     real, vector, derivatives = precision.real, precision.vector, integration_module(precision, False)
 
     @particle_kernel(integration_module(precision, True), "x_moved x_now c")

@@ -53,24 +53,24 @@ from cortado.sph.moment_functions import matrix_type, symmetric
 
 @dataclass(frozen=True)
 class ClampFunctions:
-    """Warp functions of one particle."""
+    """Warp functions of one particle for the clamp of its pressure."""
 
     wanted: Any
-    """b of n, f and dt."""
+    """The wanted divergence b of n, f and dt."""
     wanted_tangent: Any
-    """Its tangent, given each of them with its own."""
+    """The tangent of b, given n, f, dt and their tangents."""
     parts: Any
-    """The parts of two slopes that k' has."""
+    """The parts of the slopes of z+ and sigma z- that k' has."""
 
 
 @cache
 def clamp_functions(precision: Precision) -> ClampFunctions:
-    """In a precision."""
+    """Make the Warp functions of the pressure's clamp, in a precision."""
     real = precision.real
 
     @wp.func
     def wanted(n: real, full: real, dt: real) -> real:
-        """b"""
+        """Return b = (1 - f) max(1 - n, 0) / dt, the divergence with which scattered fluid comes together."""
         return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
 
     @wp.func
@@ -82,9 +82,9 @@ def clamp_functions(precision: Precision) -> ClampFunctions:
 
     @wp.func
     def parts(up: real, down: real):
-        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or at a corner the mean of both
-        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that
-        there is no corner but in this formula."""
+        """Return the parts of the slopes of z+ and of sigma z- that k' has: all of one, or at a corner the mean of both
+        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere. Inside sigma is 1, and there is no
+        true corner."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)
@@ -105,15 +105,14 @@ class PressureKernels:
     """The kernels of one iteration of the projection's pressure."""
 
     update: Kernels
-    """k' and y'; its adjoint are three kernels, that of the clamp, and that of D without and with an adjoint of A from
-    elsewhere."""
+    """k' and y'; their adjoint is three kernels: of the clamp, and of D without and with another adjoint of A."""
     whole_adjoint: wp.Kernel
-    """Adds to the adjoint of A what that of D gives it."""
+    """Adds to the adjoint of A the part by that of D."""
 
 
 @cache
 def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of one pressure iteration, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -153,8 +152,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         T: wp.array(dtype=six),
         error: wp.array(dtype=pair_of),
     ):
-        """``error``: the square of the divergence that is not wanted times the time step, weighted with c, which is 1
-        inside and beside walls and 0 at free surfaces, and c. A and the divergence are written to ``at``; T is y' L."""
+        """Take a pressure iteration. ``error``: the square of the unwanted divergence times the time step, weighted
+        with c, and c, which is 1 inside and beside walls and 0 at free surfaces. A and the divergence are written to
+        ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
         widened = spread(i, x, at.u, s)
@@ -242,7 +242,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         d_bar: wp.array(dtype=real),
         S: wp.array(dtype=six),
     ):
-        """S is d_bar L."""
+        """Apply the adjoint of the clamp, from those of k' and y' to d_bar of the divergence and S = d_bar L."""
         i = wp.tid()
         dt = time_step[i // particles]
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
@@ -272,7 +272,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         return d_bar_i * L_i
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
-        """From that of D, and of A where it is a whole matrix S, to that of u."""
+        """Make the kernel from the adjoint of D, and of A for a whole matrix S, to that of u."""
 
         def divergence_adjoint(
             s: neighbourhood,
@@ -317,12 +317,12 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
 
 TOWARDS = 0.1
 """In spacings: how far the kick of the step before may take a particle towards a wall in a step. In dams, jets, a beach
-and a fountain it took none further than that, but those that wait in a nozzle."""
+and a fountain it took none further than that, but particles that wait in a nozzle."""
 
 
 @cache
 def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of the first pressure and velocity of a step, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, weights4 = precision.real, precision.vector, weights_type(precision)
     topic = f"projection_{dimension}d"
@@ -331,7 +331,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
 
     @wp.func
     def taken(kick: vector, gamma: vector, dt: real, spacing: real) -> real:
-        """1, or 0 where nothing is."""
+        """Return 1 for a particle that takes on the pressure of the step before, 0 for one kicked towards a wall."""
         if wp.dot(kick, gamma) > real(0.0) and dt * wp.length(kick) > towards * spacing:
             return real(0.0)
         return real(1.0)
@@ -354,7 +354,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         u: wp.array(dtype=vector),
         warm: wp.array(dtype=int),
     ):
-        """``warm`` is 0 for each scene before."""
+        """Write k, y and u of the first iterate of a step; ``warm`` is 0 for each scene before."""
         i = wp.tid()
         if surfaced[i // particles] == 0:
             weights[i][0] = real(1.0)
@@ -401,7 +401,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         y_bar_i: real,
         u_bar_i: vector,
     ) -> tuple[weights4, vector, real, vector]:
-        """``v_bar`` is the adjoint of v*."""
+        """Apply the adjoint of the first iterate of a step; ``v_bar`` is the adjoint of v*."""
         part = taken(kick_before_i, beside_i, time_step, spacing)
         both, full, no = k_bar_i + y_bar_i, part * weights_i[1], real(0.0)
         full_bar = part * (k_before_i * both + wp.dot(kick_before_i, u_bar_i))

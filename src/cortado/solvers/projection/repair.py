@@ -40,14 +40,14 @@ class RepairKernels:
     """The kernels of one repair of the density."""
 
     measure: Kernels
-    """lambda' from n(x_k)."""
+    """The multiplier lambda' from the density n(x_k)."""
     move: Kernels
-    """x_k+1 from lambda'."""
+    """The positions x_k+1 from lambda'."""
 
 
 @cache
 def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of one repair of the density, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
@@ -73,7 +73,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
 
     @wp.func
     def along(change: vector, back: vector, held: real) -> vector:
-        """The change of ``held`` times ``back`` with that of ``back``, and its transpose. Held back, it only turns."""
+        """Return the derivative of ``held`` times ``back`` along a ``change`` of ``back``, which is symmetric."""
         if held < real(1.0):
             return held * (change - (wp.dot(back, change) / wp.dot(back, back)) * back)
         return change
@@ -90,7 +90,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         excess: wp.array(dtype=real),
         error: wp.array(dtype=pair_of),
     ):
-        """``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for a sum and a maximum)."""
+        """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for
+        a sum and a maximum)."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], s), s)
@@ -162,7 +163,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def move(
         pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
     ) -> tuple[real, vector]:
-        """``held`` is the part of its way that a particle goes."""
+        """Move a particle by lambda'; ``held`` is the part of the way d that it goes."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
@@ -194,7 +195,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def begin_adjoint(
         m_i: real, x_now_i: vector, x_moved_i: vector, held_i: real, x_now_bar_i: vector
     ) -> tuple[real, vector, vector]:
-        """Of a particle's own part in x_k+1; f is the adjoint of the sum."""
+        """Apply the adjoint of a particle's own part in x_k+1; f is the adjoint of the sum over neighbours."""
         back = (x_moved_i - x_now_i) / held_i
         bar = along(x_now_bar_i, back, held_i)
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
@@ -215,7 +216,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         # out
         n_now_bar: wp.array(dtype=real),
     ):
-        """Of the sum, and of lambda' by n."""
+        """Apply the adjoint of the sum over neighbours in x_k+1, and of lambda' with respect to n."""
         i = s.first + wp.tid() // LANES
         by_c, x_part = push_back(i, x, c_out, f, s)
         widened, x_lift = lift_back(i, x, c_out, of.image, f, s)

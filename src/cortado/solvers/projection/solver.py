@@ -17,7 +17,7 @@ from cortado.solvers.solver import ResumingAdjoint, Solver, StepAdjoint, StepTan
 
 
 class Projection(ProjectionSteps):
-    """Incompressible SPH by a projection that pushes and pulls; see `Solver`."""
+    """The solver by a projection that pushes and pulls incompressible SPH fluid, with derivatives; see `Solver`."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return ProjectionTangent(self, parameters_dot)
@@ -32,7 +32,7 @@ class Projection(ProjectionSteps):
 
 
 class ProjectionMaker:
-    """Makes the solver as the table [solver] of a scene says."""
+    """A maker of the projection solver that the table [solver] of a scene describes."""
 
     batches = True
 
@@ -40,8 +40,8 @@ class ProjectionMaker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """The solver of a scene that is cut into particles, on a device. Without pressure nothing is projected, and all
-        solvers take the same step."""
+        """Make the projection solver of a scene that is cut into particles, on a device. Without pressure nothing is
+        projected, and all solvers take the same step."""
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
@@ -59,7 +59,7 @@ maker = ProjectionMaker
 
 
 def pressure_limits(table: ProjectionSolver) -> LoopLimits:
-    """When the pressure loop may stop."""
+    """Return the bounds on iterations and errors at which the projection's pressure loop stops."""
     if table.tolerance is None:
         return LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
     return LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)

@@ -45,7 +45,7 @@ them: two of them do up to 1.6 times the stiffest wave of the lattice."""
 
 @dataclass(frozen=True)
 class ProjectionKernels:
-    """The kernels that only the projection needs."""
+    """The kernels that only the projection needs, by topic."""
 
     beginning: Any
     velocity: VelocityKernels
@@ -56,7 +56,7 @@ class ProjectionKernels:
 
     @classmethod
     def of(cls, discretisation: Discretisation, dimension: int) -> "ProjectionKernels":
-        """In 2 or 3 dimensions."""
+        """Make all kernels of the projection, in 2 or 3 dimensions."""
         own = discretisation, dimension
         return cls(
             beginning_kernels(*own),
@@ -69,7 +69,7 @@ class ProjectionKernels:
 
 
 class ProjectionSteps(ParticleSolver):
-    """The steps of one set of particles, forward."""
+    """The forward steps of the projection for one set of particles."""
 
     topic = "projection"
     density: Surroundings
@@ -86,9 +86,9 @@ class ProjectionSteps(ParticleSolver):
         grid: Grid,
         endless: bool,
     ):
-        """Of iterations of the pressure within ``limits`` and so many repairs of density in every step; velocities
+        """Prepare steps with pressure iterations within ``limits`` and ``repairs`` repairs of density each; velocities
         ``follow`` the shift and the repairs, or stay as they are. A coarse ``grid`` corrects the pressure between
-        iterations, and in a cold scene before the first one; none in an ``endless`` scene."""
+        iterations, in a cold scene before the first one too, and never in an ``endless`` scene."""
         self.constants = constants
         super().__init__(system)
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
@@ -125,7 +125,7 @@ class ProjectionSteps(ParticleSolver):
 
     @property
     def around(self) -> dict[str, wp.array]:
-        """What surrounds particles, see `cortado.solvers.projection.surroundings`."""
+        """Return the surroundings of particles, by name; see `cortado.solvers.projection.surroundings`."""
         return self.density.around
 
     def wall_push(self) -> ProjectionPush:
@@ -133,12 +133,12 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def relaxed(self) -> dict[str, float]:
-        """Constants of the iterations, as kernels call them."""
+        """Return the relaxation omega of the pressure iterations by the name that kernels have for it."""
         return {"omega": self.constants.relaxation}
 
     @cached_property
     def spaced(self) -> dict[str, float]:
-        """Constants with the spacing, as kernels call them."""
+        """Return the surroundings' constants and the spacing by the names that kernels have for them."""
         return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
@@ -190,17 +190,17 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def mean_stress(self) -> MeanStress:
-        """Made when stresses are asked for."""
+        """Make the kernels and arrays of mean stresses when stresses are first asked for."""
         return MeanStress(self.discretisation, self.layout, self.system.walled.dimension)
 
     @property
     def parameters(self) -> Parameters:
-        """Those of the last step."""
+        """Return the parameters of the last step."""
         assert self._context is not None
         return self._context.parameters
 
     def begin(self, state: State, parameters: Parameters) -> StepContext:
-        """Everything but the pressure, and the first one."""
+        """Do all of a step before the pressure iterations, and write the first iterate."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
         if self.bodies is not None:
             self.bodies.begin(context, self.around)
@@ -214,7 +214,7 @@ class ProjectionSteps(ParticleSolver):
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Iteration k, from the iterates of one slot to those of another."""
+        """Take pressure iteration k, from the iterates of slot ``before`` to those of slot ``after``."""
         old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
 
         def correct() -> None:
@@ -231,26 +231,26 @@ class ProjectionSteps(ParticleSolver):
         self.press(context, new)
 
     def momentum(self, k: int) -> float:
-        """beta of iteration k."""
+        """Return the extrapolation factor beta of iteration k."""
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
-        """That of walls, where bodies move as the y of an iterate pushes them."""
+        """Return the drift of walls, where free bodies move as the y of an iterate pushes them."""
         drift = self.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
-        """The velocities that the y of an iterate leaves, with its pull."""
+        """Write the velocities that the y of an iterate leaves, with its pull y L."""
         own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
         context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
 
     def settle(self, context: StepContext, last: int) -> None:
-        """The new velocities of bodies, by the k of a slot."""
+        """Write the new velocities of free bodies by the k of a slot."""
         if self.bodies is not None:
             self.bodies.settle(context, self.iterates[last]["y"])
 
     def move(self, context: StepContext, last: int) -> None:
-        """The positions that the new velocities and the shift lead to, by the k of a slot."""
+        """Write the positions to which the new velocities and the shift lead, by the k of a slot."""
         kernels, first = self.kernels, self.repaired[0]
         flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
         context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
@@ -258,11 +258,11 @@ class ProjectionSteps(ParticleSolver):
         context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
 
     def last_gradient(self, slot: int) -> wp.array:
-        """A of the last iteration, whose result is in a slot."""
+        """Return A, the velocity gradient sums of the last iteration, whose result is in a slot."""
         return self.corrected[max(slot - 1, 0)]["A"]
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Repair k, from the positions of one slot to those of another."""
+        """Repair densities the k-th time, from the positions of slot ``before`` to those of slot ``after``."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
         relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}

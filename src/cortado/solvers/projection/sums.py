@@ -16,8 +16,8 @@ from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
 CROWDED = 0.25
-"""R: how much more pairs count in a shift that are close (Monaghan 2000), boundedly: unbounded, the derivative of the
-shift is so steep among clumped particles that gradients of a splash grow by ten orders more."""
+"""R: how much more close pairs count in a shift (Monaghan 2000), boundedly: unbounded, the derivative of the shift is
+so steep among clumped particles that gradients of a splash grow by ten orders more."""
 APART = 0.65
 """In spacings: how near pairs are that a shift moves apart. With 0.7 and 0.6 particles of a dam break 25 deep come as
 seldom to half a spacing; energy rises more with 0.7, 0.03 in place of 0.02 % in a dam 12 deep, and with 0.8."""
@@ -30,7 +30,8 @@ equals."""
 
 @dataclass(frozen=True)
 class ProjectionSums:
-    """Warp functions. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
+    """Warp functions of the projection's sums over neighbours; a symmetric matrix comes as its diagonal and its entries
+    yz, xz and xy."""
 
     moments: Any
     """M = -sum g_ij x_ij^T, Q = sum h_ij g_ij g_ij^T / m_j, g = sum g_ij, the crowding sum (1 + R q / (1 + q / 4))
@@ -39,29 +40,29 @@ class ProjectionSums:
     ``per_apart``; and sum V W_ij, to which what fills lists up adds."""
     moments_tangent: Any
     moments_back: Any
-    """What adjoints of the moments, and ``n_bar`` of the last one, give to x and m."""
+    """The adjoints of x and m by those of the moments, with ``n_bar`` of the last one."""
     force: Any
     """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
     force_tangent: Any
     force_back: Any
-    """For adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and what x is given."""
+    """From adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and the adjoint of x."""
     velocity_gradient: Any
     """The rows of A = sum v_ij g_ij^T, which lacks M^-1 to be the gradient."""
     velocity_gradient_tangent: Any
     velocity_gradient_back: Any
-    """For an adjoint of A, what v is given but for A_bar_i g_i, and what x is."""
+    """From an adjoint of A: the adjoint of v without A_bar_i g_i, and that of x."""
     divergence_back: Any
-    """The same where that adjoint is symmetric, S = d L for an adjoint d of the divergence L : A."""
+    """The adjoints of v and x where that of A is symmetric, S = d L for an adjoint d of the divergence L : A."""
     push: Any
     """sum (c_i + c_j) g_ij"""
     push_tangent: Any
     push_back: Any
-    """For adjoints f of the push: sum g_ij . f_ij, and what x is given."""
+    """From adjoints f of the push: sum g_ij . f_ij, and the adjoint of x."""
 
 
 @cache
 def projection_sums(discretisation: Discretisation) -> ProjectionSums:
-    """The sums over neighbours of the projection, for a discretisation."""
+    """Make the sums over neighbours of the projection, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -73,24 +74,24 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Entries yz, xz and xy of (a b^T + b a^T) / 2."""
+        """Return the entries yz, xz and xy of the symmetric matrix (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     @wp.func
     def mobility(m_i: real, m_j: real) -> real:
-        """h_ij / m_j"""
+        """Return h_ij / m_j, the weight of a pair in the diagonal, greater for a lighter neighbour."""
         r = (m_i - m_j) * reciprocal(m_i + m_j)
         return (real(1.0) + unequal * r * r) * reciprocal(m_j)
 
     @wp.func
     def slope_of_h(m_i: real, m_j: real) -> real:
-        """The derivative of h_ij by m_i."""
+        """Return the derivative of the weight h_ij with respect to the mass m_i."""
         per_both = reciprocal(m_i + m_j)
         return real(4.0) * unequal * (m_i - m_j) * m_j * per_both * per_both * per_both
 
     @wp.func
     def closeness(near: real) -> real:
-        """1 + R q / (1 + q / 4) with q = near^4."""
+        """Return the weight 1 + R q / (1 + q / 4), q = near^4, by which close pairs count more in a shift."""
         q = near * near * near * near
         return real(1.0) + crowded * q * reciprocal(real(1.0) + real(0.25) * q)
 
@@ -102,12 +103,12 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @wp.func
     def nearness(x_ij: vector, per_apart: real) -> real:
-        """1 - |x_ij|^2 / (0.65 s)^2, at least 0."""
+        """Return 1 - |x_ij|^2 / (0.65 s)^2, at least 0, with 1 / (0.65 s)^2 as ``per_apart``."""
         return wp.max(real(1.0) - per_apart * wp.dot(x_ij, x_ij), real(0.0))
 
     @wp.func
     def parted(x_ij: vector, change: vector, per_apart: real) -> vector:
-        """The derivative of p_ij along a change of x_ij, a symmetric matrix times it."""
+        """Return the derivative of the pair's push apart p_ij along a change of x_ij."""
         w = nearness(x_ij, per_apart)
         return w * (w * change - (real(4.0) * per_apart * wp.dot(x_ij, change)) * x_ij)
 

@@ -24,7 +24,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Names and types of what is kept of a particle's surroundings."""
+    """Return names and types of the entries of a particle's surroundings."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
@@ -34,14 +34,14 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def bar_entries(precision: Precision) -> dict[str, Any]:
-    """The same for adjoints, which add up for all but Q: nothing but a depends on it."""
+    """Return names and types of the adjoints of surroundings that add up: all but Q, on which only a depends."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of n and the moments of neighbours, and of L, a and the weights that follow from them. Those of the
-    adjoint hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
+    """Make the kernels of n and the moments of neighbours, and of L, a and the weights that follow. The adjoint's two
+    kernels hand on the adjoints of M and Q as six numbers each, M_pull and Q_pull."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -84,7 +84,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of: around,
         surfaced: wp.array(dtype=int),
     ):
-        """``surfaced`` is 0 for each scene before."""
+        """Write a particle's surroundings; ``surfaced`` is 0 for each scene before."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
@@ -140,7 +140,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         n_dot: wp.array(dtype=real),
         dot: around,
     ):
-        """Put together of the gradients of each entry."""
+        """Write the tangent of surroundings, put together from the gradients of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot, crowd_dot, apart_dot, near_dot = moments_tangent(
             i, x, x_dot, m, m_dot, per_nearest, per_apart, s
@@ -216,7 +216,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         M_pull: wp.array(dtype=six),
         Q_pull: wp.array(dtype=six),
     ):
-        """Of what follows from the moments: adds to the adjoints of them."""
+        """Add to the adjoints of the moments from those of L, a, the weights and all else that follows."""
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
             of.M[i],
@@ -284,7 +284,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 class Surroundings(Density):
-    """Writes n and all of ``around``."""
+    """The measurement of the number density n and of all surroundings that the projection needs."""
 
     def __init__(
         self, discretisation: Discretisation, layout: Layout, topic: str, dimension: int, constants: ProjectionConstants
@@ -310,7 +310,7 @@ class Surroundings(Density):
 
 
 class SurroundingsTangent(DensityTangent):
-    """Forward mode."""
+    """The tangent of the measured surroundings, for forward mode."""
 
     _density: Surroundings
 
@@ -324,7 +324,7 @@ class SurroundingsTangent(DensityTangent):
 
 
 class SurroundingsAdjoint(DensityAdjoint):
-    """Reverse mode."""
+    """The adjoint of the measured surroundings, for reverse mode."""
 
     _density: Surroundings
 
@@ -340,7 +340,7 @@ class SurroundingsAdjoint(DensityAdjoint):
             array.zero_()
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
-        """From the adjoints of n and of all around to those of positions, masses and solids."""
+        """Turn the adjoints of n and of all surroundings into those of positions, masses and solids."""
         own, known = self._density, (*bar.named, self.around, self._density.around)
         for kernel in own.kernels.adjoint:
             context.launch(kernel, *known, self._moments, own.constants)

@@ -22,18 +22,18 @@ class VelocityKernels:
     """The kernels of the velocity that pressures leave."""
 
     velocity: Kernels
-    """Its adjoint goes on from the f of all particles."""
+    """The velocity; its adjoint starts from the f of all particles."""
     pull_tangent: wp.Kernel
     """Comes before the tangent of the velocity."""
     own_adjoint: wp.Kernel
-    """Comes before the adjoint of the velocity: from the adjoints of u and of the kick to that of v* and to f."""
+    """Comes before the adjoint of the velocity: from the adjoints of u and of the kick to those of v* and f."""
     time_adjoint: wp.Kernel
-    """What v* = v + dt a gives to the adjoint of dt."""
+    """The part of v* = v + dt a in the adjoint of dt."""
 
 
 @cache
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of the velocity that pressures leave, in 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
@@ -52,13 +52,13 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         gamma_i: vector,
         v_star_i: vector,
     ) -> tuple[vector, vector]:
-        """The velocity u = v* + kick that the pressure y leaves, with the kick -D^T y / m; T is y L."""
+        """Return the kick -D^T y / m by the pressure y, and the velocity u = v* + kick; T is y L."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
 
     @particle_kernel(tangent_module, "T T_dot")
     def pull_tangent(y_i: real, y_dot_i: real, L_i: matrix, L_dot_i: matrix) -> tuple[six, six]:
-        """T = y L, and its tangent."""
+        """Return the pull T = y L of a pressure, and its tangent."""
         return y_i * pack(L_i), y_dot_i * pack(L_i) + y_i * pack(L_dot_i)
 
     both = [over(sums.force_tangent, "total"), over(mirrors.lift_tangent, "lifted")]
@@ -101,7 +101,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         image_i: real,
         f_i: vector,
     ) -> tuple[real, real, matrix, vector, vector]:
-        """From f of all particles; T is y L."""
+        """Add to the adjoints of y, L, gamma and x by the f of all particles; T is y L."""
         A = whole(diagonal, others)
         y_part = wp.ddot(L_i, A) + wp.dot(gamma_i, f_i) + image_i * widened
         return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift
@@ -110,7 +110,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     def own_adjoint(
         m_i: real, v_star_i: vector, y_i: real, L_i: matrix, u_i: vector, u_bar_i: vector, kick_bar_i: vector
     ) -> tuple[vector, real, six, vector, vector]:
-        """f = -(u_bar + kick_bar) / m, and T is y L. The adjoint of the kick is 0 afterwards."""
+        """Write f = -(u_bar + kick_bar) / m and T = y L; the adjoint of the kick is 0 afterwards."""
         bar = u_bar_i + kick_bar_i
         return u_bar_i, wp.dot(bar, v_star_i - u_i) / m_i, y_i * pack(L_i), -bar / m_i, vector()
 
@@ -125,7 +125,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
 
 @cache
 def velocity_gradient_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """In 2 or 3 dimensions; that of the adjoint needs g, the sum of g_ij."""
+    """Make the kernels of A = sum v_ij g_ij^T in 2 or 3 dimensions; the adjoint needs g, the sum of g_ij."""
     precision, modules = discretisation.precision, discretisation.modules(f"projection_{dimension}d")
     vector, matrix, sums = precision.vector, matrix_type(precision), projection_sums(discretisation)
 

@@ -46,28 +46,28 @@ DIRECTION = 0.01
 
 @dataclass(frozen=True)
 class BesideSums:
-    """Warp functions."""
+    """Warp functions of the sums over wall particles beside a fluid particle."""
 
     sums: Any
     """normal, whole, nu and the drifts."""
     tangent: Any
     back: Any
-    """What their adjoints give to x."""
+    """The adjoint of x by those of the sums."""
 
 
 @dataclass(frozen=True)
 class EdgeFunctions:
-    """Warp functions of one particle."""
+    """Warp functions of one particle that tell how much it is beside the edge of a wall."""
 
     edge: Any
     """e of normal, whole and 0.05 a_0."""
     back: Any
-    """The adjoints of normal and whole for that of e."""
+    """From the adjoint of e to those of normal and whole."""
 
 
 @cache
 def edge_functions(precision: Precision, dimension: int, module: Any) -> EdgeFunctions:
-    """In 2 or 3 dimensions, in a Warp module."""
+    """Make the functions of the edge factor e in 2 or 3 dimensions, in a Warp module."""
     real, vector, smoothstep = precision.real, precision.vector, moment_functions(precision, dimension).smoothstep
     e_0, e_1, direction = (wp.constant(real(value)) for value in (*EDGED, DIRECTION))
 
@@ -86,7 +86,7 @@ def edge_functions(precision: Precision, dimension: int, module: Any) -> EdgeFun
 
 @cache
 def normal_part(discretisation: Discretisation) -> Any:
-    """The Warp function of a vector, along the normal of a wall at the ``foot`` of a particle of it."""
+    """Make the Warp function that projects a vector on the normal of a wall at the ``foot`` of a wall particle."""
     vector = discretisation.precision.vector
 
     @wp.func
@@ -98,7 +98,7 @@ def normal_part(discretisation: Discretisation) -> Any:
 
 @cache
 def beside_sums(discretisation: Discretisation) -> BesideSums:
-    """The sums over wall particles of the projection, for a discretisation."""
+    """Make the projection's sums over wall particles, for a discretisation."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -120,7 +120,8 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
         turn_dot: vector,
         s: neighbourhood,
     ) -> tuple[vector, vector, real, real, real]:
-        """A wall that turns turns its push; the rest of the way changes it as it does beside one that does not."""
+        """Return the tangent of a wall particle's terms. A wall that turns turns its push; the rest of its way changes
+        the push as beside a wall that does not turn."""
         rest = x_dot_ij - wp.cross(turn_dot, x_ij)
         whole, bent = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, rest, s)
         part = normal(whole, foot)
@@ -147,13 +148,13 @@ def beside_sums(discretisation: Discretisation) -> BesideSums:
 
 
 def beside_solid_kernel(discretisation: Discretisation) -> Any:
-    """The kernel of what they give to solids (`cortado.particles.wall_terms.SolidShares.add`), for the adjoints of
-    the sums."""
+    """Make the kernel that adds the adjoints of the sums over walls to those of solids
+    (`cortado.particles.wall_terms.SolidShares.add`)."""
     return solid_kernel(discretisation, "projection", _work)
 
 
 def normal_term(discretisation: Discretisation) -> WallTerm:
-    """normal / V of the walls of a solid, with the adjoint ``push_bar``."""
+    """Return the wall term normal / V of a solid, with the adjoint ``push_bar``."""
     return WallTerm(discretisation, "projection", _normal_work, "push_bar")
 
 
@@ -191,7 +192,7 @@ def _work(d: Discretisation) -> Any:
 
 @dataclass(frozen=True)
 class _Sums:
-    """The sums of one solid and of all walls, (n, 3)."""
+    """The sums over the walls of one solid and over all walls, arrays (n, 3)."""
 
     normal: NDArray
     whole: NDArray
@@ -200,10 +201,10 @@ class _Sums:
 
 
 class ProjectionPush:
-    """A `cortado.sph.walls.WallAction`."""
+    """The sums along which pressures of the projection push walls: a `cortado.sph.walls.WallAction`."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, constants: ProjectionConstants, volume: float):
-        """``volume`` V of a particle at rest [m^d]."""
+        """Prepare sums for particles with a volume V at rest, ``volume`` [m^d]."""
         self._layout = layout
         self._normal, self._whole = (WallSums(term(discretisation), layout) for term in (normal_term, wall_slope_term))
         self._least = DIRECTION * constants.least_diagonal / volume**2
@@ -219,7 +220,7 @@ class ProjectionPush:
         return self._on_device(change.normal + e * (change.whole - change.normal) + e_dot * off)
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """v* gets nothing."""
+        """Add to the adjoints of positions and solids by that of the total; the adjoint of v* gets nothing."""
         at, own = self._sums(step, solid), np.asarray(total_bar.numpy(), dtype=np.float64)
         e, by_normal, by_whole = self._edge(at)
         e_bar = (own * (at.whole - at.normal)).sum(axis=1, keepdims=True)
@@ -228,7 +229,7 @@ class ProjectionPush:
             sums.adjoint(step, bar, ALL_WALLS, self._on_device(e_bar * slope), v_star_bar)
 
     def _sums(self, step: StepContext, solid: int, dot: Tangents | None = None) -> _Sums:
-        """Or their tangents along ``dot``."""
+        """Read the sums over the walls of a solid and over all walls, or their tangents along ``dot``."""
 
         def found(sums: WallSums, over: int) -> NDArray:
             array = sums.total(step, over) if dot is None else sums.tangent(step, dot, over)
@@ -237,7 +238,7 @@ class ProjectionPush:
         return _Sums(*(found(sums, over) for over in (solid, ALL_WALLS) for sums in (self._normal, self._whole)))
 
     def _edge(self, at: _Sums) -> tuple[NDArray, NDArray, NDArray]:
-        """e (n, 1), and its gradients (n, 3) with respect to normal and whole of all walls."""
+        """Return the edge factor e (n, 1) and its gradients (n, 3) with respect to normal and whole of all walls."""
         normal, whole = at.all_normal, at.all_whole
         square = (whole**2).sum(axis=1, keepdims=True)
         below = square + self._least
