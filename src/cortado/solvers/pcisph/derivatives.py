@@ -32,7 +32,7 @@ class PcisphAdjoint(ParticleAdjoint):
         """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
         to ``bar``."""
         self._begin(counts, state_bar, parameters)
-        self._finish(counts, state_bar, parameters)
+        self._go_back(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         """Write the adjoint of a replayed step's state, for adjoints ``within`` the step (`PressureAdjoint`)."""
@@ -41,7 +41,7 @@ class PcisphAdjoint(ParticleAdjoint):
         add(within.p, self._p_bar)
         if within.stress is not None:
             add(within.stress, self._p_bar)
-        self._finish(counts, state_bar, parameters, within)
+        self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Go back from the adjoint of a step's result to that of the last prediction."""
@@ -60,10 +60,11 @@ class PcisphAdjoint(ParticleAdjoint):
             p_bar=self._p_bar,
         )
 
-    def _finish(
+    def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Go back from the adjoint of the last prediction to that of the state before the step."""
+        """Go back from the adjoint of the last prediction to that of the state, through the step in reverse: the
+        iterations, prediction with all forces, relaxation of the pressure, sorting."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named

@@ -142,7 +142,8 @@ class PcisphSteps(ParticleSolver):
         return None if self.limits is None else self.iterates.p[1].numpy()
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure: sort, relax and make the first prediction."""
+        """Do all of a step before the pressure iterations: sort and measure the density (`sort`), write the relaxation
+        y, add up the explicit forces, gravity among them, and predict v* = v + dt a, x* = x + dt v*."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             self._relax(context)

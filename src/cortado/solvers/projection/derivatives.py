@@ -159,7 +159,7 @@ class ProjectionAdjoint(ParticleAdjoint):
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""
         self._begin(state_bar, parameters)
-        self._finish(counts, state_bar, parameters)
+        self._go_back(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         """Write the adjoint of a replayed step's state, for adjoints ``within`` it (`PressureAdjoint`)."""
@@ -174,7 +174,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             q = solver.mean_stress.impulses(context, solver.around, at)
             context.launch(pressed, *known, impulse=q, p_bar=within.stress, impulse_bar=at["q_bar"])
             solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), at)
-        self._finish(counts, state_bar, parameters, within)
+        self._go_back(counts, state_bar, parameters, within)
 
     def _last(self, counts: Counts) -> dict[str, wp.array]:
         """Return the iterate of the replayed step after all pressure iterations."""
@@ -204,10 +204,11 @@ class ProjectionAdjoint(ParticleAdjoint):
         if self._bodies is not None:
             self._bodies.begin()
 
-    def _finish(
+    def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Go back from the adjoints of the last positions, velocities and k to that of the state."""
+        """Go back from the adjoints that `_begin` wrote to that of the state, through the step in reverse: velocities
+        that follow, repairs, shift, iterations, first k, prediction with all forces, sorting."""
         solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
         known = (*self.bar.named, self._around, solver.around)
         flow = {"A": self._last_gradient(counts), "A_bar": self._A_bar}

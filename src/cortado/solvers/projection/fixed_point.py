@@ -154,7 +154,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         """Replay a step without pressure iterations, from k of the state after it; see `ResumingAdjoint`."""
         solver, repairs = self._solver, counts[1]
         solver.reserve((0, repairs))
-        context, at = solver.begin(state, parameters), solver.iterates[0]
+        context, at = solver.predict(state, parameters), solver.iterates[0]
         self._end.sort(context, self._after)
         self._root.fill_(1.0)
         self._pull_by(context, self._end[IMPULSE], at["y"], solver.pull)

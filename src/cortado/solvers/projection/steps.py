@@ -142,7 +142,7 @@ class ProjectionSteps(ParticleSolver):
         return {**self.density.constants, "spacing": self.constants.spacing}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
-        context = self.begin(state, parameters)
+        context = self.predict(state, parameters)
         projection, repair = self.loops
         projection.run(lambda k: self.iterate(context, k, 0, 0))
         self.settle(context, 0)
@@ -165,7 +165,7 @@ class ProjectionSteps(ParticleSolver):
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
         iterations, repairs = counts
-        context = self.begin(state, parameters)
+        context = self.predict(state, parameters)
         for k in range(iterations):
             self.iterate(context, k, k, k + 1)
         self.settle(context, iterations)
@@ -199,8 +199,9 @@ class ProjectionSteps(ParticleSolver):
         assert self._context is not None
         return self._context.parameters
 
-    def begin(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure iterations, and write the first iterate."""
+    def predict(self, state: State, parameters: Parameters) -> StepContext:
+        """Do all of a step before the pressure iterations: sort and measure the density (`sort`), add up the explicit
+        forces, gravity among them, predict v* = v + dt a, and write the first iterate."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
         if self.bodies is not None:
             self.bodies.begin(context, self.around)
