@@ -21,14 +21,14 @@ from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhoo
 BITS = 32
 """Candidates that one thread compares before it appends."""
 ROWS = 9
-"""Rows of cells to visit, at most."""
+"""Most rows of cells to visit."""
 LEAST_AT_ONCE = 8
 """Lanes that take the rows at once; fewer take one after the other. Measured on an H200."""
 
 
 @cache
 def append_function(discretisation: Discretisation) -> Any:
-    """A Warp function: append what lanes have found, in their order."""
+    """Make the Warp function that appends the particles which lanes have found to a list, in their order."""
     neighbourhood = neighbourhood_type(discretisation.precision)
     lanes = lane_functions(discretisation.precision, discretisation.lanes)
     vote, ones, before = lanes.vote, lanes.ones, lanes.before
@@ -46,7 +46,7 @@ def append_function(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
-    """A Warp function for one lane: append the particles first ... last - 1 that are within reach; ``own`` is left
+    """Make the Warp function for one lane that appends particles first ... last - 1 within reach; ``own`` is left
     out."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -100,7 +100,7 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_lanes(discretisation: Discretisation) -> Any:
-    """A Warp function for several lanes: append the particles first ... last - 1 that are within reach, but ``own``."""
+    """Make the Warp function for several lanes that appends particles first ... last - 1 within reach but ``own``."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     separation = pair_functions(discretisation).separation
@@ -134,14 +134,14 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
 
 
 def scan_around(discretisation: Discretisation) -> Any:
-    """A Warp function: append the particles that are within reach in the cells around cell c of a scene whose cells
+    """Make the Warp function that appends the particles within reach in the cells around cell c of a scene whose cells
     begin at layer ``bottom``; ``own`` is left out."""
     return (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
 
 
 @cache
 def scan_by_rows(discretisation: Discretisation) -> Any:
-    """`scan_around`, one row of cells after the other."""
+    """Make the Warp function of `scan_around` that visits one row of cells after the other."""
     vector = discretisation.precision.vector
     grid_type = cell_grid_type(discretisation.precision)
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -184,8 +184,7 @@ def scan_by_rows(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_at_once(discretisation: Discretisation) -> Any:
-    """`scan_around`, all rows as one range; but where the cells go around the end of a row, it is left to
-    `scan_by_rows`."""
+    """Make the Warp function of `scan_around` that visits all rows as one range, or row by row at the grid's ends."""
     vector = discretisation.precision.vector
     grid_type = cell_grid_type(discretisation.precision)
     neighbourhood = neighbourhood_type(discretisation.precision)

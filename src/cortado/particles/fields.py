@@ -11,7 +11,7 @@ from cortado.scene.parameters import Axis, Parameter
 
 
 class Entry(Enum):
-    """The kind of entry that a field holds for each thing that it describes."""
+    """The kind of entry that a field holds for each particle or scene: a number, a vector or another."""
 
     NUMBER = "a number"
     VECTOR = "a vector"
@@ -31,19 +31,19 @@ class StateField:
     axis: Axis = Axis.PARTICLE
     """PARTICLE, in the scene's order, or SCALAR for one entry."""
     first: str | None = None
-    """The parameter that it begins as, of one over time the first row; None for a field that begins at 0."""
+    """The parameter that gives its first value, of one over time the first row; None for a field that begins at 0."""
     is_constant: bool = False
-    """Whether no step changes it: the states of a run share the array."""
+    """True where no step changes it: the states of a run share the array."""
 
     def shape(self, particles: int, dimension: int, phases: int) -> tuple[int, ...]:
-        """The shape of the values of the field as NumPy has them."""
+        """Return the shape of the field's values as NumPy has them."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raises `TypeError` for fields of one name, and for one that begins as a parameter which is not known, or which
-    has not one value for each of its entries."""
+    """Raise `TypeError` for fields of one name, and for one that begins as an unknown parameter or as one without a
+    value for each of its entries."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -67,7 +67,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """The first values of fields whose parameter is among the given ones, by their names."""
+    """Return the first values of fields by name, where these begin as one of the given parameters."""
     found = {}
     for field in fields:
         if field.first is not None and field.first in parameters:

@@ -15,21 +15,21 @@ from cortado.device.precision import Precision
 
 @dataclass(frozen=True)
 class Loads:
-    """Warp functions that read one element, at indices that are not negative."""
+    """Warp functions that read one element of an array, at indices that are not negative."""
 
     neighbour: Any
-    """Of a list [neighbour, particle]."""
+    """Reads a list [neighbour, particle]."""
     vector: Any
-    """Of an array of vectors, one after the other in memory."""
+    """Reads an array of vectors, one after the other in memory."""
     number: Any
-    """Of an array of numbers, one after the other in memory."""
+    """Reads an array of numbers, one after the other in memory."""
     six: Any
-    """Of an array of six numbers each, one after the other in memory: in three loads on a GPU, and not in six."""
+    """Reads an array of six numbers each, one after the other in memory: in three loads on a GPU, and not in six."""
 
 
 @cache
 def loads(precision: Precision, taped: bool) -> Loads:
-    """The functions of a precision; a tape can differentiate ``taped`` ones."""
+    """Make the functions that read array elements in a precision; a tape can differentiate ``taped`` ones."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
@@ -79,7 +79,7 @@ def _direct(precision: Precision) -> Loads:
 
 @cache
 def wall_functions(precision: Precision, taped: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Warp functions of its number b and the neighbourhood, by name."""
+    """Make Warp functions, by name, that read the data of a wall particle by its number b and the neighbourhood."""
     real, vector = precision.real, precision.vector
     load = loads(precision, taped)
     load_vector, load_number = load.vector, load.number

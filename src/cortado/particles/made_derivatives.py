@@ -30,7 +30,7 @@ TermMaker = Callable[[Discretisation], Callable[..., Any]]
 
 
 def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """The Warp function ``f(i, *arrays, *bars, *others, s)`` of the term that is made, given the arrays of the adjoints
+    """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of a term's adjoint, given the arrays of the adjoints
     of its sums. It returns the adjoints of the entries of particle i in each array, and of each of the others.
     ``module`` is the Warp module of the function, if not that of the file."""
     term = _differentiable(make, d)
@@ -40,8 +40,8 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """The Warp function ``f(i, *arrays, *others, s)`` of the tangents of the sums of the term that is made, in which
-    each array and each of the others is followed by its tangent."""
+    """Make the Warp function ``f(i, *arrays, *others, s)`` of the tangents of a term's sums, in which each array and
+    each of the others is followed by its tangent."""
     term = _differentiable(make, d)
     arrays, others = _with_tangents(term.arrays), _with_tangents(term.others)
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
@@ -67,7 +67,7 @@ def _made(
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
-    """The Warp function T . bar of the arguments of a term and of an adjoint of each of its results."""
+    """Make the Warp function T . bar of the arguments of a term T and an adjoint for each of its results."""
     types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
         f"_term_{n} * {bar}" if kind is precision.real else f"_wp.{dot_of(kind)}(_term_{n}, {bar})"
@@ -86,12 +86,12 @@ def _work({", ".join(types)}):
 
 
 def dot_of(kind: Any) -> str:
-    """Warp's name of the product of two vectors, or of two matrices, that is a number."""
+    """Return Warp's name of the scalar product of two vectors, or of two matrices."""
     return "dot" if len(kind._shape_) == 1 else "ddot"
 
 
 def bars_of(term: Term) -> dict[str, Any]:
-    """Names and types of the adjoints of the results."""
+    """Return names and types of the adjoints of a term's results."""
     return {f"_bar_{n}": kind for n, kind in enumerate(term.results)}
 
 
@@ -100,7 +100,7 @@ def _with_tangents(types: Types) -> dict[str, Any]:
 
 
 def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
-    """The line that assigns the derivative of T . bar by each parameter to ``label_parameter``."""
+    """Return the line that assigns the derivative of T . bar by each parameter to ``label_parameter``."""
     names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *bars_of(term)))
     return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
 
@@ -123,7 +123,7 @@ def _adjoint(term: Term) -> Body:
 
 
 def _tangent(term: Term, d: Discretisation) -> Body:
-    """Lines that add up, for each component of each result, its gradient times the tangents of the parameters."""
+    """Return a loop's lines that add up, for each component of each result, gradient times parameters' tangents."""
     kinds = {**term.parameters, **bars_of(term)}
 
     def change_of(name: str, of_j: Mapping[str, str]) -> str:
@@ -152,7 +152,7 @@ def _tangent(term: Term, d: Discretisation) -> Body:
 
 
 def _unit(kind: Any, d: Discretisation, k: int) -> str:
-    """The text of a result whose component k is 1, and all others 0."""
+    """Return the text of a result whose component k is 1, and all others 0."""
     if kind is d.precision.real:
         return "_real(1.0)"
     return f"{type_name(kind, d)}({', '.join(f'_real({float(m == k)})' for m in range(len(kind())))})"

@@ -33,21 +33,21 @@ class WallArrays(Rows):
     positions: np.ndarray
     """(b, 3) [m]; of solids that move in their own frames"""
     weights: np.ndarray
-    """(b,) what each counts for in the density, a fluid particle being 1 [-]"""
+    """(b,) weight of each in the density, a fluid particle being 1 [-]"""
     grips: np.ndarray
-    """(b,) the same of those without slip, and 0 of those along which fluid slips freely"""
+    """(b,) weights of wall particles without slip, and 0 of those along which fluid slips freely"""
     feet: np.ndarray
     """(b, 3) from each to the surface [m]"""
     slides: np.ndarray
     """(b, 3) how fast their surface slides along the solid [m/s]"""
     solid: np.ndarray
-    """(b,) the number of the solid whose each is: of those that move from 0 on, of those at rest from -2 on
-    downwards; -1 of the container's"""
+    """(b,) number of each particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest; -1
+    for the container"""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Where solids are, for each scene of a batch, or tangents of that."""
+    """The positions and rotations of solids, for each scene of a batch, or tangents of these."""
 
     positions: wp.array
     """(members, solids) vectors, of the middles [m]"""
@@ -57,20 +57,20 @@ class Poses:
 
     @classmethod
     def zeros(cls, members: int, solids: int, precision: Precision, device: Any, tangents: bool = False) -> "Poses":
-        """Poses that are still to be written, or their ``tangents``."""
+        """Allocate poses that are still to be written, or their ``tangents``."""
         kinds = precision.vector, precision.vector if tangents else matrix_of(precision)
         return cls(*(wp.zeros((members, solids), dtype=kind, device=device) for kind in kinds))
 
 
 @cache
 def matrix_of(precision: Precision) -> Any:
-    """3 x 3 in a precision."""
+    """Return the Warp type of 3 x 3 matrices in a precision."""
     return wp.types.matrix(shape=(3, 3), dtype=precision.real)
 
 
 @cache
 def sizes_type(precision: Precision) -> Any:
-    """The Warp struct of how large solids are."""
+    """Make the Warp struct of the scales of solids and their tangents."""
     real = precision.real
 
     class Sizes:
@@ -79,7 +79,7 @@ def sizes_type(precision: Precision) -> Any:
         growths: wp.array2d(dtype=real)
         """Their tangents, over themselves."""
         power: real
-        """Of sigma, by which weights grow: d - 1."""
+        """The power of sigma by which weights grow: d - 1."""
 
     Sizes.__name__ = Sizes.__qualname__ = f"Sizes_{precision.name}"
     return wp.struct(Sizes)
@@ -87,7 +87,7 @@ def sizes_type(precision: Precision) -> Any:
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
-    """Kernels that place wall particles, write them in the order of their cells, say where cells begin, and write
+    """Make kernels that place wall particles, write them in the order of their cells, say where cells begin, and write
     tangents."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module = kernel_module(f"moving_walls_{precision.name}")
@@ -102,12 +102,12 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def place_of(b: int, scale: real, of: own_of) -> vector:
-        """In the frame of its solid; with a scale of 1 to the last bit its own place."""
+        """Return a wall particle's place in its solid's frame; with a scale of 1 its own place to the last bit."""
         return of.own[b] + (scale - real(1.0)) * (of.own[b] + of.own_feet[b])
 
     @wp.func
     def surface_of(b: int, scale: real, of: own_of) -> vector:
-        """The point of the surface above it, likewise."""
+        """Return the point of the surface above a wall particle, in its solid's frame."""
         return scale * (of.own[b] + of.own_feet[b])
 
     @wp.kernel(module=module, enable_backward=False)
@@ -212,8 +212,8 @@ class MovingWalls:
     """The moving wall particles of one search for neighbours, which stand behind those at rest in its arrays."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """``walls`` of so many solids that move; the first of them has the number ``first`` in the arrays of the
-        search."""
+        """Take the ``walls`` of ``solids`` moving solids; in the search's arrays they have numbers from ``first``
+        on."""
         precision, device, count = layout.precision, layout.device, len(walls)
         sizes = (layout.members, solids, precision, device)
         self.sizes, each = sizes_type(precision)(), {"dtype": precision.real, "device": device}
@@ -262,7 +262,7 @@ class MovingWalls:
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write them to the arrays of a search, given the length (members,) of the step [s]."""
+        """Write the wall particles to the arrays of a search, given the length (members,) of the step [s]."""
         (place, write, shift, _), after = self._kernels, self.after
         launch(place, self._all, self._device, self._own, self.named, positions=after.positions)
         self._sort(self._own["x"])
@@ -272,7 +272,7 @@ class MovingWalls:
         launch(write, self._all, self._device, self._own, self.named, known, walls)
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write their tangents, of what `write` has written last."""
+        """Write the tangents of the wall particles that `write` has written last."""
         known = {
             "first": self._first,
             "order": self._sort.order,

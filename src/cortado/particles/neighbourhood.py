@@ -27,40 +27,40 @@ UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
 with the particle itself, which adds nothing to a sum but W(0) to the density's."""
 REFLECTIONS = 64
-"""More than the bits of a reflection say."""
+"""A number above all bits of a reflection."""
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """A smoothing kernel in a precision: what a kernel factory is asked for."""
+    """A smoothing kernel in a precision with further choices, for which kernels are made."""
 
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
     """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
     periodic: bool = False
-    """Whether particles see the nearest images of one another: see ``period`` in the neighbourhood."""
+    """True where particles see the nearest images of one another: see ``period`` in the neighbourhood."""
     moving: bool = False
-    """Whether walls move: sums know their velocities."""
+    """True where walls move: sums know their velocities."""
     taped: bool = False
-    """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
+    """True for forward kernels that a tape can differentiate: they get Warp's own adjoint, which takes one lane."""
 
     @property
     def still(self) -> "Discretisation":
-        """This discretisation where walls do not move, for what is linear in the velocities of the fluid alone."""
+        """Return this discretisation where walls do not move, for terms linear in the fluid's velocities alone."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
-        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others. ``topic``
+        """Return the Warp module of forward kernels or of adjoint kernels; `tangent_module` has the others. ``topic``
         tells the modules of one file or solver from those of others."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
     def tangent_module(self, topic: str) -> Any:
-        """The Warp module of the kernels of forward mode, which no gradient needs."""
+        """Return the Warp module of the kernels of forward mode, which no gradient needs."""
         return self._module("tangent", topic, False)
 
     def modules(self, topic: str) -> tuple[Any, Any, Any]:
-        """The Warp modules of forward, tangent and adjoint kernels."""
+        """Return the Warp modules of forward, tangent and adjoint kernels."""
         return self.module(True, topic), self.tangent_module(topic), self.module(False, topic)
 
     def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
@@ -74,7 +74,7 @@ class Discretisation:
 
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
-    """The Warp struct of one precision; arrays are sorted by cell, lists are [neighbour, particle]."""
+    """Make the Warp struct of a neighbourhood; arrays are sorted by cell, lists are [neighbour, particle]."""
     real, vector = precision.real, precision.vector
 
     class Neighbourhood:
@@ -83,40 +83,40 @@ def neighbourhood_type(precision: Precision) -> Any:
         part: wp.int32
         """Number of the range."""
         particles: wp.int32
-        """Of one scene: particle i belongs to scene i // particles of a batch."""
+        """Number of particles of one scene: particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
         """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours, then images that
         it sees."""
         fluid_count: wp.array(dtype=wp.int32)
-        """Of the filled list, a multiple of `UNROLL`."""
+        """Length of the filled list, a multiple of `UNROLL`."""
         filling: wp.array(dtype=wp.int32)
-        """How many of them are the particle itself."""
+        """How many entries of it are the particle itself."""
         count: wp.array(dtype=wp.int32)
-        """Of these and wall neighbours."""
+        """Number of fluid and wall neighbours."""
         all_count: wp.array(dtype=wp.int32)
-        """Of these and images."""
+        """Number of neighbours, images included."""
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
-        """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
+        """w_b [-]: weight of a wall particle in the density, a fluid particle being 1."""
         wall_grips: wp.array(dtype=real)
         """w_b of walls without slip, 0 of those that slip freely [-]."""
         wall_velocities: wp.array(dtype=vector)
-        """How fast the point of the surface above a wall particle moves [m/s]; read where the `Discretisation` is
+        """Velocity of the point of the surface above a wall particle [m/s]; read where the `Discretisation` is
         moving."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
-        """The number of the solid whose a wall particle is: of those that move from 0 on, of those at rest from -2 on
-        downwards; -1 of the container's."""
+        """Number of a wall particle's solid: from 0 on for solids that move, from -2 on downwards for solids at rest;
+        -1 for the container."""
         wall_positions_dot: wp.array(dtype=vector)
-        """Tangents of their positions, which like the next three are there where walls move."""
+        """Tangents of the walls' positions, which like the next three are there where walls move."""
         wall_velocities_dot: wp.array(dtype=vector)
-        """Tangents of their velocities."""
+        """Tangents of the walls' velocities."""
         wall_turns_dot: wp.array(dtype=vector)
-        """Tangents of how their solid is turned: the rotation vector over the change."""
+        """Tangents of the rotation of a wall particle's solid: the rotation vector over the change."""
         wall_growths_dot: wp.array(dtype=real)
-        """Tangents of their weights and grips, over these [-]."""
+        """Tangents of the walls' weights and grips, divided by these [-]."""
         support: real
         """Support radius h [m]."""
         per_support: real
@@ -130,7 +130,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         response_scale: real
         """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
         laplacian_correction: real
-        """What second derivatives are multiplied with [-], see `cortado.discretise.calibration`."""
+        """Factor of second derivatives [-], see `cortado.discretise.calibration`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         period: vector
@@ -140,7 +140,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         mirror_lower: vector
         """Coordinates of the flat walls that mirror the fluid [m], -inf along an axis where none does."""
         mirror_upper: vector
-        """The same of those at the upper ends, inf where none does."""
+        """Coordinates of mirroring walls at the upper ends, inf where none does."""
 
     Neighbourhood.__qualname__ = f"Surroundings_{precision.name}"
     Neighbourhood.__name__ = Neighbourhood.__qualname__
@@ -149,7 +149,7 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]:
-    """Warp functions of mirrors by name. ``near_mirrors`` has the bits of the walls within reach of a position, on
+    """Make Warp functions of mirrors by name. ``near_mirrors`` has the bits of the walls within reach of a position, on
     either side, ``before_mirrors`` of those that it is in front of. ``reflects`` tells whether bits are those of a
     reflection in some walls, and ``reflection`` has the diagonal of R, and o."""
     real, vector = precision.real, precision.vector
@@ -176,7 +176,7 @@ def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]
 
     @wp.func
     def reflects(bits: int, near: int) -> bool:
-        """A wall does not mirror what the one across from it does."""
+        """Test that bits are those of a reflection in near walls; opposite walls do not mirror each other's images."""
         return (bits & near) == bits and (bits & (bits >> 3)) == 0
 
     @wp.func
@@ -194,7 +194,7 @@ def mirror_functions(precision: Precision, neighbourhood: Any) -> dict[str, Any]
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Warp functions of a separation in given neighbourhood.
+    """Make Warp functions of a separation in a neighbourhood.
 
     ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);

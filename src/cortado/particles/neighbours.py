@@ -26,7 +26,7 @@ from cortado.particles.neighbourhood import REFLECTIONS, UNROLL, Discretisation,
 from cortado.particles.state import Layout
 
 MOST_IMAGED = (2**31 - 1) // REFLECTIONS
-"""Particles whose images have numbers."""
+"""Most particles whose images have numbers."""
 
 
 @cache
@@ -56,8 +56,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         all_count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
-        """``needed``, for each range, becomes the longest list, also where that is more than there is room for. Scenes
-        that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` as `_near_walls`."""
+        """List neighbours; ``needed``, for each range, becomes the longest list, also where there is no room for it.
+        Scenes that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` comes from `_near_walls`."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -94,7 +94,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
 
 @cache
 def image_kernel(discretisation: Discretisation) -> Any:
-    """The kernel that appends images to lists of neighbours, of which and of the particle itself they are."""
+    """Make the kernel that appends images of particles, and of the particle itself, to lists of neighbours."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
     pair, load = pair_functions(discretisation), loads(discretisation.precision, discretisation.taped)
     separation, reflects, reflection = pair.separation, pair.reflects, pair.reflection
@@ -112,7 +112,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
         all_count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
-        """``needed`` as in `fill_kernel`."""
+        """Append images to lists; ``needed`` becomes the longest list, as in `fill_kernel`."""
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])
         near_walls = near_mirrors(x_i, s) & before_mirrors(x_i, s)
@@ -140,8 +140,8 @@ def image_kernel(discretisation: Discretisation) -> Any:
 
 
 def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
-    """(cells,) whether there are walls in a cell or around it; ``starts`` (cells + 1,): where each has its first wall
-    particle."""
+    """Return (cells,) True where there are walls in a cell or around it; ``starts`` (cells + 1,) has the first wall
+    particle of each."""
     near = np.diff(starts).reshape(grid.shape[::-1]) > 0
     for axis in range(3):
         near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
@@ -149,7 +149,7 @@ def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
 
 
 class NeighbourSearch:
-    """Sorts a fixed number of particles by cell and lists their neighbours, on one device and without a host read.
+    """A search that sorts particles by cell and lists their neighbours, on one device and without a host read.
 
     The list is stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU, whichever a device reads
     fastest; kernels index it [neighbour, particle] on both.
@@ -166,9 +166,9 @@ class NeighbourSearch:
         dimension: int = 3,
         mirrored: bool = False,
     ):
-        """``walls`` at rest are the same ones for all scenes of a batch; those that move stand behind them, one scene
-        after the other, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``.
-        Lists of ``mirrored`` fluid have images."""
+        """Allocate the search. ``walls`` at rest are shared by all scenes of a batch; moving ones stand behind them,
+        scene by scene, and are written by `MovingWalls.write`, of so many ``solids`` in a ``dimension``. Lists of
+        ``mirrored`` fluid have images."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > MOST_IMAGED:
             raise InputError(
@@ -207,7 +207,7 @@ class NeighbourSearch:
         self.allocate(capacity)
 
     def allocate(self, capacity: int) -> None:
-        """Make room for lists of that length, rounded up to a multiple of `UNROLL`."""
+        """Make room for lists of ``capacity`` neighbours, rounded up to a multiple of `UNROLL`."""
         self.capacity = -(-capacity // UNROLL) * UNROLL
         shape = (self.particles, self.capacity)
         if self.device.is_cpu:
@@ -224,7 +224,7 @@ class NeighbourSearch:
         self._sort(positions)
 
     def _write_walls(self, walls: WallArrays) -> None:
-        """Write the wall particles at rest, in this order."""
+        """Write the wall particles at rest to the search's arrays, in this order."""
         known = {name: getattr(walls, name) for name in ("positions", "weights", "grips", "feet")}
         for name, values in {**known, "solids": walls.solid}.items():
             array = self.walls[f"wall_{name}"]
@@ -267,9 +267,9 @@ class NeighbourSearch:
 
     @property
     def needed(self) -> int:
-        """The longest list since `forget_needed`; more than the capacity if there was too little room."""
+        """Return the length of the longest list since `forget_needed`; it is more than a capacity that is too small."""
         return int(self._seen.read().max())
 
     def forget_needed(self) -> None:
-        """Begin anew with `needed`."""
+        """Forget the longest list, so that `needed` begins anew."""
         self._needed.zero_()

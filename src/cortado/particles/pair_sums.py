@@ -64,7 +64,7 @@ OVER_WALLS = """\
         {body}
 """
 MOVING = {"v": "_wall_velocity(_b, s)", "x_dot": "_wall_position_dot(_b, s)", "v_dot": "_wall_velocity_dot(_b, s)"}
-"""Entries of arrays that wall particles have where they move."""
+"""Texts of the entries of arrays that wall particles have where they move."""
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
@@ -77,7 +77,7 @@ Body = Callable[[Mapping[str, str]], Iterable[str]]
 def over_fluid(
     d: Discretisation, arrays: Types, body: Body, ahead: bool, numbered: bool, separated: bool = True
 ) -> str:
-    """A loop over the fluid, which reads entries of neighbours of these arrays.
+    """Return the text of a loop over the fluid, which reads neighbours' entries of these arrays.
 
     ``ahead`` loads what `UNROLL` neighbours have before any of it is used, so that loads do not wait for one another;
     ``numbered`` loops know the number _j of a neighbour, ``separated`` ones _x_ij.
@@ -95,8 +95,8 @@ def over_fluid(
 
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
-    """A loop over the images of the fluid and of the particle itself, which have the numbers of their particles and
-    their vectors, mirrored."""
+    """Return the text of a loop over the images of the fluid and of the particle itself, which have their particles'
+    numbers and mirrored vectors."""
     of_j = {
         array: f"{array}[_j]" if kind is d.precision.real else f"_times(_flip, {array}[_j])"
         for array, kind in arrays.items()
@@ -105,10 +105,10 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool, of_one: bool) -> str:
-    """A loop over the walls, whose particles have a place, a weight _w_b, and what is ``known`` of
-    `cortado.particles.terms.OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array v,
-    and tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all that
-    are not of the moving ``solid``."""
+    """Return the text of a loop over the walls, whose particles have a place, a weight _w_b, and the entries ``known``
+    of `cortado.particles.terms.OF_WALLS`. Where walls move they have a velocity, too, which is their entry of the array
+    v, and tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all
+    that are not of the moving ``solid``."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
@@ -130,7 +130,7 @@ def summed(
     scope: Types,
     module: Any,
 ) -> Any:
-    """The Warp function ``name(i, *arrays, *others, s)`` of what loops add up, of these types."""
+    """Make the Warp function ``name(i, *arrays, *others, s)`` that returns the totals of loops, of these types."""
     results = tuple(results)
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
@@ -167,19 +167,19 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 
 def scope_of(d: Discretisation) -> dict[str, Any]:
-    """The names that texts of loops over neighbours know: types, and the functions of pairs."""
+    """Return the names that texts of loops over neighbours know: types, and the functions of pairs."""
     precision = d.precision
     types = {"_real": precision.real, "_vector": precision.vector, "_neighbourhood": neighbourhood_type(precision)}
     return {**{f"_{name}": function for name, function in vars(pair_functions(d)).items()}, **types}
 
 
 def zero(kind: Any, d: Discretisation) -> str:
-    """The text of a 0 of a type."""
+    """Return the text of a zero of a type."""
     return "_real(0.0)" if kind is d.precision.real else f"{type_name(kind, d)}()"
 
 
 def type_name(kind: Any, d: Discretisation) -> str:
-    """The name of a type in a text."""
+    """Return the name of a type in the text of a loop."""
     known = {d.precision.real: "_real", d.precision.vector: "_vector"}
     return known.get(kind) or f"_vector_{len(kind())}"
 
@@ -191,10 +191,10 @@ def _lines(indent: int, lines: Iterable[str]) -> str:
 def pair_sum(
     d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
 ) -> Decorator:
-    """A decorator that makes of a term the Warp function of its sum over fluid and walls. ``walls`` is the term of
-    walls if they act in another way; its parameters are among those of the fluid's. A sum that ``rubs`` has nothing of
-    walls that slip freely. A tangent is given the sum that it is of, which ``grows`` with the weights of walls: their
-    tangents count as many times as the term of that."""
+    """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
+    ``walls`` is the term of walls if they act in another way; its parameters are among those of the fluid's. A sum that
+    ``rubs`` has nothing of walls that slip freely. A tangent is given the sum that it is of, which ``grows`` with the
+    weights of walls: their tangents count as many times as the term of that."""
 
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
@@ -205,8 +205,8 @@ def pair_sum(
 
 
 def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
-    """A decorator that makes of a term its sum over the fluid alone, as `pair_sum` does over walls too. ``module`` is
-    the Warp module of the function, if not that of the file."""
+    """Return a decorator that turns the term of a pair into its sum over the fluid alone. ``module`` is the Warp module
+    of the function, if not that of the file."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -216,7 +216,7 @@ def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Deco
 
 
 def image_sum(d: Discretisation) -> Decorator:
-    """A decorator that makes of a term its sum over the images of the fluid in flat walls that mirror it
+    """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls
     (`cortado.particles.neighbourhood`)."""
 
     def make(function: Function) -> Any:
@@ -227,8 +227,8 @@ def image_sum(d: Discretisation) -> Decorator:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """A function that gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum`
-    where some walls have no slip, and `fluid_sum` where all slip freely."""
+    """Return a function that makes a decorator of a sum over all that fluid rubs against, for the term of walls:
+    `pair_sum` where some walls have no slip, and `fluid_sum` where all slip freely."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, ahead)
@@ -237,7 +237,7 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
-    """A decorator that makes of a term its sum over the walls alone."""
+    """Return a decorator that turns a term into its sum over the walls alone."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -247,8 +247,8 @@ def wall_sum(d: Discretisation, grows: Any = None) -> Decorator:
 
 
 def solid_sum(d: Discretisation) -> Decorator:
-    """A decorator that makes of a term its sum over the walls of one moving solid, by its number ``solid``, a
-    parameter."""
+    """Return a decorator that turns a term into its sum over the walls of one moving solid, whose number is
+    ``solid``."""
 
     def make(function: Function) -> Any:
         term = Term.of(function)
@@ -258,7 +258,7 @@ def solid_sum(d: Discretisation) -> Decorator:
 
 
 def _check_walls(wall: Term, term: Term) -> None:
-    """Raises `TypeError` for a term of walls that does not fit that of the fluid."""
+    """Raise `TypeError` for a term of walls that does not fit that of the fluid."""
     more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
     if wall.results != term.results or more:
         found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
@@ -316,26 +316,26 @@ def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = N
 
 @dataclass(frozen=True)
 class ByHand:
-    """The derivative of a sum, as Warp functions."""
+    """A derivative of a sum that was written by hand, as a Warp function."""
 
     kind: str
-    """"tangent", or "adjoint": one that returns the adjoints of the entries of particle i in each array of the sum, in
-    their order. Behind them are those of what is the same for all neighbours, or what else a kernel needs."""
+    """"tangent" or "adjoint". An adjoint returns the adjoints of the entries of particle i in each array of the sum, in
+    their order, and behind them those of the other arguments, or whatever else a kernel needs."""
     of: Any
     function: Any
 
 
 BY_HAND: list[ByHand] = []
-"""Those of all sums that were made."""
+"""The derivatives by hand of all sums that were made."""
 
 
 def tangent_of(sum_of: Any) -> Callable[[Any], Any]:
-    """A decorator of the tangent of a sum over neighbours."""
+    """Return a decorator that marks a function as the tangent of a sum over neighbours."""
     return lambda function: _noted("tangent", sum_of, function)
 
 
 def adjoint_of(sum_of: Any) -> Callable[[Any], Any]:
-    """A decorator of the adjoint of a sum over neighbours."""
+    """Return a decorator that marks a function as the adjoint of a sum over neighbours."""
     return lambda function: _noted("adjoint", sum_of, function)
 
 

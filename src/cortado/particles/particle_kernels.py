@@ -61,12 +61,12 @@ _total_{n} = _kind_{n}()
         {gradient}
         _total_{n} += ({change}) * _unit
     {place}_total_{n}"""
-"""Of a result that is a vector or a matrix. The number of components is a variable, as Warp would write each gradient
-out."""
+"""The text of the tangent of a vector or a matrix. The number of components is a variable, as Warp would write each
+gradient out."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
-    """The Warp kernel with arguments of these types and these lines, which know what is in ``scope``."""
+    """Make the Warp kernel with arguments of these types from lines of text that know the names in ``scope``."""
     text = KERNEL.format(name=name, parameters=", ".join(types), body="\n    ".join(body))
     known = {"wp": wp, **scope}
     exec(text, known)
@@ -77,32 +77,32 @@ def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, modu
 
 @dataclass(frozen=True)
 class Over:
-    """A sum over neighbours in a kernel."""
+    """A sum over neighbours in a kernel, with the names of its results and renamed arguments."""
 
     function: Any
     names: Sequence[str]
-    """Of its results in the kernel."""
+    """Names of its results in the kernel."""
     renamed: Mapping[str, str]
 
     def read(self, types: Types) -> dict[str, Any]:
-        """Types by the names that arguments have in the kernel."""
+        """Return types by the names that arguments have in the kernel."""
         return {self.renamed.get(name, name): kind for name, kind in types.items()}
 
     def call(self, entries: Mapping[str, str], function: str) -> str:
-        """The line that computes the sum, given the texts of what is the same for all neighbours."""
+        """Return the line that computes the sum, given the texts of arguments that are equal for all neighbours."""
         names = (*self.read(self.function.arrays), *self.read(self.function.others))
         results = ", ".join(f"_{name}" for name in self.names)
         return f"{results} = {function}(i, {', '.join(entries.get(name, name) for name in names)}, s)"
 
 
 def over(function: Any, names: str, /, **renamed: str) -> Over:
-    """A sum over neighbours (`cortado.particles.pair_sums`), the names of its results, one word each, and of its
-    arguments that are called otherwise in the kernel."""
+    """Name a sum over neighbours (`cortado.particles.pair_sums`) for a kernel: its results, one word each, and
+    arguments that have other names in the kernel."""
     return Over(function, names.split(), renamed)
 
 
 def dotted(names: Mapping[str, str]) -> dict[str, str]:
-    """The same for the tangents of what is called otherwise."""
+    """Return the renamed arguments of a sum for their tangents, with _dot behind both names."""
     return {f"{name}_dot": f"{other}_dot" for name, other in names.items()}
 
 
@@ -113,8 +113,9 @@ def particle_kernel(
     numbers: Collection[str] = (),
     name: str | None = None,
 ) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator that makes a kernel in a Warp module of a function with a type at each parameter; ``results``: the
-    arrays that it writes, one word each. The kernel is called as the function, unless it has a ``name``."""
+    """Return a decorator that turns a function of one particle, with a type at each parameter, into a kernel in a Warp
+    module; ``results``: the arrays that it writes, one word each. The kernel is called as the function, unless it has a
+    ``name``."""
 
     def make(function: Callable[..., Any]) -> Any:
         term, places = Term.of(function), function.__qualname__.split(".")
@@ -142,7 +143,7 @@ def sum_kernel(
     numbers: Collection[str] = (),
     **renamed: str,
 ) -> Any:
-    """The kernel of one sum, each of whose results is written, or added, ``times`` a text such as "s.volume", and
+    """Make the kernel of one sum, each of whose results is written, or added, ``times`` a text such as "s.volume", and
     divided by another one."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
@@ -165,8 +166,8 @@ def sum_kernels(
     written: Collection[str] = (),
     **renamed: str,
 ) -> Kernels:
-    """The three kernels of one sum, each in its own of the Warp ``modules``, given the sum with its tangent and its
-    adjoint, as `cortado.particles.pair_sums` notes them. It is of ``result`` = ``before`` + ``times`` the sum /
+    """Make the three kernels of one sum, each in its own of the Warp ``modules``, given the sum with its tangent and
+    its adjoint, as `cortado.particles.pair_sums` notes them. It is of ``result`` = ``before`` + ``times`` the sum /
     ``per``, where ``before`` is an array, and the others are texts, all of which may be left out. Adjoints are added to
     those of arrays and of scenes, but for those of arrays that are ``written``."""
     total, tangent, adjoint = sums
@@ -184,7 +185,7 @@ def sum_kernels(
 
 
 class _Arguments:
-    """What a kernel takes, as it is found."""
+    """The arguments of a kernel that is being made, collected as the function's parameters are read."""
 
     def __init__(self, sums: Sequence[Over], numbers: Collection[str]):
         self._sums, self._names = sums, numbers
@@ -200,7 +201,7 @@ class _Arguments:
             self._calls.append(one.call(entries, f"_sum_{n}"))
 
     def entry(self, name: str, kind: Any) -> str:
-        """The text of what a parameter is."""
+        """Return the text of a parameter's value in the kernel, and note the argument that it needs."""
         if name == "s":
             self._around = kind
         if name == "member":
@@ -217,7 +218,7 @@ class _Arguments:
     def kernel(
         self, name: str, lines: Iterable[str], writes: Iterable[tuple[str, str, Any]], scope: Types, module: Any
     ) -> Any:
-        """The kernel that goes on from the sums with some lines, and writes values of a type to arrays."""
+        """Make the kernel that computes the sums, goes on with some lines, and writes values to arrays."""
         stored, written, read = [], {}, {}
         for result, value, kind in writes:
             array, _, other = result.removeprefix("+").partition(":")
@@ -256,7 +257,8 @@ def pointwise_kernels(
     numbers: Collection[str] = (),
     written: Collection[str] = (),
 ) -> Kernels:
-    """The three kernels, each in its own of the Warp ``modules``, of the function that ``make`` makes for a module.
+    """Make forward, tangent and adjoint kernels, each in its own of the Warp ``modules``, of the function that ``make``
+    makes for a module.
 
     The function has a type at each parameter, and ``results`` are the arrays that it writes; what it returns for
     "acceleration:acceleration_in" is added to the latter. ``replaced`` maps a result to the input in whose place its
@@ -276,7 +278,7 @@ def pointwise_kernels(
 
 
 class _Pointwise:
-    """Name, types of arguments, and lines of each of the three kernels."""
+    """The name, the arguments and the lines of each of the three kernels of a pointwise function."""
 
     _first = "i = wp.tid()"
 

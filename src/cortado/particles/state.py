@@ -19,17 +19,17 @@ from cortado.scene.parameters import Axis
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 2) or (n, 3) with three components, in float64."""
+    """Return vectors (n, 2) or (n, 3) as vectors with three components, (n, 3), in float64."""
     return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
 
 
 def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array:
-    """Vectors (n, 2) or (n, 3) as a Warp array of vectors (n,)."""
+    """Copy vectors (n, 2) or (n, 3) to a device as a Warp array (n,) of vectors with three components."""
     return wp.array(padded(values), dtype=precision.vector, device=device)
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """The memory of numbers, vectors or matrices as an array of numbers of a shape, which keeps it."""
+    """Return the memory of numbers, vectors or matrices as an array of numbers of a shape, which keeps it alive."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -37,7 +37,7 @@ def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
 
 
 class Arrays(Staying):
-    """Warp arrays by name."""
+    """A collection of Warp arrays by name, with operations on all of them."""
 
     def __init__(self, arrays: Mapping[str, wp.array]):
         self._arrays = dict(arrays)
@@ -48,38 +48,38 @@ class Arrays(Staying):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names, in their order."""
+        """Return the names of the arrays, in their order."""
         return tuple(self._arrays)
 
     def arrays(self) -> list[wp.array]:
-        """The arrays, in their order."""
+        """Return the arrays, in their order."""
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """The arrays as kernels call their arguments, ``drag_k`` for ``drag.k``: "_dot" behind the name of a tangent,
-        "_bar" of an adjoint."""
+        """Return the arrays by the names of kernels' arguments, ``drag_k`` for ``drag.k``: "_dot" behind the name of a
+        tangent, "_bar" of an adjoint."""
         if suffix not in self._named:
             self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
 
     def assign(self, other: Self) -> None:
-        """Copy another of the same device and sizes, without a host round trip; what both share stays as it is."""
+        """Copy the arrays of another collection on this device, without a host round trip; shared arrays stay."""
         for own, source in zip(self.arrays(), other.arrays(), strict=True):
             if own is not source:
                 wp.copy(own, source)
 
     def gradients(self) -> Self:
-        """The adjoints of the arrays that Warp's tape has written."""
+        """Return the adjoints of the arrays that Warp's tape has written."""
         return type(self)({name: array.grad for name, array in self._arrays.items()})
 
     def clear(self) -> None:
-        """Make everything 0."""
+        """Set all arrays to 0."""
         for array in self.arrays():
             array.zero_()
 
 
 def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
-    """Arrays of zeros by name, each of a size or a shape and a Warp type."""
+    """Make arrays of zeros by name, each of a size or a shape and a Warp type."""
     options = {"device": device, "requires_grad": requires_grad}
     return {name: wp.zeros(size, dtype=dtype, **options) for name, (size, dtype) in kinds.items()}
 
@@ -94,7 +94,7 @@ class Fields(Arrays):
 
     @classmethod
     def zeros(cls, particles: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
-        """Fields of zeros."""
+        """Allocate fields of zeros for a number of sorted particles."""
         types = dict.fromkeys("xv", precision.vector) | dict.fromkeys(("n", "m", "rho_0", "mu"), precision.real)
         return cls(zeros({name: (particles, dtype) for name, dtype in types.items()}, device, requires_grad))
 
@@ -109,50 +109,50 @@ class State(Arrays):
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
-        """``batch`` as that of `Layout`."""
+        """Take the arrays of declared fields; ``batch`` is the number of scenes, None for a single one."""
         super().__init__(arrays)
         self.fields, self.batch = fields, batch
 
     @property
     def positions(self) -> wp.array:
-        """(n,) vectors [m]."""
+        """Return the positions of particles, (n,) vectors [m]."""
         return self["positions"]
 
     @property
     def velocities(self) -> wp.array:
-        """(n,) vectors [m / s]."""
+        """Return the velocities of particles, (n,) vectors [m / s]."""
         return self["velocities"]
 
     @property
     def mass_fractions(self) -> wp.array:
-        """(n,) of as many numbers as there are phases [-]."""
+        """Return the mass fractions of particles, (n,) vectors with a number for each phase [-]."""
         return self["mass_fractions"]
 
     def like(self) -> Self:
-        """One of the same fields and sizes, all 0."""
+        """Make a state of the same fields and sizes, all 0."""
         zero = {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """A later state of the same run that is still to be written: what no step changes is the same array."""
+        """Make a later state of this run that is still to be written; it shares arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
     def copy(self) -> Self:
-        """This state in arrays of its own."""
+        """Copy this state to arrays of its own."""
         own = {name: wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
 
     def member(self, number: int) -> Self:
-        """One scene of a batch, as a view of these arrays."""
+        """Return one scene of a batch as a state that is a view of these arrays."""
         assert self.batch is not None
         sizes = {name: len(self[name]) // self.batch for name in self.names}
         views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
         return type(self)(self.fields, views)
 
     def numbers(self, name: str) -> wp.array:
-        """A field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...), that
-        shares its memory: what speaks DLPack, such as PyTorch and JAX, takes it without a copy."""
+        """Return a field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...),
+        that shares its memory. Libraries that speak DLPack, such as PyTorch and JAX, take it without a copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
@@ -166,8 +166,8 @@ class State(Arrays):
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Every field, or only those of some names, as a new array: vectors (n, dimension), numbers (n,), fractions
-        (n, phases), in a batch (batch, n, ...)."""
+        """Copy every field, or only those of some names, to new arrays by name: vectors (n, dimension), numbers (n,),
+        fractions (n, phases), in a batch (batch, n, ...)."""
         names = set(self.names if only is None else only)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
@@ -177,27 +177,27 @@ class State(Arrays):
 
 
 class StateSeries:
-    """States of one run one behind the other in the same arrays, so that all of them are copied at once."""
+    """States of one run, one behind the other in shared arrays, which are copied all at once."""
 
     def __init__(self, like: State, length: int):
-        """``length`` states of the fields and sizes of one, still to be written; what no step changes is its array."""
+        """Allocate ``length`` states of the fields and sizes of one, to be written; constant fields are shared."""
         self._like, self._length = like, length
         changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
         self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
 
     def state(self, k: int) -> State:
-        """One of them, as a view of the arrays."""
+        """Return state k of the series as a view of the arrays."""
         size = {name: len(array) // self._length for name, array in self._whole.items()}
         own = {name: array[k * size[name] : (k + 1) * size[name]] for name, array in self._whole.items()}
         arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
         return State(self._like.fields, arrays, self._like.batch)
 
     def like(self) -> Self:
-        """A series of as many states, still to be written."""
+        """Allocate a series of equal length, still to be written."""
         return type(self)(self._like, self._length)
 
     def assign(self, other: Self) -> None:
-        """Copy as many others of the same run."""
+        """Copy another series of this run, of equal length."""
         for name, array in self._whole.items():
             wp.copy(array, other._whole[name])
 
@@ -216,13 +216,13 @@ class Parameters(Arrays):
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
-        """The values that `set` has written, by name; `set_row` writes to it."""
+        """Return the values that `set` has written, by name; `set_row` writes to it."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write some by name, the same for all members or with an axis of them: a vector (d,) or vectors
-        (steps, d); numbers or arrays of them; or a Warp array like the own one. Nothing else may write to arrays that
-        are set again."""
+        """Write some parameters by name, for all members or with an axis of members: a vector (d,) or vectors (steps,
+        d); numbers or arrays of them; or a Warp array like the own one. Nothing else may write to arrays that are set
+        again."""
         for name, value in values.items():
             array, last = self[name], self._written.get(name)
             if isinstance(value, wp.array):
@@ -257,35 +257,35 @@ class Layout:
     behind the other. A kernel has one thread for each particle of all of them."""
 
     particles: int
-    """Of one scene."""
+    """Number of particles of one scene."""
     phases: int
     precision: Precision
     device: Any
     batch: int | None = None
-    """How many scenes; None for a single one, whose arrays have no axis for it."""
+    """Number of scenes; None for a single one, whose arrays have no axis for it."""
     known: Known = REGISTRY
-    """Their parameters."""
+    """The parameters of the scenes."""
 
     @property
     def members(self) -> int:
-        """The number of scenes in the batch."""
+        """Return the number of scenes in the batch."""
         return self.batch or 1
 
     @property
     def all_particles(self) -> int:
-        """The number of particles of all scenes."""
+        """Return the number of particles of all scenes."""
         return self.members * self.particles
 
     def sum_of(self, dtype: Any) -> TreeReduction:
-        """Sums over the particles of each scene of numbers, vectors or matrices of a Warp type."""
+        """Make a function that sums numbers, vectors or matrices of a Warp type over the particles of each scene."""
         return sum_of(dtype, self.particles, self.device, self.members)
 
     def arrays(self, suffix: str = "", **kinds: Any) -> dict[str, wp.array]:
-        """Arrays (n,) over all particles, all 0, of Warp types by name, to which a ``suffix`` is added."""
+        """Make arrays (n,) over all particles, all 0, of Warp types by name, to which a ``suffix`` is added."""
         return zeros({f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}, self.device)
 
     def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
-        """A state of these fields, all 0."""
+        """Make a state of these fields, all 0."""
         precision = self.precision
         dtypes = {
             Entry.NUMBER: precision.real,
@@ -298,7 +298,7 @@ class Layout:
         return State(fields, zeros(kinds, self.device, requires_grad), self.batch)
 
     def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
-        """Parameters of a run of so many steps, all 0."""
+        """Make the parameters of a run of ``steps`` steps, all 0."""
         real, vector, members = self.precision.real, self.precision.vector, self.members
         sizes: dict[Axis, Any] = {Axis.STEP: (members, max(steps, 1)), Axis.PHASE: (members, self.phases)}
         used = [self.known[name] for name in self.known.run]

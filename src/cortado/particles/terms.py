@@ -17,23 +17,23 @@ from typing import Any, get_args
 NUMBERS = ("i", "j")
 INDICES = ("i", "j", "ij")
 OF_WALLS = {"foot": "_foot", "turn_dot": "_turn_dot"}
-"""What terms of walls know of a wall particle, and its text."""
+"""Names of a wall particle's data in terms of walls, with their texts."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A function of a pair, taken apart."""
+    """The function of a pair of particles, taken apart into its parameters and its results."""
 
     function: Callable[..., Any]
     parameters: Mapping[str, Any]
-    """Their types by name."""
+    """Types of its parameters by name."""
     results: tuple[Any, ...]
-    """Types of what it returns."""
+    """Types of its results."""
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """The term of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns several
-        things. Raises `TypeError` for one without them, or for names that begin with an underscore."""
+        """Read the term of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns
+        several things. Raises `TypeError` for one without them, or for names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -50,27 +50,27 @@ class Term:
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """Types of the entries of arrays, by the arrays' names."""
+        """Return the types of the entries of arrays, by the arrays' names."""
         return {array: self.parameters[name] for name in self.parameters if (array := array_of(name))}
 
     @property
     def of_neighbours(self) -> dict[str, Any]:
-        """Types of the entries of arrays of which the term takes a neighbour's, by name."""
+        """Return the types of the entries of arrays that are read for a neighbour, by name."""
         read = {array_of(name) for name in self.parameters if name.endswith(("_j", "_ij"))}
         return {array: kind for array, kind in self.arrays.items() if array in read}
 
     @property
     def others(self) -> dict[str, Any]:
-        """Types of what is the same for all neighbours, by name."""
+        """Return the types, by name, of arguments that are equal for all neighbours."""
         known = (*NUMBERS, *OF_WALLS, "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
-        """The text of its arguments, given those of a neighbour's entries and of its number."""
+        """Return the text of its arguments, given the texts of a neighbour's entries and of its number."""
         return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
-        """The text of its arguments with the particles exchanged."""
+        """Return the text of its arguments with the particles exchanged."""
         return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
 
     def _arguments(
@@ -90,11 +90,11 @@ class Term:
 
 
 def array_of(parameter: str) -> str:
-    """The array that a parameter is of; nothing for others."""
+    """Return the name of the array that a parameter is an entry of; an empty text for others."""
     array, _, index = parameter.rpartition("_")
     return array if index in INDICES else ""
 
 
 def own_entry(array: str) -> str:
-    """The text of a particle's own entry of an array."""
+    """Return the text of a particle's own entry of an array."""
     return f"_{array}_i"

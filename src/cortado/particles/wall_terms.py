@@ -43,11 +43,11 @@ from cortado.particles.state import Layout
 from cortado.particles.terms import Term
 
 ALL_WALLS = -(2**31)
-"""In the place of the number of a solid: those of all solids and of the container."""
+"""Stands in place of a solid's number for the walls of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 """f, t, f_0, t_0 and g."""
 WHOLE = ("force", "torque", "growth")
-"""What others than particles give."""
+"""Shares of a solid that others than particles give."""
 LOOP = """\
 _x_i = at.x[i]
     {own}
@@ -74,7 +74,7 @@ WorkMaker = Callable[[Discretisation], Callable[..., Any]]
 
 @dataclass(frozen=True)
 class _Loop:
-    """A loop over the wall particles of a term, as text."""
+    """The text of a loop over the wall particles of a term."""
 
     term: Term
     d: Discretisation
@@ -82,7 +82,7 @@ class _Loop:
 
     @property
     def read(self) -> list[str]:
-        """Arrays but x of which it reads the entry of particle i."""
+        """Return the names of arrays but x of which the loop reads the entry of particle i."""
         parameters = self.term.parameters
         return [name for name in self.term.arrays if name != "x" and {f"{name}_i", f"{name}_ij"} & parameters.keys()]
 
@@ -92,11 +92,11 @@ class _Loop:
 
     @property
     def gradients(self) -> str:
-        """The line that assigns the derivative of W by each parameter to ``_by_parameter``."""
+        """Return the line that assigns the derivative of the work W by each parameter to ``_by_parameter``."""
         return f"{', '.join(f'_by_{name}' for name in self.term.parameters)} = wp.grad(_work)({self.arguments})"
 
     def text(self, given: Iterable[str], own: Iterable[str], body: Iterable[str]) -> str:
-        """With lines before it and within it; entries of arrays are read but for those that are ``given``."""
+        """Return the loop with lines before it and within it; it reads entries of arrays that are not ``given``."""
         entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
         return LOOP.format(
             own="\n    ".join((*entries, *own)),
@@ -105,7 +105,7 @@ class _Loop:
         )
 
     def known(self, module: Any) -> dict[str, Any]:
-        """What names in the text stand for, in a Warp module."""
+        """Return the values of the names in the text, in a Warp module."""
         return {
             **scope_of(self.d),
             **{"_matrix": matrix_of(self.d.precision), "_pair": self.d.precision.pair},
@@ -117,25 +117,25 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of walls in a discretisation; ``make(discretisation)`` gives its work."""
+    """A term of the forces by walls in a discretisation; ``make(discretisation)`` gives its work."""
 
     discretisation: Discretisation
     topic: str
-    """Of its Warp modules."""
+    """Topic of its Warp modules."""
     make: WorkMaker
     bar: str
     """The array in which the work is linear."""
     rubs: bool = False
-    """Whether it has nothing of walls that slip freely."""
+    """True for a term without walls that slip freely."""
 
     @property
     def kernels(self) -> Kernels:
-        """Kernels of the sum A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, the array ``bar``
-        of the term. They know the ``constants`` of the work and the number ``solid``, or `ALL_WALLS`."""
+        """Return kernels of the sum A, which is ``total``, of its tangent ``total_dot``, and of its adjoint, the array
+        ``bar`` of the term. They know the ``constants`` of the work and the number ``solid``, or `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
-        """The kernel of what the adjoint gives to a solid that moves."""
+        """Return the kernel that turns the sum's adjoint into adjoints of a solid that moves."""
         return solid_kernel(self.discretisation, self.topic, self.make, self.rubs)
 
 
@@ -204,10 +204,10 @@ def _kernels(of: WallTerm) -> Kernels:
 
 
 class SolidShares:
-    """What the particles give to the adjoints of the poses of solids in one step, particle by particle."""
+    """The particles' shares of the adjoints of the poses of solids in one step."""
 
     def __init__(self, walls: MovingWalls | None, layout: Layout):
-        """``walls`` of the solids; where None move, nothing is given."""
+        """Allocate shares for the solids whose ``walls`` move; without any, nothing is added."""
         self._walls, self._pair = walls, layout.precision.pair
         size, kinds, device = layout.all_particles, share_kinds(layout.precision), layout.device
         solids = range(0 if walls is None else walls.solids)
@@ -227,8 +227,8 @@ class SolidShares:
         over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """What a sum gives, by the kernel that `solid_kernel` makes of it, which is asked for where solids move; of a
-        sum ``over`` the walls of one solid, to that alone."""
+        """Add the shares of a sum by the kernel that ``kernel()`` makes, which is called where solids move; of a sum
+        ``over`` the walls of one solid, to that one alone."""
         if self._walls is None:
             return
         before, after, power = self._walls.before, self._walls.after, self._walls.sizes.power
@@ -239,11 +239,11 @@ class SolidShares:
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
-        """(n,) what the particles have given to one solid so far, as kernels call it."""
+        """Return the particles' shares (n,) of one solid's adjoints so far, by the names that kernels have for them."""
         return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
-        """The sums (members,) of one solid, by `NAMES`, and begin anew."""
+        """Return the sums (members,) of one solid's shares, by `NAMES`, and set the shares to 0."""
         found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
         for name, given in self._whole[solid].items():
             add(given, found[name])
@@ -251,12 +251,12 @@ class SolidShares:
         return found
 
     def add_whole(self, solid: int, *given: wp.array) -> None:
-        """(members,) f, t, and g where there is one, which others than particles give to one solid."""
+        """Add f, t, and g where there is one, (members,), to the adjoints of one solid, apart from particles."""
         for one, own in zip(given, self._whole[solid].values(), strict=False):
             add(one, own)
 
     def clear(self) -> None:
-        """Forget what was given."""
+        """Set the shares of all solids to 0."""
         for solid in range(len(self._arrays)):
             self._forget(solid)
 
@@ -266,7 +266,7 @@ class SolidShares:
 
 
 def share_kinds(precision: Precision) -> dict[str, Any]:
-    """Types of what a particle gives, by `NAMES`."""
+    """Return the types of a particle's shares, by `NAMES`."""
     return {**dict.fromkeys(NAMES, precision.vector), "growth": precision.real}
 
 
@@ -332,7 +332,7 @@ def solid_kernel(
 
 
 def _share(loop: _Loop, seen: Any, module: Any) -> Any:
-    """The Warp function of the sums over the wall particles of one solid, of which particles' shares are made."""
+    """Make the Warp function of the sums over one solid's wall particles, of which particles' shares are made."""
     term = loop.term
     velocity = [name for name in ("v_ij", "v_j") if name in term.parameters]
     by_v = {(): "_vector()", ("v_ij",): "-_w_b * _by_v_ij", ("v_j",): "_w_b * _by_v_j"}[tuple(velocity)]

@@ -12,7 +12,7 @@ from cortado.sph.integration import integration_module, new_state_adjoint
 
 @cache
 def begin_adjoint_kernel(precision: Precision) -> Any:
-    """From the adjoint of the new state, in scene order, to that of its prediction; all others begin at 0."""
+    """Make the kernel from the adjoint of the new state, in scene order, to that of its prediction."""
     real, vector = precision.real, precision.vector
     adjoin_new_state = new_state_adjoint(precision)
 

@@ -25,18 +25,19 @@ class SolveKernels:
     begin: Any
     """p = r, y = 0."""
     start: Any
-    """Of a scene: whether there is anything to do."""
+    """Tells for each scene whether there is anything to solve."""
     descend: Any
     """y and r after a step along p."""
     turn: Any
     """The next p."""
     decide: Any
-    """Of a scene: whether to go on."""
+    """Tells for each scene whether to go on."""
 
 
 @cache
 def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
-    """Of a precision, for numbers or vectors of it; ``going`` (members,) is 1 for a scene that goes on."""
+    """Make the kernels of conjugate gradients for numbers or vectors; ``going`` (members,) is 1 for a scene to go
+    on."""
     real = precision.real
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
     square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
@@ -65,7 +66,7 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         going: wp.array(dtype=wp.int32),
         active: wp.array(dtype=wp.int32),
     ):
-        """``active`` is the number of scenes that go on."""
+        """Begin the solve of each scene that has a residual; ``active`` becomes the number of scenes that go on."""
         b = wp.tid()
         first[b] = total[b]
         size[b] = total[b]
@@ -156,16 +157,16 @@ def _square_of_vectors(vector: Any, real: Any, module: Any) -> Any:
 
 
 def round_off(precision: Precision) -> float:
-    """The part of the first |r| below which a solve gets no better."""
+    """Return the part of the first residual |r| below which a solve in a precision gets no better."""
     return 3e-7 if precision is FLOAT32 else 1e-14
 
 
 class ConjugateGradients:
-    """Solves for the particles of one solver, or for whatever a layout has as many of, with arrays of its own."""
+    """A solver by conjugate gradients for the particles, or other entries, of a layout, with arrays of its own."""
 
     def __init__(self, layout: Layout, kind: Any, tolerance: float, most: int):
-        """For numbers or vectors, a Warp ``kind``, until |r| has fallen to ``tolerance`` of the first, or ``most``
-        iterations are done."""
+        """Prepare solves for numbers or vectors, a Warp ``kind``, which end when |r| has fallen to ``tolerance`` of the
+        first, or after ``most`` iterations."""
         real = layout.precision.real
         self._kernels, self._layout = solve_kernels(layout.precision, kind), layout
         self._limits = {"tolerance": tolerance, "most": most}
@@ -188,7 +189,9 @@ class ConjugateGradients:
         r: wp.array,
         y: wp.array,
     ) -> None:
-        """Write to ``y`` what solves B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
+        """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``. ``multiply``
+        writes B p, for ``p``, its first argument, to the ``product`` of its second, and each particle's w p B p to the
+        ``share``.
 
         ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
         w p B p of each particle to the ``share``.

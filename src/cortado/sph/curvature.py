@@ -36,7 +36,7 @@ DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
 
 @dataclass(frozen=True)
 class CurvatureConstants:
-    """Of a smoothing kernel and a spacing."""
+    """The constants of surface tension by curvature for a smoothing kernel and a particle spacing."""
 
     spacing: float
     """[m]"""
@@ -47,21 +47,21 @@ class CurvatureConstants:
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
-        """On a lattice with a spacing [m], for a support radius [m]."""
+        """Compute the constants on a lattice with a spacing [m], for a support radius [m]."""
         width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
         shared = ACTS * dimension / (3.0 * (dimension - 1))
         return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
 
 
 def _indicator(size: np.ndarray) -> np.ndarray:
-    """w of s |q|."""
+    """Return w, how much a particle is part of the surface, from s |q|: 0 below `FAINT`, 1 above `CLEAR`."""
     t = np.clip((size - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 @cache
 def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[int, int]) -> float:
-    """J of a flat surface across a direction in the plane of the first two axes, for a support in spacings."""
+    """Return J of a surface cut across a direction in the plane of the first two axes, for a support in spacings."""
     offsets, volume = lattice_offsets(1.0, support, dimension), rest_volume(kernel, 1.0, support, dimension)
     apart = 1.0 / float(np.linalg.norm(cut))
     weights = volume * kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
@@ -78,9 +78,9 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 FAINT, CLEAR = 0.03, 0.1
 """s |q| below which a particle is no part of the surface, and above which all of it is."""
 SINGULAR = {2: 1e-3, 3: 1e-4}
-"""By dimension, what is added to det B: neighbours may lie on a line, or be missing. There kappa is 0."""
+"""By dimension, the number added to det B: neighbours may lie on a line, or be missing. There kappa is 0."""
 LONE = 1e-6
-"""What is added to sum V W w: where no neighbour is part of the surface, the mean curvature is 0."""
+"""The number added to sum V W w: where no neighbour is part of the surface, the mean curvature is 0."""
 HOLLOW = 0.25
 """delta kappa below which the depth of a hollow surface counts less, in a parabola, until it counts no more: bubbles of
 a radius below 3 delta, which the divisor 1 + delta kappa would be 0 in."""
@@ -88,23 +88,23 @@ a radius below 3 delta, which the divisor 1 + delta kappa would be 0 in."""
 
 @dataclass(frozen=True)
 class CurvatureFunctions:
-    """Warp functions of one particle."""
+    """Warp functions of one particle for the normal and the curvature of a fluid's surface."""
 
     normal: Any
-    """w and e of q and the spacing."""
+    """The indicator w and the normal e of q and the spacing."""
     normal_tangent: Any
-    """Their tangents, of q, the spacing and the tangent of q."""
+    """The tangents of w and e, by q, the spacing and the tangent of q."""
     normal_back: Any
-    """The adjoint of q, of q, the spacing and the adjoints of w and e."""
+    """The adjoint of q, by q, the spacing and the adjoints of w and e."""
     curvature: Any
-    """kappa of B and D."""
+    """The curvature kappa of B and D."""
     outermost: Any
-    """k of a, b and delta."""
+    """The curvature k at the surface of a, b and delta."""
 
 
 @cache
 def curvature_functions(precision: Precision, dimension: int, module: Any) -> CurvatureFunctions:
-    """In 2 or 3 dimensions, in a Warp module."""
+    """Make the Warp functions of a surface's curvature in 2 or 3 dimensions, in a Warp module."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     smoothstep = moment_functions(precision, dimension).smoothstep
     faint, clear = wp.constant(real(FAINT)), wp.constant(real(CLEAR))
@@ -112,13 +112,13 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
 
     @wp.func
     def rise(size: real) -> real:
-        """The derivative of w by s |q|."""
+        """Return the derivative of the surface indicator w with respect to s |q|."""
         t = wp.clamp((size - faint) / (clear - faint), real(0.0), real(1.0))
         return real(6.0) * t * (real(1.0) - t) / (clear - faint)
 
     @wp.func
     def normal(q: vector, spacing: real):
-        """Where w is 0, e is 0, as nothing depends on it."""
+        """Return the surface indicator w and the unit normal e of a particle; e is 0 where w is 0."""
         size, w, e = wp.length(q), real(0.0), vector()
         if size * spacing > faint:
             w = smoothstep(size * spacing, faint, clear)
@@ -144,7 +144,7 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
 
     @wp.func(module=module)
     def curvature(B: matrix, D: matrix) -> real:
-        """-tr(B^-1 D), by cofactors."""
+        """Return the curvature kappa = -tr(B^-1 D), by cofactors."""
         a = B[1, 1] * B[2, 2] - B[1, 2] * B[2, 1]
         b = B[0, 2] * B[2, 1] - B[0, 1] * B[2, 2]
         c = B[0, 1] * B[1, 2] - B[0, 2] * B[1, 1]
@@ -168,33 +168,34 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
 
 @dataclass(frozen=True)
 class CurvatureSums:
-    """Warp functions of sums over the fluid. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
+    """Warp functions of the curvature's sums over the fluid; symmetric matrices are diagonals and entries yz, xz,
+    xy."""
 
     colour: Any
     """g and z, without W(0)."""
     colour_tangent: Any
     colour_back: Any
-    """What adjoints of g and z give to x."""
+    """The adjoint of x by those of g and z."""
     average: Any
     """V sum W_ij g_j"""
     average_tangent: Any
     average_back: Any
-    """For adjoints r of it: V sum W_ij r_j, and what x is given."""
+    """From the adjoint r of the average: V sum W_ij r_j, and the adjoint of x."""
     bend: Any
     """B and the symmetric part of D."""
     bend_tangent: Any
     bend_back: Any
-    """For symmetric adjoints of B and D: what e, w and x are given."""
+    """From symmetric adjoints of B and D to those of e, w and x."""
     mean: Any
     """V sum W_ij c_j and V sum W_ij w_j"""
     mean_tangent: Any
     mean_back: Any
-    """For adjoints a and b of the two: V sum W_ij a_j, V sum W_ij b_j, and what x is given."""
+    """From adjoints a and b of both sums: V sum W_ij a_j, V sum W_ij b_j, and the adjoint of x."""
 
 
 @cache
 def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
-    """The sums over neighbours of the curvature, for a discretisation."""
+    """Make the sums over neighbours of the curvature, for a discretisation."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), matrix_type(precision)
@@ -203,7 +204,7 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Entries yz, xz and xy of (a b^T + b a^T) / 2."""
+        """Return the entries yz, xz and xy of the symmetric matrix (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     @fluid_sum(discretisation)
@@ -256,7 +257,7 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         w_dot_j: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, vector, vector]:
-        """g x^T is symmetric, and so are the two terms together that its tangent has."""
+        """Return a pair's tangents of B and D; g x^T is symmetric, and so is the sum of its tangent's two terms."""
         g = (s.volume * w_j) * gradient(x_ij, s)
         g_dot = s.volume * (w_dot_j * gradient(x_ij, s) + w_j * hessian_product(x_ij, x_dot_ij, s))
         turn, turn_dot = e_j - e_i, e_dot_j - e_dot_i
@@ -280,7 +281,7 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         D_bar_j: matrix,
         s: neighbourhood,
     ) -> tuple[vector, real, vector]:
-        """A pair adds w_j times something to the sums of i, and w_i times the same to those of j."""
+        """Return a pair's adjoints of e, w and x; in the sums of i it has w_j, in those of j w_i as a factor."""
         g, turn = s.volume * gradient(x_ij, s), e_j - e_i
         moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
         turned = w_j * D_bar_i + w_i * D_bar_j

@@ -38,7 +38,7 @@ from cortado.sph.moment_functions import matrix_type, moment_functions
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Names and types of what is kept of each particle, with c = w kappa."""
+    """Return names and types of the arrays that surface tension by curvature keeps of particles, with c = w kappa."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
@@ -57,7 +57,7 @@ class CurvatureKernels:
 
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> CurvatureKernels:
-    """In 2 or 3 dimensions; ``depth`` is delta and ``per_width`` 1 / J."""
+    """Make the kernels of tension by curvature, in 2 or 3 dimensions; ``depth`` is delta and ``per_width`` 1 / J."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
@@ -116,7 +116,7 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> Curvatu
 
 @cache
 def curvature_tangents(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
-    """Of the four kernels, in 2 or 3 dimensions, in the Warp module of a topic."""
+    """Make the tangents of the four curvature kernels, in 2 or 3 dimensions, in the Warp module of a topic."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
@@ -194,7 +194,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 
 @cache
 def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: str) -> tuple[Any, ...]:
-    """Of the four kernels; that of the last one is two, the first of which has no neighbours."""
+    """Make the adjoints of the four curvature kernels; the last has two, the first of which has no neighbours."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), curvature_sums(discretisation)
@@ -214,7 +214,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         b_i: real,
         acceleration_bar_i: vector,
     ) -> tuple[real, real, vector, real, real, real]:
-        """What the adjoint of the acceleration asks of a particle's own numbers."""
+        """Turn the adjoint of the acceleration into those of a particle's own m, sigma, q, w, a and b."""
         k = outermost(a_i, b_i, depth)
         by_a, by_b, _by_depth = wp.grad(outermost)(a_i, b_i, depth)
         strength, work = surface_tension * per_width / m_i, wp.dot(q_i, acceleration_bar_i)
@@ -242,7 +242,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         D_i: matrix,
         s: neighbourhood,
     ) -> tuple[vector, real, matrix, matrix]:
-        """From the adjoints of a and b to those of B and D."""
+        """Turn the adjoints of a and b into those of B and D, and add to those of x and w."""
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
         c_bar = c_part + self_weight * a_bar_i
         by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
@@ -261,7 +261,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         w_bar_i: real,
         q_bar_i: vector,
     ) -> tuple[vector, vector, real]:
-        """From the adjoints of B, D, w and q to those of V sum W_ij g_j, which r is, and of z."""
+        """Turn the adjoints of B, D, w and q into those of z and of V sum W_ij g_j, which is r."""
         r = (q_bar_i + normal_back(q_i, spacing, w_bar_i + w_part, e_bar)) / z_i
         return x_part, r, -wp.dot(q_i, r)
 

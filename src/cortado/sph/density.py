@@ -30,9 +30,9 @@ class DensitySums:
 
 @cache
 def density_sums(discretisation: Discretisation) -> DensitySums:
-    """Raw neighbour sums: ``weights`` (sum of W, with what fills the list up), ``weights_tangent`` and
-    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib: the adjoint of positions for an
-    adjoint r of the sum of every particle)."""
+    """Make the raw neighbour sums of the density: ``weights`` (sum of W, with what fills the list up),
+    ``weights_tangent`` and ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib). The last is the adjoint
+    of positions for an adjoint r of every particle's sum."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -57,7 +57,7 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
 
 @cache
 def density_solid_kernel(discretisation: Discretisation, topic: str = "density", looped: bool = False) -> Any:
-    """The kernel of what the number density gives to solids, for its adjoints ``bar`` (`SolidShares.add`)."""
+    """Make the kernel from the adjoint ``bar`` of number densities to those of solids (`SolidShares.add`)."""
     return solid_kernel(discretisation, topic, _density_work, looped=looped)
 
 
@@ -72,8 +72,8 @@ def _density_work(d: Discretisation) -> Any:
 
 @cache
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions, in the Warp modules of
-    a topic: one that a solver has of its own saves it a module to load."""
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the number density, in the Warp modules of a topic; a
+    topic that a solver has anyway saves it a module to load."""
     real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)

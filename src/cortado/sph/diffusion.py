@@ -41,7 +41,7 @@ class PairwiseLaplacian:
 
 @cache
 def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> PairwiseLaplacian:
-    """Raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
+    """Make raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     fractions = discretisation.precision.fractions(phases)
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -90,7 +90,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         y_ij: fractions,
         s: neighbourhood,
     ) -> tuple[vector, real, real, fractions, real]:
-        """For an adjoint y of the sums: what it gives those of x_i, n_i, w_i and u_i, and y_i times the sum itself."""
+        """Return a pair's adjoints of x_i, n_i, w_i and u_i for an adjoint y of the sums, and y_i times the sum."""
         f = factor(x_ij, s)
         weight = w_i / n_j + w_j / n_i
         work = wp.dot(u_ij, y_ij)
@@ -102,7 +102,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 MOST_SUBSTEPS = 10_000
-"""Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
+"""Most explicit steps of diffusion in a time step; with more the mobility is taken for a mistake."""
 
 
 def stable_substeps(
@@ -113,8 +113,8 @@ def stable_substeps(
     interface_width: float,
     rest_density: np.ndarray,
 ) -> int:
-    """Those that are stable in a scene of several phases with a time step [s], a mobility [m2/s], an interface width
-    [m] and rest densities (phases,) [kg/m3]; raises `OutOfRangeError` where there would be more than
+    """Return how many substeps of diffusion are stable in a scene of several phases with a time step [s], a mobility
+    [m2/s], an interface width [m] and rest densities (phases,) [kg/m3]. Raises `OutOfRangeError` for more than
     `MOST_SUBSTEPS`."""
     mixture, discretisation = scene.mixture, scene.discretisation
     limit = diffusion_limit(
@@ -138,7 +138,7 @@ def stable_substeps(
 
 @dataclass(frozen=True)
 class Diffusion:
-    """What the kernels of a mixture are made for."""
+    """The choices for which kernels of a mixture's diffusion are made: discretisation, phases, energy and mobility."""
 
     discretisation: Discretisation
     phases: int
@@ -147,7 +147,7 @@ class Diffusion:
 
     @property
     def modules(self) -> tuple[Any, Any, Any]:
-        """The Warp modules of forward, tangent and adjoint kernels."""
+        """Return the Warp modules of forward, tangent and adjoint kernels."""
         return self.discretisation.modules(f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}")
 
 
@@ -162,7 +162,7 @@ class DiffusionKernels:
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
-    """Kernels of the potential, of the flux, and of the adjoint of the flux's scale."""
+    """Make kernels of the chemical potential, of the flux, and of the adjoint of the flux's scale."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision = discretisation.precision
     real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
@@ -198,7 +198,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_i: fractions,
         s: neighbourhood,
     ) -> tuple[fractions, real]:
-        """chi, and m M as ``w``."""
+        """Return the chemical potential chi of a particle, and m M as ``w``."""
         stiffness = interface_width * interface_width * s.volume / m_i
         return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
 
@@ -253,7 +253,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @particle_kernel(adjoint_module, "y", numbers=["substeps"])
     def scale_adjoint(substeps: int, time_step: real, m_i: real, c_bar_i: fractions, s: neighbourhood) -> fractions:
-        """The adjoint y of the flux's raw sum."""
+        """Return the adjoint y of the flux's raw sum from the adjoint of the new fractions."""
         return (time_step / real(substeps) * s.volume / m_i) * c_bar_i
 
     @particle_kernel(
@@ -276,7 +276,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_i: fractions,
         s: neighbourhood,
     ) -> tuple[vector, real, real, fractions, real, real, fractions]:
-        """Goes on to the adjoint z of the potential's raw sum."""
+        """Add to the adjoints of the flux's inputs, and return z, the adjoint of the potential's raw sum."""
         m_part = w_bar * mobility * mobile(c_i) - own / m_i
         c_part = (w_bar * m_i * mobility) * mobile_gradient(c_i)
         c_part += strength * energy_hessian_product(c_i, project(chi_bar))

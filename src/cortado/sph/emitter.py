@@ -30,19 +30,19 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @dataclass(frozen=True)
 class EmitterKernels(Kernels):
-    """The kernels of the end of a step, in the scene's order of particles; the others have one thread a scene."""
+    """The kernels of an emitter at the end of a step, in scene order; ``begin`` and ``collect`` work by scene."""
 
     begin: Any
     """Keeps q_(n-1) of the state before a step, and l at its end, as a step may write over the state that it reads."""
     begin_tangent: Any
     collect: Any
-    """Adds what prescribed particles leave to the adjoints of the parameters and of the state before."""
+    """Adds the adjoints left by prescribed particles to those of the parameters and of the state before."""
 
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """The Warp struct of what does not change of an emitter; its arrays are of the particles of one scene from
-    ``first`` on."""
+    """Make the Warp struct of an emitter's constants; its arrays are of the particles of one scene from ``first``
+    on."""
     real, vector = precision.real, precision.vector
 
     class Nozzle:
@@ -57,7 +57,7 @@ def nozzle_type(precision: Precision) -> Any:
         column: real
         """Particles further upstream are in reserve [m]."""
         reserve: vector
-        """How far these are from their place in line [m]."""
+        """Distance of particles in reserve from their place in line [m]."""
         area: real
         """A [m^(d - 1)]"""
 
@@ -67,19 +67,19 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
-    """The kernels for a precision. Of each scene b, ``outlet`` (members,) is q_(n-1) [m], ``emitted`` (members,) l at
-    the end of the step [m]."""
+    """Make the kernels of an emitter for a precision. Of each scene, ``outlet`` (members,) is q_(n-1) [m], ``emitted``
+    (members,) l at the end of the step [m]."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     changes = bundle(outlet=vector, emitted=wp.float64, flow_rate=real, time_step=real)
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
-        """w dt"""
+        """Return w dt, how far the column of fluid moves in a step [m]."""
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
     @wp.func
     def remaining(p: int, nozzle: nozzle_of, emitted: wp.float64) -> real:
-        """s of a particle; 0 for one that is no part of the emitter."""
+        """Return how far a particle is upstream of the opening, s [m]; 0 for one that is no part of the emitter."""
         if p < nozzle.first:
             return real(0.0)
         return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
@@ -178,7 +178,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     def prescribe_adjoint(
         i: int, member: int, particles: int, nozzle: nozzle_of, emitted: wp.float64, x_bar_i: vector, v_bar_i: vector
     ) -> tuple[vector, vector, vector, vector]:
-        """What reaches free particles, and what reaches prescribed ones."""
+        """Split the adjoints of new positions and velocities into those of free and of prescribed particles."""
         prescribed = remaining(i - member * particles, nozzle, emitted) > real(0.0)
         return (
             wp.where(prescribed, vector(), x_bar_i),
@@ -221,9 +221,9 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
 
 
 OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
-"""Where the opening of the nozzle is."""
+"""The position of the nozzle's opening."""
 EMITTED = StateField("emitted", "m", Entry.DOUBLE, Axis.SCALAR)
-"""The length of the column of fluid that has left it."""
+"""The length of the column of fluid that has left the nozzle."""
 
 
 @dataclass(frozen=True)
@@ -239,21 +239,21 @@ class Nozzle:
     direction: np.ndarray
     """(d,) of the flow, a unit vector"""
     area: float
-    """Of the opening [m2], in 2-D [m]."""
+    """Area of the opening [m2], in 2-D [m]."""
     column: float
     """Particles further upstream are in reserve [m]."""
     reserve: np.ndarray
-    """(d,) how far these are from their place in line [m]"""
+    """Distance (d,) of particles in reserve from their place in line [m]."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
 
 
 class Emitter(Part):
-    """The emitter of one solver."""
+    """The part of a step that prescribes the particles which wait in a nozzle, in one solver."""
 
     fields = (OUTLET, EMITTED)
-    """What it carries from step to step."""
+    """Fields that the emitter carries from step to step."""
 
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
         self.nozzle, self.layout = nozzle, layout
@@ -272,7 +272,7 @@ class Emitter(Part):
         """Of the nozzle, and of a step once it has begun, for kernels."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Keep what the end of a step needs of the state before it."""
+        """Keep the nozzle's fields of the state before the step, which the end of the step needs."""
         before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
         step.launch(self.kernels.begin, self.constants, **before, threads=self.layout.members)
 
@@ -292,7 +292,7 @@ class Emitter(Part):
 
 
 class EmitterTangent(PartTangent):
-    """Forward mode of prescribed particles and of the nozzle."""
+    """The tangent of prescribed particles and of the nozzle, for forward mode."""
 
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
@@ -309,7 +309,7 @@ class EmitterTangent(PartTangent):
 
 
 class EmitterAdjoint(PartAdjoint):
-    """Reverse mode of prescribed particles and of the nozzle."""
+    """The adjoint of prescribed particles and of the nozzle, for reverse mode."""
 
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
@@ -320,8 +320,8 @@ class EmitterAdjoint(PartAdjoint):
         self._sums = [layout.sum_of(layout.precision.vector) for _ in range(2)]
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """What reaches free particles; adds what reaches prescribed ones to ``bar`` and to the adjoint of the nozzle,
-        which becomes that before the step."""
+        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and to the adjoint of the
+        nozzle, which becomes that before the step."""
         emitter, free, prescribed = self._emitter, self._free, self._prescribed
         step.launch(
             emitter.kernels.adjoint,

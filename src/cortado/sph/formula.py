@@ -30,7 +30,7 @@ WIDTH = (1, 3)
 
 @dataclass(frozen=True)
 class PackingKernels:
-    """By the rank of a parameter: of its value in a step into theta, and of the adjoint of theta into its own."""
+    """Kernels, by a parameter's rank, that write its value in a step into theta and add theta's adjoint to its own."""
 
     pack: tuple[Any, Any]
     add: tuple[Any, Any]
@@ -38,7 +38,7 @@ class PackingKernels:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
-    """Parameters are (members, steps), or (members, 1) where they are constant."""
+    """Make the kernels that pack parameters (members, steps) into theta; constant ones are (members, 1)."""
     real, vector = precision.real, precision.vector
     forward, backward = integration_module(precision, True, taped), integration_module(precision, False)
 
@@ -96,7 +96,7 @@ def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
 
 
 class Packed:
-    """Theta of every scene, its tangent, and its adjoint, for the force of one solver."""
+    """The parameters of a user's function as one vector theta for every scene, with its tangent and its adjoint."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._parameters, self._layout = tuple(parameters), layout
@@ -111,15 +111,15 @@ class Packed:
         self._sum = layout.sum_of(self.dtype) if self._parameters else None
 
     def theta(self, step: StepContext) -> wp.array:
-        """(members,) in a step."""
+        """Return theta (members,), the packed parameters in a step."""
         return self._pack(step, step.parameters, self._flat, self._theta)
 
     def theta_dot(self, step: StepContext, parameters_dot: Parameters) -> wp.array:
-        """(members,) its tangent."""
+        """Return the tangent (members,) of theta, the packed parameters in a step."""
         return self._pack(step, parameters_dot, self._flat_dot, self._theta_dot)
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add up the `shares`, into the adjoints of the parameters."""
+        """Add up the particles' `shares` of theta's adjoint into the adjoints of the parameters."""
         if self._sum is None:
             return
         total = self._sum(self.shares)
@@ -136,7 +136,7 @@ class Packed:
         return vectors
 
     def _places(self) -> list[tuple[int, Parameter]]:
-        """Where in theta each parameter begins."""
+        """Return the parameters with the indices in theta at which they begin."""
         places, first = [], 0
         for parameter in self._parameters:
             places.append((first, parameter))
@@ -144,7 +144,7 @@ class Packed:
         return places
 
     def _rows(self, array: wp.array) -> wp.array:
-        """A parameter with an axis of steps, which has one entry where it is constant."""
+        """Return a parameter as an array with an axis of steps, which has one entry where it is constant."""
         return array if array.ndim == 2 else array.reshape((self._layout.members, 1))
 
     def _numbers(self, requires_grad: bool) -> wp.array:
@@ -153,7 +153,7 @@ class Packed:
         return wp.zeros((layout.members, self._size), dtype=layout.precision.real, **options)
 
     def _vectors(self, flat: wp.array) -> wp.array:
-        """The same memory as vectors, that of its adjoint included."""
+        """Return an array of numbers as vectors in the memory of that array, with its adjoint."""
         shape = (self._layout.members,)
         vectors = self._view(flat, self.dtype, shape)
         if flat.requires_grad:
@@ -168,35 +168,35 @@ class Packed:
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """The Warp vector of as many numbers as parameters of these ranks have; of one, where there are none."""
+    """Return the Warp vector type that holds parameters of these ranks; of one number where there are none."""
     return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What functions of a kind are given before their parameters, but for the time, which they may leave out."""
+    """The first arguments of a kind of user functions, before the parameters; the time among them may be left out."""
 
     names: tuple[str, str]
-    """What sentences call them."""
+    """Names of the inputs in messages."""
     kind: str = "vector"
-    """"vector" or "number": what they are, and what the function returns."""
+    """"vector" or "number": the type of the inputs and of the function's result."""
 
 
 TIME = "t", "time"
-"""Names that the time has."""
+"""Names of an argument that is the time."""
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
-"""How a compiler writes those of vectors and numbers."""
+"""Finds the types of vectors and numbers as a compiler writes them."""
 INPUTS = {
     "Body": Inputs(("x", "v")),
     "Pair": Inputs(("x_ij", "v_ij")),
     "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
 }
-"""By what sentences call a force."""
+"""By the name of a kind of force in messages."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """The function of a force. Two are equal where their texts are, numbers from outside of them included."""
+    """A user's function as kernels call it. Two are equal where their texts and the numbers from outside are."""
 
     name: str
     text: str
@@ -204,16 +204,16 @@ class Formula:
     inputs: tuple[str, ...]
     """Its arguments before the parameters: two vectors or numbers, and time if there is a third."""
     kind: str
-    """"vector" or "number": what the first two are, and what it returns."""
+    """"vector" or "number": the type of the first two inputs and of the result."""
     parameters: tuple[str, ...]
-    """Its other arguments."""
+    """Its arguments after the inputs."""
     outside: str
-    """What the text does not say: the functions under ``@wp.func`` that it calls, and values, as a text."""
+    """A text of everything that `text` refers to: the functions under ``@wp.func`` that it calls, and values."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
-    """What names in the text stand for."""
+    """Values of the names in the text."""
 
     def function(self, precision: Precision, types: tuple[Any, ...], module: Any) -> Any:
-        """The Warp function of a precision, with the types of its parameters; it has the name of the user's."""
+        """Make the Warp function in a precision, with the types of its parameters; it has the name of the user's."""
         real, vector = precision.real, precision.vector
         scope = {**self.scope, **meanings(precision), REAL: real, VECTOR: vector}
         code = compile(self.text, f"<force {self.name}>", "exec")
@@ -229,8 +229,8 @@ class Formula:
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """A user's function with its text, called ``kind`` in sentences, and the values of its parameters: those given, and
-    its own for what is not. Raises `InputError`."""
+    """Read a user's function with its text, called ``kind`` in messages, and return it with its parameters' values:
+    those given, and its defaults for others. Raises `InputError`."""
     what = f"{kind} function {function.__name__}"
     inputs, values = _arguments(what, function, parameters, INPUTS[kind])
     frozen, written = Frozen(what, function), definition(what, function, source)
@@ -254,9 +254,9 @@ def formula(
 def _arguments(
     what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Names of the inputs, and the parameters' values in the order of the function's arguments. The first two inputs
-    may have any names; those of ``first``, and t, stand for nothing else. A third one is the time only where its name
-    says so, as it may be a parameter whose value was forgotten."""
+    """Return names of the inputs, and the parameters' values in the order of the function's arguments. The first two
+    inputs may have any names; those of ``first``, and t, stand for nothing else. A third one is the time only where its
+    name says so, as it may be a parameter whose value was forgotten."""
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
@@ -283,8 +283,8 @@ def _arguments(
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
-    """Compile a module with a user's function, which returns a vector or a number; raises `InputError` where
-    Warp cannot, with the first thing that its compiler says of it."""
+    """Compile a module with a user's function, which returns a vector or a number; raise `InputError` with the first
+    message of Warp's compiler where it fails."""
     with TemporaryFile() as said:
         try:
             with c_stderr_to(said.fileno()):
@@ -305,8 +305,8 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """The Warp function of two vectors or numbers and theta that a user's function is; in 2-D without what a vector has
-    along z."""
+    """Make the Warp function of two vectors or numbers and theta that calls a user's function; in 2-D vectors lose
+    their z."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0

@@ -36,12 +36,12 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """f(c) of mass fractions c (phases,), for kernels and for NumPy. A user's own is another object of this class."""
+    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may make their own."""
 
     name: str
-    """Tells kernels of one energy from those of another."""
+    """Name that tells kernels of one energy from those of another."""
     value: Callable[[np.ndarray], np.ndarray]
-    """f of (n, phases) -> (n,)."""
+    """Function f of fractions (n, phases) -> (n,)."""
     curvature: float
     """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]: it
     bounds the time step."""
@@ -57,7 +57,7 @@ class FreeEnergy:
             raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
 
     def check(self, precision: Precision, phases: int, device: Any) -> None:
-        """Raises `InputError` where its ``functions`` fail, or return no functions of so many fractions."""
+        """Raise `InputError` where the energy's ``functions`` fail, or return no functions of so many fractions."""
         what = f"FreeEnergy {self.name}'s functions"
         try:
             found = self.functions(precision, phases)
@@ -81,7 +81,7 @@ class FreeEnergy:
 
 @dataclass(frozen=True)
 class Mobility:
-    """m(c), from 0 to 1."""
+    """A mobility m(c) of mass fractions, from 0 to 1."""
 
     name: str
     greatest: Callable[[int], float]
@@ -166,7 +166,7 @@ def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
 
     @wp.func
     def products(c: fractions) -> real:
-        """sum_(k < l) c_k c_l"""
+        """Return sum_(k < l) c_k c_l over all pairs of phases."""
         t = total(c)
         return real(0.5) * (t * t - wp.dot(c, c))
 

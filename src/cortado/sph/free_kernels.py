@@ -26,34 +26,34 @@ from cortado.sph.rotations import rotations
 
 @dataclass(frozen=True)
 class FreeFunctions:
-    """The bundle of a body's state, and Warp functions of scene b."""
+    """The bundle of a free body's state, and Warp functions of its rotation in scene b."""
 
     state: Any
     """position, turn_x, turn_y, turn_z, rotation, velocity and angular_velocity"""
     about: Any
     """The vector of an angle, or of an angular velocity."""
     angle_of: Any
-    """The other way."""
+    """The angle, or angular velocity, of a vector."""
     attitude: Any
-    """Q"""
+    """The rotation Q since the start."""
     column: Any
-    """Of a matrix."""
+    """A column of a matrix."""
     evened: Any
-    """Q - I of a Q, of which round-off is taken that makes its axes longer or lets them lean."""
+    """Q - I of a Q without round-off that would make its axes longer or let them lean."""
     twist: Any
-    """The adjoint of a further turn of Q for that of a state; of a tangent twice the turn."""
+    """From the adjoint of a state to that of a further turn of Q; for a tangent, twice the turn."""
     write_twist: Any
-    """The adjoint of a state for that of a further turn of Q."""
+    """From the adjoint of a further turn of Q to that of a state."""
 
 
 def free_module(precision: Precision) -> Any:
-    """The Warp module of kernels of free bodies that need no smoothing kernel."""
+    """Return the Warp module of kernels of free bodies that need no smoothing kernel."""
     return kernel_module(f"free_bodies_derivative_{precision.name}")
 
 
 @cache
 def rate_function(precision: Precision) -> Any:
-    """The Warp function R A R^T w of matrices R and A and a vector w."""
+    """Make the Warp function R A R^T w of matrices R and A and a vector w."""
     vector, matrix = precision.vector, matrix_of(precision)
 
     @wp.func
@@ -65,7 +65,7 @@ def rate_function(precision: Precision) -> Any:
 
 @cache
 def free_functions(precision: Precision, dimension: int) -> FreeFunctions:
-    """In 2 or 3 dimensions."""
+    """Make the Warp functions of a free body's state and rotation, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     angle = rotations(precision, dimension).angle
     axes = dict.fromkeys(("turn_x", "turn_y", "turn_z"), vector)
@@ -124,17 +124,17 @@ def free_functions(precision: Precision, dimension: int) -> FreeFunctions:
 
 @dataclass(frozen=True)
 class FreeKernels:
-    """Of one body, with a thread for each scene."""
+    """Kernels of one free body's motion in a step, with a thread for each scene."""
 
     predict: Kernels
-    """Where its walls are, and V, W and L."""
+    """The pose in which its walls are, and V, W and L."""
     end: Kernels
     """The state after the step."""
 
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of a free body's motion, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     flat, space, of_body = (
         rotations(precision, dimension),
@@ -226,8 +226,8 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         time_step_bar: wp.array(dtype=real),
         density_bar: wp.array(dtype=real),
     ):
-        """``bar`` has what the end of the step gives to c and Q, ``turned_end`` what it gives to a further turn of R;
-        force and torque are the adjoints of poses, and ``moved`` those of V, W and L."""
+        """Apply the adjoint of a body's predicted pose. ``bar`` has the adjoints of c and Q, ``turned_end`` that of a
+        further turn of R; force and torque are the adjoints of poses, and ``moved`` those of V, W and L."""
         b = wp.tid()
         Q, dt = attitude(b, of), time_step[b]
         R, w = Q * begun_rotation(of.rotation[b]), about(of.angular_velocity[b])
@@ -256,7 +256,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         # out
         later: after,
     ):
-        """Writes the pose and the velocities of each body at the end of the step; ``moved`` has V_1, W_1 and L_1."""
+        """Write the pose and the velocities of each body at the end of the step; ``moved`` has V_1, W_1 and L_1."""
         b = wp.tid()
         dt = time_step[b]
         turning = rotation(dt * moved.W[b])
@@ -318,7 +318,7 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         bars_of: bars,
         turned_end: wp.array(dtype=vector),
     ):
-        """From the adjoint of the state to those of V_1, W_1, L_1, and of a further turn of R."""
+        """Turn the adjoint of a body's state into those of V_1, W_1, L_1, and of a further turn of R."""
         b = wp.tid()
         dt, w, L, turning, before = (
             time_step[b],

@@ -36,36 +36,36 @@ NAMES = {
     "velocity": velocity_name,
     "angular_velocity": angular_velocity_name,
 }
-"""Of fields of a state that begin as parameters, by what kernels call them."""
+"""Names of a body's state fields that begin as parameters, by the names that kernels have for them."""
 MOTION = ("V", "W", "L")
 GIVEN = ("pushed", "twisted")
 
 
 @dataclass(frozen=True)
 class FreeTable:
-    """A free body of a scene."""
+    """A free body of a scene, by its number, its name and its mass."""
 
     name: str
     number: int
-    """Among the solids that move."""
+    """Number among the solids that move."""
     mass: Mass
-    """With a density of 1, in volumes of a particle."""
+    """Mass and inertia for a density of 1, in volumes of a particle."""
 
 
 @dataclass(frozen=True)
 class FreeSolids:
-    """Makes the part of one solver."""
+    """A maker of the part that moves free bodies in a solver."""
 
     tables: Sequence[FreeTable]
     dimension: int
     search: NeighbourSearch
-    """Whose walls are theirs."""
+    """The search for neighbours that has the walls of the bodies."""
     contacts: "Callable[[FreeSolidsPart], Touch]"
-    """Makes what finds what bodies touch."""
+    """Makes the object that finds what bodies touch."""
 
     @property
     def walls(self) -> MovingWalls:
-        """The wall particles in which the search finds neighbours."""
+        """Return the wall particles in which the search finds neighbours."""
         assert self.search.moving is not None
         return self.search.moving
 
@@ -76,20 +76,20 @@ class FreeSolids:
 
 
 class Touch(Protocol):
-    """What finds what bodies touch, once poses are known, and writes `FreeBody.given`."""
+    """A search for what free bodies touch, once poses are known, which writes `FreeBody.given`."""
 
     def look(self, step: StepContext) -> None:
-        """For all bodies."""
+        """Find what all bodies touch, and write the momenta that they get by it."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Something with a ``look(step, dot)`` that writes `Changes.given`."""
+        """Return an object with a ``look(step, dot)`` that writes `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Something with a ``look(step, bar)`` that goes on from `Changes.given`."""
+        """Return an object with a ``look(step, bar)`` that goes on from `Changes.given`."""
 
 
 class FreeBody:
-    """One body in a step."""
+    """One free body in a step, with its arrays on the device."""
 
     def __init__(self, table: FreeTable, dimension: int, layout: Layout):
         self.table, vector = table, layout.precision.vector
@@ -119,17 +119,17 @@ class FreeBody:
         """V, W and L at the start of a step, and V_1, W_1 and L_1."""
 
     def state(self, state: State, suffix: str = "") -> dict[str, wp.array]:
-        """The fields of a state as kernels call them."""
+        """Return the body's fields of a state by the names that kernels have for them."""
         return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
 
     def known(self, step: StepContext) -> tuple[Named, ...]:
-        """What all kernels know of it."""
+        """Return the arrays and constants of the body that all kernels take."""
         density = step.parameters[density_name(self.table.name)]
         return self.constants, self.state(self.begun), {"density": density}
 
 
 class FreeSolidsPart(Part):
-    """The bodies of one solver."""
+    """The part of a step that moves the free bodies of one solver."""
 
     def __init__(self, made_of: FreeSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
@@ -164,7 +164,7 @@ class FreeSolidsPart(Part):
 
 
 class Changes:
-    """Tangents or adjoints of one body in a step."""
+    """Tangents or adjoints of one free body in a step."""
 
     def __init__(self, body: FreeBody, layout: Layout, suffix: str):
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
@@ -175,13 +175,13 @@ class Changes:
         """The adjoint of a further turn of R, by the end of the step."""
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Set all of the body's tangents or adjoints to 0."""
         for array in (*self.before.values(), *self.moved.values(), *self.given.values(), self.turned_end):
             array.zero_()
 
 
 class FreeSolidsTangent(PartTangent):
-    """Forward mode."""
+    """The tangent of free bodies in a step, for forward mode."""
 
     def __init__(self, part: FreeSolidsPart):
         self._part = part
@@ -209,7 +209,7 @@ class FreeSolidsTangent(PartTangent):
 
 
 class FreeSolidsAdjoint(PartAdjoint):
-    """Reverse mode."""
+    """The adjoint of free bodies in a step, for reverse mode."""
 
     def __init__(self, part: FreeSolidsPart):
         self._part = part

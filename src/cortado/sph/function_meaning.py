@@ -23,7 +23,7 @@ REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "
 
 @cache
 def meanings(precision: Precision) -> dict[str, Any]:
-    """By these names. Of a % b, which has the sign of b, and of a // b the bits are those of CPython."""
+    """Make Warp functions of Python's operators, by name; a % b, with the sign of b, and a // b have CPython's bits."""
     real, module = precision.real, kernel_module(f"python_{precision.name}")
     none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
 
@@ -62,9 +62,9 @@ Lines = ast.AST | list[ast.stmt]
 
 
 class InPrecision(ast.NodeTransformer):
-    """Numbers, and types of numbers and vectors, become those of the precision; what numbers and vectors from outside
-    are is written out, so that the text says all that the function does. Whole numbers are left as indices alone:
-    loops are written out too, and with them what each index is."""
+    """A rewriting of a function's text for a precision: numbers and types become those of the precision, and values
+    from outside are written out, which makes the text complete. Whole numbers stay as indices alone: loops are
+    unrolled, with the value of each index."""
 
     def __init__(self, what: str, scope: Mapping[str, Any], local: set[str]):
         self._what, self._scope, self._local = what, scope, local
@@ -143,7 +143,7 @@ class InPrecision(ast.NodeTransformer):
         return ast.Call(self.visit(node.func), given, keywords)
 
     def _index(self, node: ast.expr) -> int:
-        """What a whole number is, as Python computes it; raises `InputError`."""
+        """Return the whole number of an index as Python computes it; raise `InputError` where it is none."""
         known = {one.id: one for one in ast.walk(node) if isinstance(one, ast.Name)}
         values = {name: self._counts.get(name, self._scope.get(name)) for name in known if name not in self._local}
         values |= {name: count for name, count in self._counts.items() if name in known}
@@ -157,7 +157,7 @@ class InPrecision(ast.NodeTransformer):
         raise InputError(f"{found}, but must have whole numbers there, or what follows from the counts of its loops.")
 
     def _resolved(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """A name from outside, as a number or a type of the precision if it stands for one."""
+        """Replace a name from outside by the number or the type of the precision that it stands for, if it does."""
         try:
             value = self._value(node)
         except (KeyError, AttributeError):
@@ -175,7 +175,7 @@ class InPrecision(ast.NodeTransformer):
 
 
 def _number(node: ast.expr, value: Any) -> ast.AST:
-    """A call that makes a number or a vector of the precision, where a value is one; truth values as they are."""
+    """Return a call that makes a number or a vector of the precision from a value; truth values stay as they are."""
     if type(value) in (wp.vec3f, wp.vec3d):
         return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
     if isinstance(value, (bool, np.bool_)):
@@ -188,17 +188,17 @@ def _number(node: ast.expr, value: Any) -> ast.AST:
 
 
 BUILTINS = ("abs", "float", "int", "max", "min", "pow", "range", "round")
-"""Functions of Python that a function may call."""
+"""Python functions that a user's function may call."""
 MATH = (
     *("acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "degrees", "exp", "floor", "isfinite", "isinf", "isnan"),
     *("log", "log10", "log2", "pow", "radians", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
 )
-"""Those of its module math."""
+"""Functions of the module math that a user's function may call."""
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raises `InputError` for a call of something else than functions and types of Warp, as Warp would take one of its
-    own of the same name."""
+    """Raise `InputError` for a call of anything but functions and types of Warp, as Warp would take its own of that
+    name."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Call):
             continue
@@ -217,7 +217,7 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
-    """Raises `InputError` for ``and`` and ``or`` whose value is one of their numbers, as it is a truth in Warp."""
+    """Raise `InputError` for ``and`` and ``or`` whose value is one of their numbers, as it is a truth in Warp."""
     tests: set[ast.AST] = set()
     for node in ast.walk(function):
         if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):
@@ -234,8 +234,8 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
-    """Raises `InputError` for what a function under ``@wp.func``, whose numbers have types of their own, has in another
-    meaning than Python's."""
+    """Raise `InputError` for code in a function under ``@wp.func``, whose numbers have types of their own, that means
+    something else in Python."""
     check_truths(what, function)
     wholes = set(counts_of(function))
     for node in ast.walk(function):

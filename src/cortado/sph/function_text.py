@@ -24,11 +24,11 @@ from cortado.errors import InputError, shown
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
 """Texts of functions that came from other processes."""
 _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
-"""Instructions that say nothing of what a code does."""
+"""Instructions that do not matter for the meaning of a code."""
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
-    """What a user gives as the function of a force, which may be one of Warp; raises `InputError`."""
+    """Return the Python function that a user gives, unwrapped from Warp; raise `InputError` for anything else."""
     plain = function.func if isinstance(function, wp.Function) else function
     if not isinstance(plain, FunctionType):
         raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
@@ -39,14 +39,14 @@ def plain_function(kind: str, function: Any) -> FunctionType:
 
 
 def check_bare(what: str, function: Any) -> None:
-    """Raises `InputError` for a function that a decorator has put around another one."""
+    """Raise `InputError` for a function that a decorator has put around another one."""
     if hasattr(function, "__wrapped__"):
         found = f"{what} is one that a decorator has put around another, which Warp would compile without it"
         raise InputError(f"{found}, but must have no decorator other than wp.func.")
 
 
 def source_of(what: str, function: FunctionType) -> str:
-    """The text of a function; raises `InputError`."""
+    """Return the source text of a function; raise `InputError` where it is not to be found."""
     if function in _SENT:
         return _SENT[function]
     try:
@@ -62,8 +62,8 @@ def keep_source(function: FunctionType, source: str) -> None:
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
-    """What the text of a function defines, without annotations, defaults and decorators. Raises `InputError` where that
-    is another function, as where its file has changed since it was imported."""
+    """Parse the text of a function, without annotations, defaults and decorators. Raises `InputError` where the text
+    defines another function, as where its file has changed since it was imported."""
     try:
         found: ast.AST = ast.parse(source).body[0]
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
@@ -86,7 +86,7 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
 
 
 def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
-    """The code of a definition within one that has the names from around it; None where Python has none."""
+    """Compile a definition inside one that has the names from around it; None where Python finds no such code."""
     doc = found.body[0]
     if isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
         doc.value.value = of.co_consts[0] if of.co_consts else None  # its indentation is no matter
@@ -101,7 +101,7 @@ def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two codes or constants are the same."""
+    """Test whether two code objects or constants are equal in what they do."""
     if not isinstance(one, CodeType) or not isinstance(other, CodeType):
         return type(one) is type(other) and repr(one) == repr(other)
     found, wanted = _instructions(one), _instructions(other)
@@ -113,7 +113,7 @@ def _alike(one: tuple[str, Any], other: tuple[str, Any]) -> bool:
 
 
 def _instructions(code: CodeType) -> list[tuple[str, Any]]:
-    """What a code does, step by step, without what depends on which names are those of imported modules."""
+    """Return the instructions of a code, without those that depend on which names are those of imported modules."""
     steps = [step for step in dis.get_instructions(code) if step.opname not in _LEFT_OUT]
     places = [step.offset for step in steps]
     found = []
@@ -125,11 +125,11 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """The scope of a function and of all that it calls: numbers, vectors, and what modules and objects have of the
-    attributes that it reads, are copies. So are functions under ``@wp.func``, whose scopes are frozen too."""
+    """The scope of a function and of all that it calls, frozen: numbers, vectors, and attributes of modules and objects
+    that it reads are copies. So are functions under ``@wp.func``, whose scopes are frozen too."""
 
     def __init__(self, what: str, function: FunctionType):
-        """Raises `InputError` where a function that it calls is not what its text says."""
+        """Freeze the scope of a function; raise `InputError` where a function it calls is not as its text says."""
         self._what, self._made = what, dict[Any, Any]()
         self.helpers: list[Any] = []
         """The copies of functions of Warp's users, in each of their forms."""
@@ -177,7 +177,7 @@ class Frozen:
         return made
 
     def _function(self, helper: Any) -> FunctionType:
-        """The function of Python, with a scope that is frozen."""
+        """Return the Python function of a Warp helper, with a scope that is frozen."""
         function, what = helper.func, f"the function {helper.func.__name__} that {self._what} calls"
         check_bare(what, function)
         definition(what, function, helper.adj.source)
@@ -193,8 +193,8 @@ REAL, VECTOR = "cortado_real", "cortado_vector"
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """Refuses what Warp would differentiate wrongly without a word: loops that it does not unroll, and vectors that are
-    changed in part."""
+    """A check that refuses code which Warp would differentiate wrongly without a word: loops that it does not unroll,
+    and vectors that are changed in part."""
 
     def __init__(self, what: str):
         self._what = what
@@ -237,7 +237,7 @@ class DerivativeCheck(ast.NodeVisitor):
 
 
 def check_returns(what: str, function: ast.FunctionDef, kind: str) -> None:
-    """Raises `InputError` for a function that may end without returning anything."""
+    """Raise `InputError` for a function that may end without returning anything."""
     if not _returns(function.body):
         raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
 
@@ -250,7 +250,7 @@ def _returns(body: list[ast.stmt]) -> bool:
 
 
 def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raises `InputError` for a name that stands for nothing, or for arrays and lists, of which Warp takes none."""
+    """Raise `InputError` for an unknown name, or a name of arrays and lists, of which Warp takes none."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Name) or node.id in own:
             continue
@@ -266,6 +266,6 @@ def _is_range(node: ast.expr) -> bool:
 
 
 def counts_of(function: ast.FunctionDef) -> list[str]:
-    """The names that its loops count with."""
+    """Return the names of a function's loop counters."""
     targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
     return [target.id for target in targets if isinstance(target, ast.Name)]

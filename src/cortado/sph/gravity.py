@@ -15,7 +15,7 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 @cache
 def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
-    """The kernels; the tangent is the acceleration itself, of another table."""
+    """Make the kernels of gravity; the tangent is the acceleration kernel with another table."""
     vector = precision.vector
 
     @particle_kernel(integration_module(precision, True, taped), "acceleration:acceleration_in")
@@ -47,7 +47,7 @@ class Gravity:
 
     @cached_property
     def _sum(self) -> TreeReduction:
-        """Of the adjoint alone, so that its kernel is not compiled for a run forward."""
+        """Return the sum over particles for the adjoint; its kernel is not compiled for a run forward."""
         return self._layout.sum_of(self._layout.precision.vector)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -64,5 +64,5 @@ class Gravity:
 
 
 def force(setting: Setting) -> Gravity:
-    """Gravity in every scene."""
+    """Make the force of gravity, which acts in every scene."""
     return Gravity(setting.layout, setting.discretisation.taped)

@@ -39,7 +39,7 @@ from cortado.sph.viscous_stress import ViscousStress
 
 @cache
 def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
-    """The kernel of T for some velocities with M and mu kept, and that of B."""
+    """Make the kernel of the stress T for some velocities with M and mu kept, and that of the implicit operator B."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -56,7 +56,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
 
     @particle_kernel(module, "product share", [over(force, "total", mu="eta")], numbers=constants)
     def multiply(total: vector, time_step: real, v_i: vector, m_i: real) -> tuple[vector, real]:
-        """B v, and each particle's share in the product with v."""
+        """Return B v of the implicit viscosity, and each particle's share in the product with v."""
         found = v_i - time_step * total
         return found, m_i * wp.dot(v_i, found)
 
@@ -65,7 +65,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
 
 @dataclass(frozen=True)
 class ImplicitKernels:
-    """The kernels, by what they do."""
+    """Kernels of implicit viscosity that need no neighbours."""
 
     predict: Any
     """u = v + dt a; with tangents of v and dt that of u, where a does not change."""
@@ -79,7 +79,7 @@ class ImplicitKernels:
 
 @cache
 def implicit_kernels(precision: Precision) -> ImplicitKernels:
-    """In a precision."""
+    """Make the kernels of implicit viscosity that need no neighbours, in a precision."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"implicit_step_derivative_{precision.name}")
 
     @particle_kernel(module, "u")
@@ -102,23 +102,23 @@ def implicit_kernels(precision: Precision) -> ImplicitKernels:
 
 
 MOST = 1_000
-"""Iterations of a solve."""
+"""Greatest number of iterations of a solve."""
 
 
 class Solve(ConjugateGradients):
-    """Conjugate gradients for the particles of one solver."""
+    """A solve by conjugate gradients for the implicit viscosity of one solver's particles."""
 
     name, most = "viscous_iterations", MOST
 
     def __init__(self, layout: Layout, operator: tuple[Any, Any]):
-        """``operator``: the kernels that `operator_kernels` gives."""
+        """Prepare solves with an ``operator``: the kernels that `operator_kernels` gives."""
         precision = layout.precision
         super().__init__(layout, precision.vector, round_off(precision), MOST)
         self._pull, self._multiply = operator
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
-        """Write to ``y`` what solves B y = r, (n,) vectors both, and overwrite ``r``; ``known``: arguments of the
-        kernels of B."""
+        """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
+        B's kernels."""
 
         def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
             step.launch(self._pull, *known, v=p)
@@ -128,12 +128,12 @@ class Solve(ConjugateGradients):
 
 
 class ImplicitViscousStress(ViscousStress):
-    """Viscosity as a stress at the end of the step. It comes after all other forces."""
+    """The viscous stress of the velocities at the end of a step; this force comes after all others."""
 
     is_last = True
 
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Any = ()):
-        """As `ViscousStress`."""
+        """Prepare the force with the arguments of `ViscousStress`."""
         if setting.discretisation.taped:
             raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
         super().__init__(setting, law, parameters)
@@ -153,11 +153,11 @@ class ImplicitViscousStress(ViscousStress):
 
     @property
     def iterations(self) -> NDArray:
-        """(members,) those of the last solve, of a run or of a derivative."""
+        """Return the iterations (members,) of the last solve, of a run or of a derivative."""
         return np.asarray(self.solve.count.numpy())
 
     def _known(self, *more: Any) -> tuple[Any, ...]:
-        """Arguments of the kernels of B, with A and T of the velocities u."""
+        """Return arguments of the kernels of B, with A and T of the velocities u."""
         return *more, self.constants, self._at_end, self._of
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -172,7 +172,7 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext) -> None:
-        """u = v + dt a', with A and T of it."""
+        """Write the velocities u = v + dt a' at the end of the step, with their A and T."""
         step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
         step.launch(self._pull, *self._known(), v=self._u)
 
@@ -205,7 +205,7 @@ class ImplicitViscousStress(ViscousStress):
         step.launch(self._implicit.end_adjoint, own, *bar.named)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
-        """Returns the adjoint of the acceleration by all other forces."""
+        """Apply the adjoint of the force, and return the adjoint of the acceleration by all other forces."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
         self.solve(step, self._known(), self._r, self._y)
         step.launch(self._implicit.unweigh, y=self._y, r=self._r)
@@ -217,5 +217,5 @@ class ImplicitViscousStress(ViscousStress):
 
 
 def stress_of(scene: Scene) -> type[ViscousStress]:
-    """The class of the viscous stress in a scene."""
+    """Return the class of the viscous stress in a scene, explicit or implicit."""
     return ImplicitViscousStress if is_implicit(scene) else ViscousStress

@@ -13,7 +13,7 @@ from cortado.particles.particle_kernels import particle_kernel
 
 @dataclass(frozen=True)
 class OrderKernels:
-    """Kernels between the scene's order and the sorted one."""
+    """Kernels that bring an array of particles from the scene's order to the sorted one, and back."""
 
     sort: Any
     unsort: Any
@@ -21,7 +21,7 @@ class OrderKernels:
 
 @cache
 def order_kernels(dtype: Any, module: Any) -> OrderKernels:
-    """The kernels for entries of a Warp type, in a Warp module."""
+    """Make the kernels that sort and unsort entries of a Warp type, in a Warp module."""
 
     @wp.kernel(module=module)
     def sort(
@@ -47,13 +47,13 @@ def order_kernels(dtype: Any, module: Any) -> OrderKernels:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
-    """The Warp module of kernels that need no smoothing kernel; ``taped`` forward kernels get Warp's own adjoint."""
+    """Return the Warp module of kernels without a smoothing kernel; ``taped`` forward ones get Warp's own adjoint."""
     return kernel_module(f"integration_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
 @cache
 def prediction_share(precision: Precision) -> Any:
-    """The Warp function of what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoint of the time step."""
+    """Make the Warp function of the time step's adjoint by a prediction v* = v + dt a, x* = x + dt v*."""
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -65,8 +65,8 @@ def prediction_share(precision: Precision) -> Any:
 
 @cache
 def new_state_adjoint(precision: Precision) -> Any:
-    """The Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of v'.
-    It adds to that of the time step, too."""
+    """Make the Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of
+    v'. It adds to the adjoint of the time step, too."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
 
@@ -92,8 +92,8 @@ class IntegrationKernels:
 
 @cache
 def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels:
-    """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives; a tape
-    can differentiate ``taped`` ones."""
+    """Make kernels that ``sort`` and ``unsort`` a state and ``predict`` without pressure, with derivatives; a tape can
+    differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
 
     @wp.kernel(module=integration_module(precision, True, taped))
@@ -145,7 +145,7 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
 
     @particle_kernel(integration_module(precision, False), "acceleration_bar")
     def acceleration_adjoint(time_step: real, v_bar_i: vector) -> vector:
-        """Every prediction of the step used v + dt a, so that one adjoint is dt times the other."""
+        """Return the adjoint of the acceleration, dt times that of v, as all predictions of a step used v + dt a."""
         return time_step * v_bar_i
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)

@@ -16,7 +16,7 @@ from cortado.sph.parts import Force, Setting
 
 
 class ForceMaker(Protocol):
-    """Makes a force for each solver of a simulation that is given it, and says which parameters the force has.
+    """A maker of a force for each solver of a simulation, which says which parameters the force has.
 
     It is pickled with the simulation. A ``fingerprint``, a text, tells it from others, so that a search is not resumed
     with another force; without one its type and its attributes do. A method ``check(values, simulation)`` raises an
@@ -28,14 +28,14 @@ class ForceMaker(Protocol):
     them where kernels read ``time``."""
 
     def force(self, setting: Setting) -> Force | None:
-        """The force in one precision and on one device; None where nothing acts."""
+        """Make the force in one precision and on one device; None where nothing acts."""
 
 
 WANTED = "a list of forces, such as [cortado.forces.Body(function, k=2.0)]"
 
 
 def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
-    """What a user gives as ``forces``; raises `InputError`."""
+    """Return what a user gives as ``forces`` if these are makers of forces; else raise `InputError`."""
     if not isinstance(forces, (list, tuple)):
         raise InputError(f"forces is {shown(forces)}, but must be {WANTED}.")
     for k, maker in enumerate(forces):
@@ -47,7 +47,7 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 
 
 def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
-    """Those of a maker of ``what``; raises `InputError`."""
+    """Return the parameters of a maker of ``what``; raise `InputError` where they are no list of parameters."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
         wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
@@ -55,8 +55,8 @@ def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Param
 
 
 def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[SolidTable] = ()) -> Known:
-    """The parameters of a simulation with these forces, the solver that this makes, and solids; raises `InputError`
-    where two have one name, or take the place of one force."""
+    """Return the parameters of a simulation with these forces, this solver's maker and these solids; raise `InputError`
+    where two have one name, or replace the same force."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -69,15 +69,15 @@ def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[
 
 
 def check_own(known: Known, source: Source) -> None:
-    """The values that forces and a solver give their parameters are numbers of a shape that a scene can have; raises
-    `InputError`."""
+    """Raise `InputError` where values that forces and a solver give their parameters have a shape that does not suit
+    the scene."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
 
 
 def fingerprint(makers: Sequence[Any], source: Source) -> str:
-    """Which forces or solvers these make, with the values that they give their parameters; empty without any."""
+    """Return a hash of the forces or solvers of these makers, with their parameters' values; empty without any."""
     words = []
     for maker in makers:
         parameters = getattr(maker, "parameters", ())

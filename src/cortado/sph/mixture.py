@@ -29,14 +29,14 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 
 def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:
-    """The Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels get
-    Warp's own adjoint."""
+    """Return the Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels
+    get Warp's own adjoint."""
     return kernel_module(f"mixture_{kind_of(forward, taped)}_{phases}_{precision.name}", forward and taped)
 
 
 @dataclass(frozen=True)
 class MixtureKernels:
-    """The kernels that carry fractions into a step and out of it, and make materials of them."""
+    """The kernels that carry mass fractions into a step and out of it, and those of densities and viscosities."""
 
     order: OrderKernels
     blend: Kernels
@@ -44,14 +44,14 @@ class MixtureKernels:
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKernels:
-    """The kernels for a number of phases; their materials are arrays (members, phases). A tape can differentiate
-    ``taped`` ones."""
+    """Make the kernels of mixtures with a number of phases; their materials are arrays (members, phases). A tape can
+    differentiate ``taped`` ones."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
-        """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
+        """Return ln(mu + tiny) of a viscosity mu: any amount of a phase without viscosity makes a mixture thin."""
         return wp.log(viscosity + tiny)
 
     @particle_kernel(mixture_module(precision, phases, True, taped), "rho_0 mu")
@@ -97,7 +97,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         mu_bar_i: real,
         c_scene_bar: wp.array(dtype=fractions),
     ) -> tuple[fractions, fractions, fractions]:
-        """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
+        """Return adjoints of densities, viscosities and fractions; ``c_scene_bar`` is of the new fractions."""
         c_bar = fractions(c_scene_bar[order_i])  # a copy: what follows writes to its components
         rest_density_bar, viscosity_bar = fractions(), fractions()
         power_bar = mu_bar_i * mu_i
@@ -119,11 +119,11 @@ REFERENCE_DENSITY = StateField("reference_density", "kg/m³", Entry.NUMBER, is_c
 
 @dataclass(frozen=True)
 class Phases:
-    """How many phases there are, and how they diffuse into one another."""
+    """The maker of a mixture's part: the number of phases, and how they diffuse into one another."""
 
     count: int
     diffusion: Diffusion | None
-    """None: not at all."""
+    """None where phases do not diffuse."""
     strength: float
     """alpha of the free energy [-]."""
 
@@ -132,7 +132,7 @@ class Phases:
 
 
 class Mixture(Part):
-    """The composition of the particles of one solver; its arrays are reused by every step."""
+    """The part of a step that carries the composition of one solver's particles; every step reuses its arrays."""
 
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
         self.phases = phases
@@ -158,12 +158,12 @@ class Mixture(Part):
         """m M (n,) of each substep [kg / (m s)]."""
 
     def fractions(self) -> wp.array:
-        """(n,) of one number for each phase, all 0."""
+        """Make an array (n,) of zero vectors with one number for each phase."""
         dtype = self._layout.precision.fractions(self.phases.count)
         return wp.zeros(self._layout.all_particles, dtype=dtype, **self._options)
 
     def numbers(self) -> wp.array:
-        """(n,) numbers, all 0."""
+        """Make an array (n,) of zeros."""
         return wp.zeros(self._layout.all_particles, dtype=self._layout.precision.real, **self._options)
 
     def set_substeps(self, substeps: int) -> None:
@@ -174,7 +174,7 @@ class Mixture(Part):
             self.w.append(self.numbers())
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Without diffusion that is all."""
+        """Sort the mass fractions, and without diffusion compute the materials."""
         with step.aside():
             if self.phases.count > 1:
                 step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.c[0])
@@ -182,7 +182,7 @@ class Mixture(Part):
                 self._blend(step)
 
     def settle(self, step: StepContext) -> None:
-        """Take the substeps of diffusion."""
+        """Take the substeps of diffusion and compute the materials after them."""
         for k in range(self.substeps):
             assert self.diffusion is not None
             now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
@@ -192,11 +192,11 @@ class Mixture(Part):
             self._blend(step)
 
     def _blend(self, step: StepContext) -> None:
-        """Rest densities and viscosities."""
+        """Compute rest densities and viscosities from the mass fractions."""
         step.launch(self.kernels.blend.forward, c=self.c[self.substeps])
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the fractions after the last substep."""
+        """Write the mass fractions after the last substep of diffusion to the new state."""
         if self.phases.count > 1:
             step.launch(self.kernels.order.unsort, a=self.c[self.substeps], a_scene=state.mass_fractions)
 
@@ -208,7 +208,7 @@ class Mixture(Part):
 
 
 class MixtureAdjoint(PartAdjoint):
-    """Reverse mode of a mixture step, by gathers."""
+    """The adjoint of a mixture's step, by gathers, for reverse mode."""
 
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
@@ -234,7 +234,7 @@ class MixtureAdjoint(PartAdjoint):
 
 
 class MixtureTangent(PartTangent):
-    """Forward mode of a mixture step."""
+    """The tangent of a mixture's step, for forward mode."""
 
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
@@ -243,7 +243,7 @@ class MixtureTangent(PartTangent):
         self._w_dot = mixture.numbers()
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """From the tangent of the old fractions, in scene order, to those of the materials."""
+        """Take the tangent of the old fractions, in scene order, on to those of the materials."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
         if mixture.phases.count > 1:

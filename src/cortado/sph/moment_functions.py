@@ -16,18 +16,18 @@ import warp as wp
 from cortado.device.precision import Precision
 
 ROUNDING = 64.0
-"""How much that is, in units of the last place of 1."""
+"""The part of (tr M)^2 that is added to I_2, in units of the last place of 1."""
 
 
 @cache
 def matrix_type(precision: Precision) -> Any:
-    """The Warp type of 3 x 3 matrices."""
+    """Return the Warp type of 3 x 3 matrices in a precision."""
     return wp.types.matrix(shape=(3, 3), dtype=precision.real)
 
 
 @cache
 def cross_terms_function(precision: Precision) -> Any:
-    """The Warp function of the entries yz, xz and xy of a b^T, given a and b."""
+    """Make the Warp function of the entries yz, xz and xy of a b^T, given a and b."""
     vector = precision.vector
 
     @wp.func
@@ -39,19 +39,19 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @dataclass(frozen=True)
 class Symmetric:
-    """Symmetric matrices as six numbers, their diagonal and their entries yz, xz and xy: what a neighbour loads."""
+    """A type of symmetric matrices as six numbers that neighbours load: diagonal and entries yz, xz and xy."""
 
     kind: Any
     """The Warp type."""
     pack: Any
-    """The Warp function of a matrix."""
+    """The Warp function from a 3 x 3 matrix to six numbers."""
     times: Any
     """The Warp function of the product with a vector."""
 
 
 @cache
 def symmetric(precision: Precision) -> Symmetric:
-    """How symmetric matrices are kept as six numbers, in a precision."""
+    """Make the type and the functions of symmetric matrices as six numbers, in a precision."""
     vector, matrix = precision.vector, matrix_type(precision)
     six = precision.six
 
@@ -72,14 +72,14 @@ def symmetric(precision: Precision) -> Symmetric:
 
 @dataclass(frozen=True)
 class MomentFunctions:
-    """Warp functions of one particle."""
+    """Warp functions of one particle's moment matrix."""
 
     whole: Any
     """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
     change: Any
-    """The same of a tangent of M, and of any symmetric matrix."""
+    """A tangent of M, or any symmetric matrix, from its diagonal and its entries yz, xz and xy."""
     fullness: Any
-    """H"""
+    """The fullness H of a neighbourhood."""
     inverse: Any
     """M^-1, by cofactors."""
     smoothstep: Any
@@ -88,7 +88,7 @@ class MomentFunctions:
 
 @cache
 def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
-    """Of a precision in 2 or 3 dimensions."""
+    """Make the Warp functions of a particle's moment matrix, in a precision and in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
     rounding = wp.constant(real(ROUNDING * float(np.finfo(precision.numpy).eps) * (dimension == 3)))
@@ -100,12 +100,12 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
 
     @wp.func
     def whole(diagonal: vector, others: vector) -> matrix:
-        """In the plane M_zz is 1, which changes none of what lies in it."""
+        """Return M from its diagonal and its other entries; in the plane M_zz is 1, which changes nothing in it."""
         return change(diagonal + vector(real(0.0), real(0.0), plane), others)
 
     @wp.func
     def fullness(M: matrix) -> real:
-        """tiny covers particles without neighbours, where H is 0."""
+        """Return the fullness H by the moments M; tiny covers particles without neighbours, where H is 0."""
         product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
         I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
         I_3, trace = wp.determinant(M), wp.trace(M)
@@ -113,7 +113,7 @@ def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
 
     @wp.func
     def inverse(M: matrix) -> matrix:
-        """The derivative of the determinant by M must not be 0."""
+        """Return M^-1 by cofactors: the derivative of the determinant with respect to M must not be 0."""
         a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
         b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
         c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]

@@ -28,26 +28,26 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 from cortado.sph.rotations import rotations
 
 FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_name, "scale": scale_name}
-"""Of a solid in a state, as kernels call them."""
+"""Names of a solid's state fields, by the names that kernels have for them."""
 
 
 @dataclass(frozen=True)
 class PoseKernels:
-    """Of one solid, with a thread for each scene."""
+    """Kernels of the poses of one moving solid, with a thread for each scene."""
 
     begin: Any
-    """Its poses before and after a step."""
+    """The solid's poses before and after a step."""
     tangent: Any
-    """Their tangents."""
+    """The tangents of these poses."""
     end: Any
-    """The state at the end; of tangents that of their state."""
+    """The solid's state at the end of a step, or its tangent from the tangent before."""
     adjoint: Any
     """From the adjoints of the poses and of the state at the end to those of the parameters and of the state before."""
 
 
 @cache
 def _kernels(precision: Precision, dimension: int) -> PoseKernels:
-    """In 2 or 3 dimensions."""
+    """Make the kernels of moving solids' poses, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     of = rotations(precision, dimension)
     angle, rotation, further, back = of.angle, of.rotation, of.further, of.back
@@ -157,17 +157,17 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
 
 @dataclass(frozen=True)
 class MovingSolids:
-    """Makes the part of one solver."""
+    """A maker of the part that moves solids along given paths in a solver."""
 
     numbers: Mapping[str, int]
-    """Of those that are told where to go, by name, among those that move."""
+    """Numbers of the solids with given paths, by name, among all solids that move."""
     dimension: int
     search: NeighbourSearch
-    """Whose walls are theirs."""
+    """The search for neighbours that has the walls of the solids."""
 
     @property
     def walls(self) -> MovingWalls:
-        """The wall particles in which the search finds neighbours."""
+        """Return the wall particles in which the search finds neighbours."""
         assert self.search.moving is not None
         return self.search.moving
 
@@ -178,7 +178,7 @@ class MovingSolids:
 
 
 class MovingSolidsPart(Part):
-    """Puts walls where they are at the end of each step: its own, and those of other parts that come before it."""
+    """The part of a step that puts walls where they are at its end: its own, and those of parts that come before it."""
 
     def __init__(self, made_of: MovingSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
@@ -211,18 +211,18 @@ class MovingSolidsPart(Part):
         self.write_end(step, step.parameters, self.begun, state)
 
     def write_end(self, step: StepContext, parameters: Parameters, begun: State, state: State) -> None:
-        """The fields at the end of a step, or their tangents."""
+        """Write the fields of moving solids at the end of a step, or their tangents."""
         for name in self.made_of.numbers:
             kept = {"begun": begun[rotation_name(name)], "scale_begun": begun[scale_name(name)]}
             new = {**self.state(state, name), **self.told(parameters, name), **kept}
             step.launch(self.kernels.end, new, threads=self.layout.members)
 
     def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """The fields of a solid as kernels call them."""
+        """Return a solid's fields of a state by the names that kernels have for them."""
         return {f"{label}{suffix}": state[name_of(name)] for label, name_of in FIELDS.items()}
 
     def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
-        """Where a solid is told to be, as kernels call it."""
+        """Return the parameters of a solid's given path by the names that kernels have for them."""
         told = {"place": position_name(name), "displacements": displacement_name(name), "turns_told": turn_name(name)}
         return {f"{label}{suffix}": parameters[parameter] for label, parameter in told.items()}
 
@@ -234,7 +234,7 @@ class MovingSolidsPart(Part):
 
 
 class MovingSolidsTangent(PartTangent):
-    """Forward mode: tangents of the walls."""
+    """The tangent of walls of solids with given paths, for forward mode."""
 
     def __init__(self, part: MovingSolidsPart):
         self._part = part
@@ -256,7 +256,7 @@ class MovingSolidsTangent(PartTangent):
 
 
 class MovingSolidsAdjoint(PartAdjoint):
-    """Reverse mode: from what particles have given to the adjoints of poses."""
+    """The adjoint of solids with given paths, from what particles have added to the adjoints of poses."""
 
     def __init__(self, part: MovingSolidsPart):
         self._part = part

@@ -43,7 +43,7 @@ class OverTime:
     after the last. Its row of a step is that at the middle of the step; a search may have a row for each step."""
 
     def __init__(self, times: Any, values: Any):
-        """``times`` (k,) [s], each greater than the one before; ``values`` (k,) or (k, d)."""
+        """Take ``times`` (k,) [s], each greater than the one before, and ``values`` (k,) or (k, d) at these times."""
         self.times, self.values = read_only("OverTime times", times), read_only("OverTime values", values)
         if self.times.ndim != 1 or not self.times.size or not np.isfinite(self.times).all():
             raise InputError(f"OverTime times are {shown(times)}, but must be a list of finite times [s].")
@@ -61,11 +61,11 @@ class OverTime:
         return f"OverTime({self.times.tolist()}, {self.values.tolist()})"
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """At times (n,) [s]."""
+        """Return the parameter's values at times (n,) [s]."""
         return self._course.at(times).reshape(-1, *self.values.shape[1:])
 
     def rates(self, times: np.ndarray) -> np.ndarray:
-        """The derivative with respect to time at times (n,) [s]."""
+        """Return the parameter's derivatives with respect to time at times (n,) [s]."""
         return self._course.rates(times).reshape(-1, *self.values.shape[1:])
 
 
@@ -74,12 +74,12 @@ class OwnFunction(ABC):
     """A force whose formula is one function of a user's, given to `Simulation`; see `cortado.forces`."""
 
     kind: ClassVar[str]
-    """What sentences call it."""
+    """Name of the kind of force in messages."""
 
     def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
-        """``function``: made by ``def``; ``parameters``: a value for each of its arguments but the first ones, a
-        number, a vector (d,) or an `OverTime`. Their names are ``name.k`` of an argument ``k``; by default the name is
-        that of the function. Raises `InputError`."""
+        """Take a ``function`` made by ``def`` and ``parameters``: a value for each of its arguments but the first ones,
+        a number, a vector (d,) or an `OverTime`. An argument ``k`` becomes the parameter ``name.k``; by default the
+        name is that of the function. Raises `InputError`."""
         self._function = plain_function(self.kind, function)
         self._source = source_of(f"{self.kind} function {self._function.__name__}", self._function)
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
@@ -92,7 +92,7 @@ class OwnFunction(ABC):
         """Those of the function, in its order, behind time if it takes that."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled as what it is made from, with the text of the function."""
+        """Pickle the force by the arguments that it was made from, with the text of the function."""
         return _made_again, (type(self), self._function, self._source, self.name, self._values, self.fingerprint)
 
     def __repr__(self) -> str:
@@ -101,13 +101,13 @@ class OwnFunction(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """Of the function's text, and of those that it calls."""
+        """Return a hash of the function's text, and of the functions that it calls."""
         courses = [repr(value) for value in self._values.values() if isinstance(value, OverTime)]
         words = (self.kind, self.name, self._formula.text, self._formula.outside, *courses)
         return sha256("\n".join(words).encode()).hexdigest()
 
     def _value(self, argument: str, value: Any) -> Any:
-        """As it is kept."""
+        """Return a parameter's value as a read-only array, or an `OverTime` as it is."""
         if isinstance(value, OverTime):
             return value
         what = f"parameter {self.name}.{argument}"
@@ -133,18 +133,18 @@ class OwnFunction(ABC):
 
     @abstractmethod
     def force(self, setting: Setting) -> Force:
-        """The force in a solver; raises `InputError` for a function that Warp cannot compile."""
+        """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
 
 
 class OwnForce(OwnFunction):
-    """One that returns a force or an acceleration, and has kernels for it alone."""
+    """A user's function that returns a force or an acceleration, with kernels for it alone."""
 
     @abstractmethod
     def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
-        """Of the force, in a precision, in a scene of 2 or 3 dimensions."""
+        """Make the kernels of the force in a precision, in a scene of 2 or 3 dimensions."""
 
     def force(self, setting: Setting) -> "FunctionForce":
-        """The force in a solver; raises `InputError` for a function that Warp cannot compile."""
+        """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
         kernels = self.kernels(setting.discretisation, setting.scene.dimension)
         made = FunctionForce(f"{self.kind} function {self._formula.name}", kernels, self.parameters, setting)
         made.compile(kernels.forward)
@@ -152,7 +152,7 @@ class OwnForce(OwnFunction):
 
 
 class FunctionForce:
-    """Such a force in one solver."""
+    """A force by a user's function, in one solver."""
 
     shares: tuple[str, ...] = ()
     batches = True
@@ -162,7 +162,7 @@ class FunctionForce:
         self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
 
     def compile(self, kernel: Any) -> Any:
-        """A kernel, which can be launched then; raises `InputError`."""
+        """Compile a kernel and return it; raise `InputError` where Warp cannot."""
         compiled(self._what, kernel.module, self._device)
         return kernel
 
@@ -190,7 +190,7 @@ class FunctionForce:
 
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
-    """The part of a Warp module's name that tells one function from another."""
+    """Return the part of a Warp module's name that tells one user function from another."""
     words = "\n".join((text.text, text.outside, str(ranks), str(dimension)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
@@ -211,18 +211,19 @@ def _dimension(dimension: int, phases: int) -> int:
 
 
 def _size(source: Source, value: np.ndarray) -> np.ndarray:
-    """Of numbers; 1 of those that are 0."""
+    """Return the sizes of numbers, by which they are scaled; 1 for numbers that are 0."""
     return np.where(value == 0.0, 1.0, np.abs(value))
 
 
 def _length(source: Source, value: np.ndarray) -> float:
-    """Of a vector, of several the greatest; 1 of what is 0."""
+    """Return the length of a vector, of several the greatest; 1 where it is 0."""
     return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
 
 
 @cache
 def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    """Of a function whose parameters are numbers (rank 0) and vectors (rank 1), in a scene of 2 or 3 dimensions."""
+    """Make the kernels of a user's force on each particle in 2 or 3 dimensions; ranks are 0 (numbers) or 1
+    (vectors)."""
     precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
     vector, theta_type = precision.vector, theta_of(precision, ranks)
 
@@ -250,7 +251,7 @@ class Body(OwnForce):
 def term(
     discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
 ) -> Callable[..., Any]:
-    """What a pair adds to the acceleration times the volume of a particle, in a Warp module."""
+    """Make the Warp function of a pair's share in a particle's acceleration times its volume, by a user's function."""
     precision = discretisation.precision
     real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
     neighbourhood, weight = neighbourhood_type(precision), pair_functions(discretisation).weight
@@ -267,7 +268,7 @@ def term(
 
 @cache
 def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    """Of a function as that of `body_kernels`."""
+    """Make the kernels of a force between neighbours by a user's function, with the arguments of `body_kernels`."""
     own, modules = (text, ranks, dimension), discretisation.modules(topic("pair", text, ranks, dimension))
     module, tangent_module, adjoint_module = modules
     accelerations = fluid_sum(discretisation, module=module)(term(discretisation, *own, module))

@@ -71,11 +71,11 @@ class StepContext:
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
     def aside(self) -> AbstractContextManager[None]:
-        """What is launched within needs nothing of what comes after it until `join`, nor that of this."""
+        """Let launches within run beside those that come after, until `join`: neither needs anything of the other."""
         return self.launcher.aside()
 
     def join(self) -> None:
-        """Let what comes wait for all that went `aside`; a step ends with it."""
+        """Let later launches wait for all that went `aside`; a step ends with it."""
         self.launcher.join()
 
 
@@ -88,7 +88,7 @@ class Tangents:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_dot``, ``viscosity_dot`` and so on."""
+        """Return the tangents as kernels call them: ``x_dot``, ``viscosity_dot`` and so on."""
         return self.fields.named("_dot"), self.parameters.named("_dot")
 
 
@@ -97,7 +97,7 @@ class Shares(Arrays):
     up: (n,) numbers or vectors, of a parameter of phases (n,) of one for each phase."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Of the parameters of these names, all 0. Raises `TypeError` for what cannot be shared."""
+        """Allocate shares of the parameters of these names, all 0; raise `TypeError` for one that cannot be shared."""
         precision, self.known = layout.precision, layout.known
         """Of which parameters some are shared."""
         of_phases = precision.fractions(layout.phases)
@@ -113,7 +113,7 @@ class Shares(Arrays):
         self._sums = {name: layout.sum_of(dtype) for name, (_, dtype) in kinds.items()}
 
     def collect(self, bar: Parameters) -> None:
-        """Add them up into ``bar``, and begin anew."""
+        """Add the particles' shares up into the parameters' adjoints ``bar``, and set them to 0."""
         for name, total in self._sums.items():
             add(total(self[name]).view(bar[name].dtype).flatten(), bar[name].flatten())
         self.clear()
@@ -121,18 +121,18 @@ class Shares(Arrays):
 
 @dataclass(frozen=True)
 class Adjoints:
-    """Where parts add adjoints: of the sorted particles, of the parameters, and particles' shares of the latter."""
+    """The adjoints that parts of a step add to: of sorted particles, of parameters, and particles' shares of these."""
 
     fields: Fields
     parameters: Parameters
     shares: Shares
     solids: SolidShares
-    """Those of the poses of solids that move."""
+    """Adjoints of the poses of solids that move."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_bar`` and so on; the sums, (members, steps), of parameters over time; and particles' shares,
-        of those parameters alone that a part names among its ``shares``."""
+        """Return adjoints as kernels call them: ``x_bar`` and so on; sums, (members, steps), of parameters over time;
+        and particles' shares of the parameters that a part names in its ``shares``."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         return self.fields.named("_bar"), self.shares.named("_bar"), whole
@@ -140,8 +140,8 @@ class Adjoints:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a force is made for: the ``force(setting)`` of a module that the registry of parameters names makes it, or
-    returns None where nothing acts."""
+    """The arguments from which a force is made. A module that the registry of parameters names has a
+    ``force(setting)``, which makes it, or returns None where nothing acts."""
 
     scene: Scene
     discretisation: Discretisation
@@ -160,75 +160,75 @@ class Force(Protocol):
     no others."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        """``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
+        """Write ``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        """The same for the tangents of the accelerations, along ``dot``."""
+        """Write ``after`` = ``before`` + the tangent of this force's acceleration along ``dot``, both (n,) vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
-        """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for. A force whose own acceleration
-        depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes after all others.
-        One that solves a system of equations has what does so as ``solve``: see `cortado.solvers.loop`. One
-        with which walls act on fluid has what they do, a `cortado.sph.walls.WallAction`, as ``wall_action``, or
-        loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is another one, of the sum of
-        y x a, with which a acts at x_i - y."""
+        """Add to the adjoints ``bar`` of the force's inputs, given that of the acceleration, (n,) vectors. A force
+        whose own acceleration depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes
+        after all others. One that solves a system of equations has what does so as ``solve``: see
+        `cortado.solvers.loop`. One with which walls act on fluid has what they do, a `cortado.sph.walls.WallAction`, as
+        ``wall_action``, or loads on solids lack it. Where that does not act at the particle, ``wall_couple`` is another
+        one, of the sum of y x a, with which a acts at x_i - y."""
 
 
 class PartTangent:
-    """Forward mode of a part."""
+    """The tangent of a part of a step, for forward mode."""
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Of `Part.begin`, from the tangent of the state before the step; ``dot`` has those of the parameters."""
+        """Apply the tangent of `Part.begin` to that of the state before the step; ``dot`` has those of parameters."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Of `Part.sort` and `Part.settle`: from the tangent of the state before the step; ``dot`` has those of the
-        sorted particles."""
+        """Apply the tangents of `Part.sort` and `Part.settle`, from that of the state before the step; ``dot`` has
+        those of the sorted particles."""
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the step, and becomes
-        that of the state there."""
+        """Apply the tangent of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the
+        step, and becomes that of the state there."""
 
 
 class PartAdjoint:
-    """Reverse mode of a part."""
+    """The adjoint of a part of a step, for reverse mode."""
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Of a part that has a `Part.target`: from the adjoint of the positions and velocities that it left to that of
-        those that it found, which is returned. It adds to ``bar``; sorted particles have no adjoints yet."""
+        """Apply the adjoint of a part with a `Part.target`: return the adjoint of the positions and velocities that it
+        found, from that of those it left. It adds to ``bar``; sorted particles have no adjoints yet."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Of `Part.settle` and `Part.sort`, and of what `Part.end` wrote of sorted particles: ``state_bar`` has the
-        adjoint of the part's fields after the step, and becomes that of those before it."""
+        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`: ``state_bar``
+        has the adjoint of the part's fields after the step, and becomes that of those before it."""
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Of `Part.begin`, after all others; a part whose fields it has left as they were lets `sort` be."""
+        """Apply the adjoint of `Part.begin`, after all others; a part whose fields it leaves alone needs none."""
 
 
 class Part:
     """A part of a step, in one solver. A `Force` may be one too."""
 
     fields: tuple[StateField, ...] = ()
-    """What it keeps from step to step, as arrays of the state."""
+    """Fields that the part keeps from step to step, as arrays of the state."""
     shares: tuple[str, ...] = ()
     """Parameters to whose adjoints every particle adds a share, as those of a `Force`."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Take so many explicit substeps of diffusion in each step from now on."""
+        """Take ``substeps`` explicit substeps of diffusion in each step from now on."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Before anything else, with the state that the step begins from, which stays as it is. What `end` needs of it
-        is kept here, as the state at the end of the step may have the same arrays."""
+        """Begin a step, before anything else, with its first state, which stays as it is. The part keeps what `end`
+        needs of this state, as the state at the end of the step may have the same arrays."""
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Once the order of the sorted particles is known."""
+        """Take part in the step once the order of the sorted particles is known."""
 
     def settle(self, step: StepContext) -> None:
-        """Once neighbours and densities are known."""
+        """Take part in the step once neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
-        """Where the part finds positions and velocities at its `end`, given where it leaves them: a part that changes
-        some has room of its own for them, as nothing is changed in place."""
+        """Return the state in which the part finds positions and velocities at its `end`, given the one to which it
+        writes them. A part that changes some has room of its own, as nothing is changed in place."""
         return moved
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
@@ -236,26 +236,26 @@ class Part:
         positions and velocities of ``moved`` from those that it finds in its target."""
 
     def new_tangent(self) -> PartTangent:
-        """Forward mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        """Make the tangent of the part, with arrays of its own; raise `MissingDerivativeError` if it has none."""
         raise MissingDerivativeError(f"{type(self).__name__} has no forward mode: let it have a method new_tangent.")
 
     def new_adjoint(self) -> PartAdjoint:
-        """Reverse mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        """Make the adjoint of the part, with arrays of its own; raise `MissingDerivativeError` if it has none."""
         raise MissingDerivativeError(f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint.")
 
 
 class PartMaker(Protocol):
-    """Makes a part for a solver."""
+    """A maker of a part of a step, for each solver."""
 
     def part(self, layout: Layout, requires_grad: bool) -> Part:
-        """The part; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
+        """Make the part; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
 
 
 class Carried:
-    """Sorted fields of a step, or their tangents or adjoints."""
+    """Fields of particles in sorted order during a step, or their tangents or adjoints."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        """Raises `TypeError` for a field that has not an entry for each particle."""
+        """Allocate the fields' arrays; raise `TypeError` for a field that has not an entry for each particle."""
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
@@ -265,17 +265,17 @@ class Carried:
         self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
-        """(n,) sorted, as they were at the start of the step."""
+        """Return a field's array (n,) in sorted order, as it was at the start of the step."""
         return self._arrays[name]
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Take them from a state."""
+        """Read the fields from a state and sort them."""
         for name in self._arrays.names:
             a = self._arrays[name]
             step.launch(_kernels(a).sort, a_scene=state[name], a=a)
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
-        """Write sorted values, one for each field, to a state."""
+        """Write sorted values, one array for each field, to a state."""
         if values.keys() != set(self._arrays.names):
             raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():

@@ -26,8 +26,8 @@ class Rheology(OwnFunction):
     """The module of the scene's force that does not act beside it."""
 
     def force(self, setting: Setting) -> ViscousStress:
-        """The viscous force with this law; raises `InputError` for a function that Warp cannot compile, or that returns
-        a viscosity that is negative or not finite."""
+        """Make the viscous force with this law; raise `InputError` for a function that Warp cannot compile, or that
+        returns a viscosity that is negative or not finite."""
         check_form(setting.scene)
         made = stress_of(setting.scene)(setting, self._law(setting.scene), self.parameters)
         made.compile(self._what)
@@ -35,7 +35,7 @@ class Rheology(OwnFunction):
         return made
 
     def check(self, values: Arrays, simulation: Any) -> None:
-        """Raises `InputError` where the law returns what is no viscosity with these values of parameters, by name."""
+        """Raise `InputError` where the law returns no valid viscosity with these values of parameters, by name."""
         if "viscosity" in values or any(one.name in values for one in self.parameters):
             self._try(values, simulation.scene, simulation.precision, simulation.device)
 
@@ -55,8 +55,8 @@ class Rheology(OwnFunction):
         check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
 
     def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
-        """(k, numbers) what the function's parameters are, with these values, at every time at which one of them
-        changes: with a row for each step, at the beginning of each."""
+        """Return the function's parameters (k, numbers) for these values at every time at which one changes: with a row
+        for each step, at the beginning of each."""
         known = {one.name: one for one in self.parameters}
         own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
         steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)
@@ -72,7 +72,7 @@ class Rheology(OwnFunction):
 
 
 def check_form(scene: Scene) -> None:
-    """Raises `InputError` for a scene whose viscous force is no stress."""
+    """Raise `InputError` for a scene whose viscous force is no stress."""
     if scene.forces.viscosity != "stress":
         found = f"forces.viscosity is {scene.forces.viscosity!r}"
         raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")

@@ -23,10 +23,10 @@ SMALL = 1e-3
 
 @dataclass(frozen=True)
 class Rotations:
-    """Warp functions of angles, which are vectors, in 2-D numbers."""
+    """Warp functions of rotations by angles, which are vectors in 3-D and numbers in 2-D."""
 
     angle: Any
-    """Their type."""
+    """The type of an angle."""
     rotation: Any
     """R(w), a 3 x 3 matrix."""
     further: Any
@@ -37,7 +37,7 @@ class Rotations:
 
 @cache
 def rotations(precision: Precision, dimension: int) -> Rotations:
-    """In 2 or 3 dimensions."""
+    """Make the Warp functions of rotations, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     @wp.func

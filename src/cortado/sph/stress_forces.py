@@ -25,12 +25,12 @@ from cortado.sph.moment_functions import matrix_type
 
 @dataclass(frozen=True)
 class ContactFunctions:
-    """Warp functions of x_ib and of a foot."""
+    """Warp functions of the viscous contact between a particle and a wall, by x_ib and the foot on the surface."""
 
     weight: Any
     """s of a separation of two particles, -V a of grad W = a x."""
     fall: Any
-    """y"""
+    """The vector y from the surface to the particle."""
     fall_change: Any
     """The derivative of y along a change of x, which is symmetric."""
     hold: Any
@@ -53,12 +53,12 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
 
     @wp.func
     def rise(x_ib: vector, foot: vector) -> real:
-        """n . x_ib"""
+        """Return n . x_ib, the distance of a particle from a wall particle along the wall's normal."""
         return wp.dot(x_ib, foot) / wp.length(foot)
 
     @wp.func
     def height(x_ib: vector, foot: vector) -> real:
-        """d, negative behind the surface."""
+        """Return the distance d of a particle from the surface of a wall, negative behind it."""
         return rise(x_ib, foot) - wp.length(foot)
 
     @wp.func
@@ -88,21 +88,21 @@ def contact_functions(discretisation: Discretisation) -> ContactFunctions:
 
 @dataclass(frozen=True)
 class StressSums:
-    """Warp functions of sums."""
+    """Warp functions of the viscous stress's sums over neighbours."""
 
     force: Any
     """The acceleration."""
     tangent: Any
     """Its tangent."""
     traction_back: Any
-    """What its adjoint gives to the rows of T and to mu."""
+    """From the adjoint of the acceleration to those of the rows of T and of mu."""
     back: Any
-    """What its adjoint gives to x, v and m."""
+    """From the adjoint of the acceleration to those of x, v and m."""
 
 
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
-    """With walls without slip if it ``sticks``; their argument ``control`` is C."""
+    """Make the viscous acceleration's sums, with walls without slip if fluid ``sticks``; ``control`` is C."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood = neighbourhood_type(precision)
@@ -157,7 +157,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         turn_dot: vector,
         s: neighbourhood,
     ) -> vector:
-        """As that of the moments beside walls that turn."""
+        """Return the tangent of a wall's viscous pull; a wall that turns turns its pull."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest) - w * m_dot_i / m_i
@@ -219,7 +219,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         least: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, vector, real]:
-        """What it gives to the rows of T and to mu."""
+        """Return a pair's part in the adjoints of the rows of T and of mu."""
         z = -weight(x_ij, s) * (bar_i / m_i - bar_j / m_j)
         return z[0] * x_ij, z[1] * x_ij, z[2] * x_ij, control * wp.dot(z, v_ij)
 
@@ -256,7 +256,7 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         least: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real]:
-        """What the pair gives to x, v and m of i, for an adjoint of the acceleration."""
+        """Return a pair's part in the adjoints of x, v and m of i, for an adjoint of the acceleration."""
         w, T, mu, own_u = weight(x_ij, s), T_i + T_j, control * (mu_i + mu_j), bar_i / m_i
         u, pull = own_u - bar_j / m_j, T * x_ij + mu * v_ij
         x_part = (s.volume * wp.dot(u, pull)) * slope_gradient(x_ij, s) - w * (wp.transpose(T) * u)
@@ -266,8 +266,8 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
 
 
 def stress_work(d: Discretisation) -> Any:
-    """What the sum gives to solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control`` as
-    ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the work of the viscous sum on solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control``
+    as ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
     fall, hold = contact.fall, contact.hold
@@ -290,7 +290,7 @@ def stress_work(d: Discretisation) -> Any:
 
 
 def stress_couple_work(d: Discretisation) -> Any:
-    """That of the couples y_ib x a_ib of what walls give to a particle: they act y_ib beneath it, on their surface."""
+    """Make the work of the couples y_ib x a_ib by which walls act on a particle from their surface, y_ib beneath it."""
     precision, fall, force = d.precision, contact_functions(d).fall, wp.func(stress_work(d))
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
 

@@ -32,7 +32,7 @@ from cortado.sph.stress_forces import contact_functions
 from cortado.sph.viscosity_law import Law
 
 LEAST_VISCOSITY = 1e-12
-"""What is added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
+"""The number added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
 SLOWEST = 1e-6
 """Shear rate [1/s] that is added to that of the fluid, in squares: at rest a law has a derivative."""
 EMPTY, FULL = 0.2, 0.5
@@ -41,7 +41,7 @@ EMPTY, FULL = 0.2, 0.5
 
 @cache
 def fluidity_function(precision: Precision) -> Any:
-    """1 / mu as a Warp function, see `LEAST_VISCOSITY`."""
+    """Make the Warp function 1 / mu of a viscosity mu, kept finite by `LEAST_VISCOSITY`."""
     real = precision.real
     least = wp.constant(real(LEAST_VISCOSITY))
 
@@ -54,19 +54,19 @@ def fluidity_function(precision: Precision) -> Any:
 
 @cache
 def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """S of M, and M where S is not 0, as Warp functions."""
+    """Make the Warp functions of S, a particle's part in the stress, and of M where S is not 0."""
     real, matrix, moments = precision.real, matrix_type(precision), moment_functions(precision, dimension)
     fullness, smoothstep = moments.fullness, moments.smoothstep
     empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
 
     @wp.func
     def part(M: matrix) -> real:
-        """S, how much of the viscous stress a particle with the moments M has: 0 in spray and 1 within the fluid."""
+        """Return S, a particle's part in the viscous stress by its moments M: 0 in spray and 1 within the fluid."""
         return smoothstep(fullness(M), empty, full)
 
     @wp.func
     def regular(M: matrix) -> matrix:
-        """M, or the unit matrix where S is 0 and nothing depends on it."""
+        """Return M, or the unit matrix where S is 0 and nothing depends on M."""
         result = M
         if part(M) == real(0.0):
             result = matrix(
@@ -79,7 +79,7 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
 @cache
 def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
-    """T of M, A, mu and C as a Warp function in a Warp module."""
+    """Make the Warp function of the traction T by M, A, mu and C, in a Warp module."""
     real, matrix, regular = precision.real, matrix_type(precision), part_functions(precision, dimension)[1]
     inverse = moment_functions(precision, dimension).inverse
 
@@ -93,8 +93,8 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 
 
 def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
-    """T and mu, in 2 or 3 dimensions, with a law of viscosity. mu follows from A, and T from ``A_u``, that of the
-    velocities which are resisted; ``control`` is C."""
+    """Make the function of T and mu of a particle, in 2 or 3 dimensions, with a law of viscosity. mu follows from A,
+    and T from ``A_u``, that of the resisted velocities; ``control`` is C."""
     real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
@@ -118,19 +118,19 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
 
 @dataclass(frozen=True)
 class MomentSums:
-    """Warp functions of sums."""
+    """Warp functions of the moments' sums over neighbours."""
 
     sums: Any
     """The diagonal of M, its entries yz, xz and xy, the rows of A, and R."""
     tangent: Any
-    """Their tangents."""
+    """The tangents of these sums."""
     back: Any
-    """What their adjoints, two matrices and a number for each particle, give to its x, v and mu."""
+    """From the sums' adjoints, two matrices and a number for each particle, to those of its x, v and mu."""
 
 
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
-    """With walls without slip if it ``sticks``."""
+    """Make the sums of M, A and R over neighbours, with walls without slip if fluid ``sticks``."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood = neighbourhood_type(precision)
@@ -143,7 +143,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Entries yz, xz and xy of a b^T + b a^T."""
+        """Return the entries yz, xz and xy of the symmetric matrix a b^T + b a^T."""
         return cross_terms(a, b) + cross_terms(b, a)
 
     def wall_moments(
@@ -158,7 +158,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
     def moments(
         x_ij: vector, v_ij: vector, mu_i: real, mu_j: real, least: real, s: neighbourhood
     ) -> tuple[vector, vector, vector, vector, vector, real]:
-        """M in two parts, the rows of A, and R."""
+        """Return a pair's terms of M in two parts, of the rows of A, and of R."""
         z = weight(x_ij, s) * x_ij
         rub = wp.dot(z, x_ij) * fluidity(mu_j)
         return wp.cw_mul(z, x_ij), cross_terms(z, x_ij), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
@@ -175,7 +175,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         turn_dot: vector,
         s: neighbourhood,
     ) -> tuple[vector, vector, vector, vector, vector, real]:
-        """A wall that turns turns y; the rest of the way changes it as it does beside one that does not."""
+        """Return the tangent of a wall particle's terms; a turning wall turns y, and the rest moves it."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
         u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
         w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
@@ -252,7 +252,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         least: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real]:
-        """What the pair gives to x, v and mu of i, for adjoints of M, of A and of R."""
+        """Return a pair's part in the adjoints of x, v and mu of i, for adjoints of M, of A and of R."""
         w, square, thin_i = weight(x_ij, s), wp.dot(x_ij, x_ij), fluidity(mu_i)
         A_bar, rub = A_bar_i + A_bar_j, R_bar_i * fluidity(mu_j) + R_bar_j * thin_i
         turned, pulled = (M_bar_i + M_bar_j) * x_ij, A_bar * x_ij
@@ -265,8 +265,8 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
 
 
 def moments_work(d: Discretisation) -> Any:
-    """What the sums give to solids, for their adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the first of
-    the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the work of the moments' sums on solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the
+    first of the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
     real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)

@@ -46,15 +46,16 @@ class StressKernels:
     moments: Kernels
     """M, A and R."""
     stress: Kernels
-    """T and mu of them, where mu follows from A, and the velocities of ``A_u`` are resisted, which may be others."""
+    """T and mu from M, A and R; mu follows from A, and T from ``A_u`` of resisted velocities."""
     force: Kernels
     """The acceleration. Its adjoint are two kernels: that of T and mu, and that of particles."""
 
 
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> StressKernels:
-    """In 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have no slip. The argument ``control`` of
-    kernels is C, ``eta`` the viscosity of the stress, and ``theta`` are the parameters of the law."""
+    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have
+    no slip. ``control`` of kernels is C, ``eta`` the viscosity of the stress, and ``theta`` are the parameters of the
+    law."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -110,6 +111,6 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
 
 
 def stress_solid_kernels(discretisation: Discretisation) -> list[Callable[[], Any]]:
-    """What makes the kernels of what the sums and the force give to solids without slip that move."""
+    """Return makers of the kernels that add viscous adjoints to those of moving solids without slip."""
     works = (moments_work, stress_work)
     return [partial(solid_kernel, discretisation, "viscous_stress", work, rubs=True) for work in works]

@@ -24,28 +24,28 @@ from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernels
 
 PART = 2.0 / 3.0
-"""How much less of the stress acts across the surface than along it; see above."""
+"""The part by which the stress across the surface is less than along it; see above."""
 
 
 @dataclass(frozen=True)
 class TensionFunctions:
-    """Warp functions of a separation x, where ``h2`` is h^2."""
+    """Warp functions of the surface stress between two particles at a separation x, where ``h2`` is h^2."""
 
     pull: Any
     """s (1 - s)^2"""
     pull_derivative: Any
-    """Its derivative by |x|^2 / 2, times h^2."""
+    """The derivative of the pull by |x|^2 / 2, times h^2."""
     stress: Any
     """S(n) x"""
     stress_change: Any
-    """Its derivative along a change of n."""
+    """The derivative of S(n) x along a change of n."""
     stress_derivative: Any
     """The derivative of w . S(n) x by n."""
 
 
 @cache
 def tension_functions(discretisation: Discretisation) -> TensionFunctions:
-    """The functions for a precision."""
+    """Make the Warp functions of the surface stress of pairs, for a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     part, one, two = wp.constant(real(PART)), wp.constant(real(1.0)), wp.constant(real(2.0))
 
@@ -82,7 +82,7 @@ def tension_functions(discretisation: Discretisation) -> TensionFunctions:
 
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
-    """The kernels of the acceleration; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
+    """Make the kernels of the acceleration by surface tension; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     functions = tension_functions(discretisation)
@@ -135,7 +135,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         scale: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real, real]:
-        """What the pair gives to x, the normals, m and sigma of i; w is the adjoint of a force."""
+        """Return a pair's part in the adjoints of x, the normals, m and sigma of i."""
         h2 = s.support * s.support
         w_i = (-scale / m_i) * bar_i
         w_ij = w_i + (scale / m_j) * bar_j

@@ -33,14 +33,14 @@ from cortado.sph.surface_stress import surface_tension_kernels
 
 @cache
 def normal_kernels(discretisation: Discretisation) -> Kernels:
-    """The kernels of n; ``inverse`` is 1 / N."""
+    """Make the kernels of the surface normals n of particles; ``inverse`` is 1 / N."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     one = wp.constant(real(1.0))
 
     @fluid_sum(discretisation)
     def arrows(x_ij: vector, s: neighbourhood) -> vector:
-        """(1 - s)^2 x"""
+        """Return a pair's term (1 - s)^2 x in the normal of a particle."""
         d = wp.max(one - wp.dot(x_ij, x_ij) / (s.support * s.support), real(0.0))
         return (d * d) * x_ij
 
@@ -48,8 +48,7 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     @tangent_of(arrows)
     @fluid_sum(discretisation)
     def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
-        """Its tangent along v, and likewise what the adjoint of positions is for an adjoint v of every n, as the
-        derivative of a pair is symmetric."""
+        """Return the derivative of a pair's term along v. It is symmetric, and serves the tangent and the adjoint."""
         h2 = s.support * s.support
         d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
         return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
@@ -64,7 +63,7 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
 
 
 class CurvatureTension:
-    """Surface tension by curvature; its arrays are those of the last step."""
+    """The force of surface tension by curvature; its arrays are those of the last step."""
 
     shares: tuple[str, ...] = ("surface_tension",)
     batches = True
@@ -113,13 +112,13 @@ particles across hold; by curvature, those of 24 and 48 across lose energy with 
 
 
 class SurfaceTension:
-    """Surface tension of a number of particles; its arrays are those of the last step."""
+    """The force of surface tension by pairs; its arrays are those of the last step."""
 
     shares: tuple[str, ...] = ("surface_tension",)
     batches = True
 
     def __init__(self, discretisation: Discretisation, inverse: float, scale: float, layout: Layout):
-        """``inverse`` and ``scale`` as `tension_constants` gives them."""
+        """Prepare the force with ``inverse`` and ``scale`` as `tension_constants` gives them."""
         self._normal, self._kernels = normal_kernels(discretisation), surface_tension_kernels(discretisation)
         self._inverse, self._scale = inverse, scale
         vectors = {"shape": layout.all_particles, "dtype": layout.precision.vector, "device": layout.device}
@@ -144,7 +143,7 @@ class SurfaceTension:
 
 
 def tension_constants(spacing: float, support: float, dimension: int) -> tuple[float, float]:
-    """1 / N [1 / m] and 1 / (Gamma s^d) [1 / m^(d + 2)] of a lattice of spacing s that is cut along an axis."""
+    """Return 1 / N [1 / m] and 1 / (Gamma s^d) [1 / m^(d + 2)] of a lattice of spacing s that is cut along an axis."""
     offsets = lattice_offsets(spacing, support, dimension)
     s = (offsets**2).sum(axis=1) / support**2
     outwards = np.rint(offsets[:, 0] / spacing).astype(int)
@@ -164,7 +163,7 @@ def tension_constants(spacing: float, support: float, dimension: int) -> tuple[f
 
 
 def force(setting: Setting) -> Force:
-    """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
+    """Make the surface tension of a scene, None without any; warn where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
     _check_support(scene, LEAST_SUPPORT[form])

@@ -28,19 +28,19 @@ from cortado.sph.walls import WallSums
 
 @dataclass(frozen=True)
 class PairForce:
-    """phi(x, v) with its derivatives, functions of Warp."""
+    """The viscous force phi(x, v) of a pair with its derivatives, as Warp functions."""
 
     force: Any
     tangent: Any
     adjoint_x: Any
     """The transposed derivative with respect to x, applied to a vector."""
     adjoint_v: Any
-    """The same with respect to v."""
+    """The transposed derivative with respect to v, applied to a vector."""
 
 
 @cache
 def pairwise(discretisation: Discretisation) -> PairForce:
-    """phi: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
+    """Make the Warp functions of the pair force phi: ``force``, ``tangent``, ``adjoint_x`` and ``adjoint_v``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -74,8 +74,8 @@ def pairwise(discretisation: Discretisation) -> PairForce:
 
 @cache
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless fluid
-    ``sticks`` to some."""
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration; all walls slip freely unless
+    fluid ``sticks`` to some."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     phi = pairwise(discretisation)
@@ -87,17 +87,17 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @wp.func
     def part(a: real, b: real) -> real:
-        """b / (a + b), and half where both are 0."""
+        """Return b / (a + b), and half where both are 0."""
         return wp.where(a + b > tiny, b * reciprocal(a + b), real(0.5))
 
     @wp.func
     def pair_viscosity(a: real, b: real) -> real:
-        """mu_ij, the harmonic mean of two viscosities; 0 where both are 0."""
+        """Return mu_ij, the harmonic mean of two viscosities; 0 where both are 0."""
         return real(2.0) * a * part(a, b)
 
     @wp.func
     def pair_viscosity_derivative(a: real, b: real) -> real:
-        """d mu_ij / d mu_i; where both are 0, the derivative for both increasing together."""
+        """Return d mu_ij / d mu_i; where both are 0, the derivative for both increasing together."""
         return real(2.0) * part(a, b) * part(a, b)
 
     @wp.func_grad(pair_viscosity)
@@ -202,7 +202,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         kappa: real,
         s: neighbourhood,
     ) -> tuple[vector, vector, real, real, real]:
-        """What the pair adds to i is what it adds to j, seen from i: to x, v, n, m and mu."""
+        """Return a pair's part in the adjoints of x, v, n, m and mu of i; seen from i, it is that of j too."""
         w_i = bar_i * reciprocal(m_i)
         w_ij = w_i - bar_j * reciprocal(m_j)
         per_volume = kappa * s.volume * reciprocal(n_i) * reciprocal(n_j)
@@ -223,7 +223,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 @cache
 def viscosity_term(discretisation: Discretisation) -> WallTerm:
-    """The acceleration by the walls of a solid, with kappa as the first of the ``constants``."""
+    """Make the wall term of the viscous acceleration by a solid's walls; kappa is its first constant."""
 
     def made(d: Discretisation) -> Any:
         real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, pairwise(d).force
@@ -274,7 +274,7 @@ class Viscosity:
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
-    """The form that a scene names. None for a scene without."""
+    """Make the viscous force in the form that a scene names; None for a scene without viscosity."""
     form = setting.scene.forces.viscosity
     if form == "stress":
         return stress_of(setting.scene)(setting)

@@ -21,42 +21,42 @@ from cortado.sph.function_text import plain_function
 
 @dataclass(frozen=True)
 class Law:
-    """A law of viscosity, with the ranks of its parameters: 0 of numbers."""
+    """A law of viscosity as a function of the shear rate, with the ranks of its parameters: 0 for numbers."""
 
     text: Formula
     ranks: tuple[int, ...]
     topic: str
-    """Tells the Warp modules of one law from those of others; empty for Newtonian fluids."""
+    """Name that tells the Warp modules of one law from those of others; empty for Newtonian fluids."""
 
     @property
     def is_newtonian(self) -> bool:
-        """Whether the viscosity does not depend on the shear rate."""
+        """Return True for a viscosity that does not depend on the shear rate."""
         return not self.topic
 
     def applied(self, precision: Precision, module: Any) -> Any:
-        """The Warp function of the shear rate [1/s], of the viscosity that particles have [Pa s], and of theta: the
+        """Make the Warp function of the shear rate [1/s], the particles' viscosity [Pa s] and theta that returns the
         viscosity [Pa s]."""
         return applied(self.text, precision, self.ranks, 3, module)
 
 
 def newtonian(shear_rate, viscosity):
-    """The viscosity does not depend on the shear rate."""
+    """Return the viscosity as it is: it does not depend on the shear rate."""
     return viscosity
 
 
 @cache
 def newtonian_law() -> Law:
-    """That of fluids without another one."""
+    """Return the law of fluids that have no other law of viscosity."""
     return Law(formula("Rheology", plain_function("Rheology", newtonian), inspect.getsource(newtonian), {})[0], (), "")
 
 
 def power_law(shear_rate, viscosity, flow_index, least_shear_rate):
-    """Of Ostwald and de Waele."""
+    """Return the viscosity of a power-law fluid (Ostwald and de Waele)."""
     return viscosity * wp.pow(shear_rate * shear_rate + least_shear_rate * least_shear_rate, 0.5 * (flow_index - 1.0))
 
 
 def carreau(shear_rate, viscosity, relaxation_time, flow_index, infinite_viscosity):
-    """The viscosity law of Carreau (1972)."""
+    """Return the viscosity by the law of Carreau (1972)."""
     turned = relaxation_time * shear_rate
     return infinite_viscosity + (viscosity - infinite_viscosity) * wp.pow(
         1.0 + turned * turned, 0.5 * (flow_index - 1.0)
@@ -64,7 +64,7 @@ def carreau(shear_rate, viscosity, relaxation_time, flow_index, infinite_viscosi
 
 
 def bingham(shear_rate, viscosity, yield_stress, regularisation):
-    """Of Bingham, made smooth by Papanastasiou (1987); for small m g, (1 - exp(-m g)) / (m g) as a series."""
+    """Return a Bingham fluid's viscosity as Papanastasiou (1987) smooths it; for small m g by a series."""
     x = regularisation * shear_rate
     part = 1.0 - x / 2.0 + x * x / 6.0
     if x > 0.01:
@@ -73,7 +73,7 @@ def bingham(shear_rate, viscosity, yield_stress, regularisation):
 
 
 def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_index, least_shear_rate):
-    """The same with a power law in the place of the viscosity."""
+    """Return a Herschel-Bulkley fluid's viscosity: a Bingham fluid's with a power law for the constant one."""
     x = regularisation * shear_rate
     part = 1.0 - x / 2.0 + x * x / 6.0
     if x > 0.01:
@@ -92,7 +92,7 @@ SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
 
 @cache
 def trial_kernel(precision: Precision, law: Law) -> Any:
-    """Of the law at each shear rate, for each viscosity and each theta."""
+    """Make the kernel that applies a law at each shear rate, for each viscosity and each theta."""
     module = kernel_module(f"{law.topic}trial_{precision.name}")
     real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), law.applied(precision, module)
 
@@ -113,8 +113,8 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
 def check_law(
     what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
-    """``viscosities`` [Pa s] by the names of phases, ``thetas`` (k, numbers) as the law has them. Raises `InputError`
-    where the law returns what is no viscosity."""
+    """Raise `InputError` where a law returns no valid viscosity, for ``viscosities`` [Pa s] by the names of phases and
+    parameters ``thetas`` (k, numbers)."""
     kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
     rows[:, : thetas.shape[1]] = thetas
     given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}

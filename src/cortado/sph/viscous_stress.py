@@ -28,13 +28,13 @@ CLOSEST = 0.25
 
 
 class ViscousStress:
-    """Viscosity as a stress; its arrays are those of the last step."""
+    """The explicit viscous force as a stress; its arrays are those of the last step."""
 
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
-        """``law``: of the viscosity, with its parameters; by default that of a Newtonian fluid."""
+        """Prepare the force with a ``law`` of viscosity and its parameters; by default a Newtonian fluid's."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
         self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
@@ -50,13 +50,13 @@ class ViscousStress:
         self.wall_couple = StressWalls(setting, self, stress_couple_work, "couple_bar") if scene.sticks else None
 
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
-        """(n,) of particles, all 0: R and eta are numbers, and all others matrices."""
+        """Make arrays (n,) of particles by name, all 0: R and eta are numbers, and all others matrices."""
         precision, sizes = self._layout.precision, {"shape": self._layout.all_particles, "device": self._layout.device}
         kinds = {name: precision.real if name in ("R", "eta") else matrix_type(precision) for name in names}
         return {name: wp.zeros(dtype=kind, **sizes, requires_grad=taped) for name, kind in kinds.items()}
 
     def compile(self, what: str) -> None:
-        """Compile the law in it; raises `InputError` where Warp cannot."""
+        """Compile the kernels with the law of viscosity; raise `InputError` where Warp cannot."""
         compiled(what, self._kernels.stress.forward.module, self._layout.device, "number")
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -75,8 +75,8 @@ class ViscousStress:
         step.launch(self._kernels.force.tangent, *known, acceleration_in_dot=before, acceleration_dot=after)
 
     def _stress_along(self, step: StepContext, dot: Tangents, resisted: Named | None = None) -> dict[str, wp.array]:
-        """Write the tangents of T and mu. Where other velocities than those at the start are ``resisted``, it has these
-        as ``v``, with their tangent, and A of them as ``A_u``."""
+        """Write the tangents of T and mu. Velocities other than those at the start may be ``resisted``, given as ``v``
+        with their tangent, and their A as ``A_u``."""
         change, known = {f"{name}_dot": a for name, a in self._change.items()}, (*dot.named, self.constants, self._of)
         if resisted is not None:
             step.launch(self._kernels.moments.tangent, {"A_dot": change["A_u_dot"]}, resisted, change, *known)
@@ -91,8 +91,8 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """From the adjoint of the acceleration; ``now`` has what `resisted` gives, and the adjoint of its velocities is
-        added to ``v_bar``."""
+        """Go back from the adjoint of the acceleration to those of its inputs; ``now`` has the arrays of `resisted`,
+        and the adjoint of the resisted velocities is added to ``v_bar``."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -102,9 +102,9 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """From the adjoints of T and mu to those of particles and solids, by way of the sums that they follow from;
-        ``now`` has what `resisted` gives, and ``bars`` the ``v_bar`` that the adjoint of its velocities is added to,
-        and room for the adjoints of M, R, A and A_u."""
+        """Turn the adjoints of T and mu into those of particles and solids, by way of the sums; ``now`` has the arrays
+        of `resisted`. ``bars`` has ``v_bar``, to which the adjoint of its velocities is added, and room for the
+        adjoints of M, R, A and A_u."""
         theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
         step.launch(self._kernels.stress.adjoint, theta, bars, now, *bar.named, self.constants, self._of)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -124,7 +124,7 @@ class ViscousStress:
         return {f"{name}_bar": array for name, array in self.arrays("M", "R").items()}
 
     def _give(self, step: StepContext, bar: Adjoints, which: int, *known: Named) -> None:
-        """What solids that move are given by the adjoints of the sums (0) or by that of the acceleration (1)."""
+        """Add to the adjoints of moving solids by those of the sums (``which`` 0) or of the acceleration (1)."""
         if self._made_for[-1]:
             constants, kernel = (
                 tuple(self.constants[name] for name in ("least", "control")),
@@ -133,23 +133,23 @@ class ViscousStress:
             bar.solids.add(step.launch, kernel, *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        """T, eta, the velocities ``v`` that are resisted, and A of them, ``A_u``, in a step."""
+        """Return T, eta, the velocities ``v`` that are resisted, and their A as ``A_u``, in a step."""
         return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
-        """The tangents of T, eta and these velocities, after forward mode of the step."""
+        """Return the tangents of T, eta and the resisted velocities, after forward mode of the step."""
         return {**{f"{name}_dot": self._change[name] for name in ("T", "eta")}, "v_dot": dot.fields["v"]}
 
     def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
-        """From the adjoint of these velocities."""
+        """Add the adjoint of the resisted velocities to that of the velocities at the start."""
         add(v_bar, bar.fields["v"])
 
 
 class StressWalls:
-    """The `cortado.sph.walls.WallAction` of a viscous stress."""
+    """The sums by which walls act on particles through viscous stress: a `cortado.sph.walls.WallAction`."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str):
-        """``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their
+        """Take ``work`` and ``bar`` of its `WallTerm`: `stress_work` for accelerations, `stress_couple_work` for their
         couples."""
         self._stress, self._layout = stress, setting.layout
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
@@ -172,7 +172,7 @@ class StressWalls:
 
     @cached_property
     def _bars(self) -> dict[str, wp.array]:
-        """Made when they are asked for, as runs do without."""
+        """Make arrays of adjoints when they are first asked for, as runs do without."""
         own = self._stress.arrays("M", "A", "A_u", "R", "T", "eta")
         sizes = {"shape": self._layout.all_particles, "device": self._layout.device}
         v_bar = wp.zeros(dtype=self._layout.precision.vector, **sizes)

@@ -20,7 +20,7 @@ from cortado.particles.particle_kernels import sum_kernels
 
 
 def turns(discretisation: Discretisation) -> Callable[..., Any]:
-    """The term of a pair."""
+    """Make the function of a pair's term (v_i - v_j) x G_ij in the circulation."""
     vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
     gradient = pair_functions(discretisation).gradient
 
@@ -32,7 +32,7 @@ def turns(discretisation: Discretisation) -> Callable[..., Any]:
 
 @cache
 def circulation_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the sum c."""
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the sum c, the vorticity times mu n."""
     sums = (
         fluid_sum(discretisation)(turns(discretisation)),
         *(make(discretisation, turns) for make in (made_tangent, made_adjoint)),

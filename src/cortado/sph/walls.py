@@ -25,7 +25,7 @@ class WallSlope:
     """Sums over the walls around a particle, as Warp functions or kernels."""
 
     slope: Any
-    """g."""
+    """The slope g."""
     change: Any
     """The sum of H with a vector of each particle."""
     tangent: Any
@@ -34,7 +34,7 @@ class WallSlope:
 
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
-    """The Warp functions ``slope(i, x, s)`` and ``change(i, x, along, s)``, with one vector ``along``."""
+    """Make the Warp functions of sums over walls ``slope(i, x, s)`` and ``change(i, x, along, s)``."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -56,7 +56,8 @@ def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
 
 
 def wall_slope_term(discretisation: Discretisation) -> WallTerm:
-    """g as the sum over the walls of a solid, with the adjoint ``slope_bar``."""
+    """Return the wall term g, the weighted sum of kernel gradients over a solid's walls; ``slope_bar`` is its
+    adjoint."""
     return WallTerm(discretisation, "wall_slope", _work, "slope_bar")
 
 
@@ -70,30 +71,30 @@ def _work(d: Discretisation) -> Any:
 
 
 class WallAction(Protocol):
-    """What walls do to the particles around them by one term of a step, after the step. ``solid`` is the number of wall
-    particles of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """The action of walls on the particles around them by one term of a step, read after the step. ``solid`` is the
+    number of wall particles of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """(n,) vectors of the sorted particles: of a force its accelerations by walls [m / s2]."""
+        """Return the action (n,) of walls on sorted particles, vectors; of a force its accelerations [m / s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """(n,) their tangents, after forward mode of the step."""
+        """Return the tangents (n,) of the action of walls, after forward mode of the step."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """From the adjoints of the vectors to those of sorted particles, parameters and solids, in ``bar``, and to
-        those (n,) of v* = v + dt a, of velocities after all explicit forces."""
+        """Turn the adjoints of the action into those of sorted particles, parameters and solids, in ``bar``, and those
+        (n,) of v* = v + dt a, of velocities after all explicit forces."""
 
 
 class WallSums:
-    """The `WallAction` of a sum that is told by its work; its arrays are those of the last step."""
+    """A `WallAction` that sums a `WallTerm` over walls; its arrays are those of the last step."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
-        """``constants`` of the work."""
+        """Take a wall term and the two ``constants`` of its work."""
         self.term, self._layout, self._constants = term, layout, constants
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
-        """Made when they are asked for, as runs do without."""
+        """Make the arrays of totals when they are first asked for, as runs do without."""
         own = {"shape": self._layout.all_particles, "device": self._layout.device}
         return {name: wp.zeros(dtype=self._layout.precision.vector, **own) for name in ("total", "total_dot")}
 
@@ -113,12 +114,12 @@ class WallSums:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array, *groups: Named
     ) -> None:
-        """As that of `WallAction`; v* gets nothing."""
+        """Apply the adjoint of the sums over walls as `WallAction` says; the adjoint of v* gets nothing."""
         step.launch(self.term.kernels.adjoint, {self.term.bar: total_bar}, *groups, *bar.named, self._known(solid))
         self.give(step, bar, solid, total_bar, *groups)
 
     def give(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, *groups: Named) -> None:
-        """What the adjoint gives to solids that move."""
+        """Add to the adjoints of moving solids by the adjoint of the sums over walls."""
         given = {self.term.bar: total_bar}
         kernel, factors = self.term.solid_kernel, self._constants
         bar.solids.add(step.launch, kernel, given, *groups, *bar.named, constants=factors, over=solid)
