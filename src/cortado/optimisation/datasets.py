@@ -29,7 +29,7 @@ PAIR = "a lower and an upper end of the same shape, each a number or a list of n
 
 
 def _ranges(given: Any) -> Any:
-    """By the name of a value its lower and its upper end, as lists of floats."""
+    """Check ranges by the names of values, and return the lower and upper ends of each as lists of floats."""
     if not isinstance(given, Mapping):
         raise field_error((), given, "a table of ranges by the keys of values")
     found = {}
@@ -107,21 +107,21 @@ class DatasetTable(Table):
 
 
 class DatasetTables(Table):
-    """The table that a data set has besides those of its scene."""
+    """The table [dataset] that a file of a data set has besides those of its scene."""
 
     dataset: DatasetTable
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Random values of the run of a number, drawn from the seed of the table and the number alone."""
+    """Random values for one run of a data set, drawn from the seed of its table and the number of the run alone."""
 
     table: DatasetTable
     number: int
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Values of what is varied, by the keys of the scene, in the order of the table."""
+        """Return random values of the scene's keys that are varied, in the order of the table."""
         random = self._random(0)
         found = {}
         for key, (lower, upper) in self.table.vary.items():
@@ -135,11 +135,11 @@ class Sample:
 
     @property
     def overrides(self) -> list[str]:
-        """The values as overrides of a scene."""
+        """Return the random values as overrides of a scene."""
         return [f"{key}={json.dumps(value)}" for key, value in self.values.items()]
 
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
-        """First positions [m] and velocities [m/s] (n, d) with noise; those without any are left out."""
+        """Return noisy first positions [m] and velocities [m/s] (n, d) by name; one without noise is left out."""
         random, found = self._random(1), {}
         for name, array, size in (
             ("initial_positions", positions, self.table.position_noise * spacing),
@@ -151,8 +151,8 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """A random direction of the first state: normal numbers times a change of positions [m], and of velocities
-        [m/s]."""
+        """Return a random direction of the first state by name: normal numbers times a size of positions [m] and of
+        velocities [m/s]."""
         random = self._random(2, which)
         names = ("initial_positions", "initial_velocities")
         return {name: size * random.standard_normal(shape) for name, size in zip(names, sizes, strict=True)}
@@ -162,8 +162,7 @@ class Sample:
 
 
 WALL, FLUID, MORE_FLUID = 1, 0, 4
-"""Types of particles in LagrangeBench: what does not move, fluid, and the first number that it leaves free, which
-further phases have."""
+"""Types of particles in LagrangeBench: walls, fluid, and the first number that it leaves free, for further phases."""
 
 
 @dataclass(frozen=True)
@@ -171,10 +170,10 @@ class OneRun:
     """The arrays and statistics of a run that a data set keeps."""
 
     arrays: dict[str, np.ndarray]
-    """By their names in the file."""
+    """Arrays by their names in the file."""
     statistics: dict[str, Any]
-    """Of the fluid: how many, the sum and the sum of squares of each component, of velocities and accelerations in
-    metres a frame; the lower and the upper end of all positions; and how many particles there are, with walls."""
+    """Statistics of the fluid: count, sum and sum of squares of each component of velocities and accelerations, in
+    metres a frame; the ends of all positions; and the number of particles with walls."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
@@ -204,14 +203,14 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def periods_of(scene: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The lower ends and the lengths (d,) [m] of the axes that are periodic, both 0 along others."""
+    """Return the lower ends and the lengths (d,) [m] of the axes that are periodic, both 0 along others."""
     ends, (_, lengths) = scene.container.extent(), scene.container.periods(scene.dimension)
     lower = np.zeros(scene.dimension) if ends is None else np.asarray(ends[0], dtype=np.float64)
     return np.where(lengths > 0.0, lower, 0.0), np.asarray(lengths, dtype=np.float64)
 
 
 def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Statistics of differences of positions (frames, n, d), the shorter way around, as LagrangeBench takes them."""
+    """Return statistics of differences of positions (frames, n, d), the shorter way around, for LagrangeBench."""
     moved = np.diff(positions, axis=0)
     moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))
     found: dict[str, Any] = {}
@@ -223,7 +222,7 @@ def _statistics(positions: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
 
 
 def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Jacobian-vector products: how positions and velocities change along random directions of the first state."""
+    """Return Jacobian-vector products of positions and velocities along random directions of the first state."""
     table, d, real = sample.table, simulation.dimension, simulation.precision.numpy
     if not table.tangents:
         return {}
@@ -253,9 +252,9 @@ def _tangents(simulation: Simulation, sample: Sample, start: dict[str, np.ndarra
 METADATA, PARTS = "metadata.json", "runs"
 """Names of the file that is written last, and of the folder that has the runs until then."""
 REACH = 1.45
-"""In spacings: how far particles are connected that a learned simulator looks at, as in LagrangeBench's data sets."""
+"""In spacings: the connectivity radius of a learned simulator, as in LagrangeBench's data sets."""
 SPARE = 1.02
-"""Of the size of runs, what the disk must have."""
+"""Free space on the disk that is asked for, relative to the size of all runs."""
 
 
 class Parts:
@@ -265,7 +264,7 @@ class Parts:
         self.folder = out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """Write a run, whole or not at all; HDF5 does it in memory, as a full disk may kill it."""
+        """Write a run to its file, whole or not at all; HDF5 does it in memory, as a full disk may kill it."""
         import h5py
 
         content = io.BytesIO()
@@ -275,16 +274,16 @@ class Parts:
         self._mark(number, {"statistics": run.statistics}, content.getvalue())
 
     def save_failure(self, number: int, why: str) -> None:
-        """Note that there is no run, and why."""
+        """Note that a run failed, and why."""
         self._mark(number, {"failure": why})
 
     def note(self, number: int) -> dict[str, Any] | None:
-        """The statistics of a run, or its failure; None while it is not finished."""
+        """Return the statistics of a run, or its failure; None while it is not finished."""
         path = self.path(number, "json")
         return json.loads(path.read_text()) if path.exists() else None
 
     def path(self, number: int, ending: str = "h5") -> Path:
-        """The file of a run, or that of its note."""
+        """Return the path of a run's file, or with another ``ending`` that of its note."""
         return self.folder / f"{number:05d}.{ending}"
 
     def _mark(self, number: int, note: Mapping[str, Any], content: bytes | None = None) -> None:
@@ -296,7 +295,7 @@ class Parts:
 
 
 def assemble(out: Path, split: Mapping[str, Sequence[int]]) -> None:
-    """Write one file for each purpose, of the runs of these numbers, numbered from 0 in each; raises
+    """Write one file for each purpose of ``split`` with the runs of its numbers, counted from 0 in each; raises
     `ComputationError` where the disk has no room, and leaves the runs as they are."""
     import h5py
 
@@ -334,8 +333,8 @@ def remove_parts(out: Path) -> None:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], notes: Mapping[int, Any], most: int
 ) -> dict[str, Any]:
-    """The metadata that LagrangeBench reads of a data set, and where it comes from; ``notes`` by the number of each
-    run, ``most`` the particles of the largest one."""
+    """Return the metadata that LagrangeBench reads of a data set, and its origin; ``notes`` by the number of each run,
+    ``most`` the particles of the largest one."""
     frames, (origin, periods) = table.steps // table.write_every + 1, periods_of(scene)
     train = [notes[number]["statistics"] for number in split["train"]]
     ends = scene.container.extent()
@@ -368,7 +367,7 @@ def metadata(
 
 
 def _moments(train: Sequence[Mapping[str, Any]], name: str) -> dict[str, list[float]]:
-    """The mean and the standard deviation (d,) over all runs to train."""
+    """Return the mean and the standard deviation (d,) of a statistic over all training runs."""
     counts, sums, squares = (np.sum([np.asarray(one[name][k]) for one in train], axis=0) for k in range(3))
     mean = sums / np.maximum(counts, 1)
     return {"mean": mean.tolist(), "std": np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0)).tolist()}

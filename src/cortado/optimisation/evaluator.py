@@ -23,7 +23,7 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Values
 
 Parameters = dict[str, Any]
-"""By name: a float where the user gave a number, otherwise a float64 array of the shape that the user gave."""
+"""Parameters by name: a float where the user gave a number, otherwise a float64 array of the given shape."""
 GREATEST_GRADIENT = 1e150
 """Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow."""
 MOST_NAMED = 6
@@ -54,11 +54,11 @@ class Optimisable(Protocol):
     """
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """The loss, and its gradient by the names and in the shapes of the parameters."""
+        """Return the loss, and its gradient by the names and in the shapes of the parameters."""
 
 
 def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
-    """What an evaluation returned, as its two parts; raises `InputError` if it has no such form."""
+    """Split an evaluation's result into loss and gradient; raise `InputError` if it has no such form."""
     pair = isinstance(returned, (tuple, list)) and len(returned) == 2
     if pair and isinstance(returned[1], Mapping):
         return returned[0], returned[1]
@@ -80,17 +80,17 @@ class Record:
     iteration: int
     """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
     updates: int
-    """Made before it; fewer than the evaluations before it where a line search evaluates several times an update."""
+    """Number of updates before it; fewer than the evaluations where a line search evaluates several times an update."""
     loss: float
     gradient_norm: float
-    """Euclidean, over all the parameters."""
+    """Euclidean norm of the gradient over all parameters."""
     parameters: Parameters
-    """At which the loss was evaluated."""
+    """Parameters at which the loss was evaluated."""
     replayed: bool
-    """Whether it was read from the checkpoint."""
+    """True where it was read from the checkpoint."""
     refused: int = 0
-    """Evaluations before it of which there is no run, as it diverged or a parameter was out of its range, so that the
-    steps to them were refused."""
+    """Evaluations before it that have no run, as it diverged or a parameter was out of its range; the steps to them
+    were refused."""
     left_out: int = 0
     """Runs that averages over ensembles have left out so far, for the same reasons; replayed ones are not known."""
 
@@ -100,7 +100,7 @@ class Record:
 
 @dataclass
 class Promises:
-    """The evaluations of a search, each with the step to it from the one before.
+    """A test of a search's gradients against its steps, from each evaluation and the step to it from the one before.
 
     The slopes of the loss along a step, at both of its ends, bound its change unless the slope has an extremum in
     between: a loss that is as smooth as the steps are long keeps near to them. Steps along which the slope changes its
@@ -114,7 +114,7 @@ class Promises:
     _best: LoggedEvaluation | None = field(default=None, repr=False)
 
     def note(self, evaluation: LoggedEvaluation) -> None:
-        """The next evaluation."""
+        """Add the next evaluation to the test."""
         if self._last is not None:
             step = evaluation.parameters - self._last.parameters
             with np.errstate(over="ignore", invalid="ignore"):
@@ -126,7 +126,7 @@ class Promises:
             self._best = evaluation
 
     def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
-        """A sentence that names parameters whose bounds keep the lowest loss from falling further; empty without."""
+        """Return a sentence that names parameters whose bounds keep the loss from falling further; else empty."""
         if self._best is None:
             return ""
         best, gradient = self._best.parameters, self._best.gradient
@@ -137,7 +137,7 @@ class Promises:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """How many steps contradict their gradients, and how many tell."""
+        """Return the numbers of steps that contradict their gradients, and of steps that tell anything."""
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
@@ -148,18 +148,18 @@ class Promises:
 
     @property
     def misled(self) -> bool:
-        """Whether the loss does not do what gradients say."""
+        """Return True if the changes of the loss contradict the gradients."""
         broken, told = self.kept
         return broken >= max(FEW, MISLED * told)
 
     def stays(self, converged: bool) -> bool:
-        """Whether the loss has stopped to fall while it is still a good part of the first one."""
+        """Return True if the loss has stopped to fall while it is still a good part of the first one."""
         best, before = min(self.losses), min(self.losses[: -max(int(STAYED * len(self.losses)), 1)], default=np.inf)
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
 
     def doubt(self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str = "") -> "Doubt":
-        """Of a search by an ``estimator``, None for that of the problem, and an ``optimiser`` whose own test may be
+        """Judge a search by an ``estimator``, None for that of the problem, and an ``optimiser`` whose own test may be
         met; ``is_run``: of runs of a simulation; ``held``: what `held` says. A line search bears estimators whose sizes
         are wrong."""
         by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
@@ -189,27 +189,27 @@ class Promises:
 
 @dataclass(frozen=True)
 class Doubt:
-    """Whether a search can be trusted."""
+    """A judgement on a search, with sentences about why its result may not be trusted."""
 
     misled: bool
-    """Its gradient disagreed with what steps did, and it did not go by its direction alone."""
+    """True where its gradient disagreed with its steps, and the search did not go by the gradient's direction alone."""
     stays: bool
-    """Its loss has stopped to fall while it is still a good part of the first one."""
+    """True where its loss has stopped to fall while it is still a good part of the first one."""
     words: str
-    """Sentences that say so, and what to try; empty where there is nothing to say."""
+    """Sentences of doubt with advice; empty without doubts."""
 
 
 @dataclass
 class CountedEnsemble:
-    """An `Ensemble` that a search asks for one gradient after another: it counts the runs that averages leave out, and
-    warns the first time alone."""
+    """An `Ensemble` for a search that asks for one gradient after another: it counts the runs that averages leave out,
+    and warns the first time alone."""
 
     ensemble: Any
     left_out: int = 0
-    """Runs, over all estimates."""
+    """Number of runs left out over all estimates."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """The estimate of the ensemble."""
+        """Return the estimate of the ensemble, and count the runs that it left out."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -220,7 +220,7 @@ class CountedEnsemble:
 
 @dataclass
 class Evaluator:
-    """The function of one vector that the optimiser sees; replays the log, then computes and adds to it."""
+    """The function of one vector that an optimiser sees; it replays the log, then computes and adds to the log."""
 
     problem: Optimisable
     estimator: Any
@@ -230,9 +230,9 @@ class Evaluator:
     on_iteration: Callable[[Record], None] | None
     history: list[Record] = field(default_factory=list)
     updates: int = 0
-    """Made by the optimiser so far."""
+    """Number of updates by the optimiser so far."""
     refused: int = 0
-    """Evaluations so far of which there is no run, after which the search went on."""
+    """Number of evaluations so far that have no run, after which the search went on."""
     promises: Promises = field(default_factory=Promises)
     """Of the gradients so far, and whether the loss kept them."""
     logged: int = 0
@@ -244,21 +244,21 @@ class Evaluator:
 
     @property
     def left_out(self) -> int:
-        """Runs that averages over ensembles have left out, of the evaluations that were not replayed."""
+        """Return how many runs averages over ensembles have left out, in evaluations that were not replayed."""
         return self.estimator.left_out if isinstance(self.estimator, CountedEnsemble) else 0
 
     def count_update(self) -> None:
-        """Called by the optimiser after each update."""
+        """Count an update; the optimiser calls it after each."""
         self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
-        """The loss and its gradient (size,) at a vector (size,)."""
+        """Return the loss and its gradient (size,) at a vector (size,)."""
         if self.logged < len(self.log):
             return self._noted(self._replay(vector), replayed=True)
         return self._noted(self._kept(self._compute(vector)), replayed=False)
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """The same, or None where there is no run: in the log its loss is infinite, and its gradient 0."""
+        """Return loss and gradient at a vector, None where there is no run: its log has an infinite loss and 0."""
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)
@@ -274,12 +274,12 @@ class Evaluator:
         return None
 
     def _kept(self, evaluation: LoggedEvaluation) -> LoggedEvaluation:
-        """The evaluation, which is in the log from now on."""
+        """Append an evaluation to the log, and return it."""
         self.log.append(evaluation)
         return evaluation
 
     def _noted(self, evaluation: LoggedEvaluation, replayed: bool) -> tuple[float, Vector]:
-        """The loss and its gradient (size,), which are in the history from now on."""
+        """Add an evaluation to the history, and return its loss and its gradient (size,)."""
         self.logged += 1
         record = Record(
             iteration=len(self.history),
@@ -298,8 +298,8 @@ class Evaluator:
         return evaluation.loss, evaluation.gradient.copy()
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
-        """The losses at vectors (size,), computed in one launch if the problem can; infinite for a run that diverges,
-        and for parameters that cannot be. They are in the log, with a gradient of 0, and not in the history."""
+        """Return the losses at vectors (size,), computed in one launch if the problem can; infinite for a run that
+        diverges, and for impossible parameters. The log gets them with a gradient of 0, the history does not."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
@@ -324,11 +324,11 @@ class Evaluator:
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        """The loss and its gradient, as the problem returns them."""
+        """Return the loss and its gradient as the problem returns them."""
         return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """The logged evaluation, or the one so many ahead of it, if it is the one asked for."""
+        """Return the logged evaluation, or the one ``ahead`` entries later, if it is the one asked for."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -361,7 +361,7 @@ class Evaluator:
             raise error.with_advice(self._shorter(error.advice, vector)) from error
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
-        """The evaluation, which is finite; raises what the problem raises, or a `ComputationError`."""
+        """Compute an evaluation and return it if it is finite; raise the problem's error or a `ComputationError`."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
         evaluation = LoggedEvaluation(
             vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients)
@@ -370,7 +370,7 @@ class Evaluator:
         return evaluation
 
     def _shorter(self, advice: str, vector: Vector) -> str:
-        """The advice of a run that diverged during a search, with where the search had come to, and the best before."""
+        """Extend the advice of a run that diverged during a search by the point of the search and the best before."""
         best = min(self.history, key=lambda record: record.loss)
         told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
         least = f"the least loss before is {best.loss:.4g}"
@@ -380,7 +380,7 @@ class Evaluator:
         return "; ".join([*told, least])
 
     def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
-        """The gradient as one vector, after a check of its names and shapes."""
+        """Return the gradient as one vector, after a check of its names and shapes."""
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
@@ -391,7 +391,7 @@ class Evaluator:
         return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
 
     def _require_finite(self, evaluation: LoggedEvaluation) -> None:
-        """Raise ComputationError, with advice, if an evaluation cannot be used."""
+        """Raise `ComputationError`, with advice, if an evaluation is not finite."""
         broken = ~(np.abs(evaluation.gradient) <= GREATEST_GRADIENT)
         if math.isfinite(evaluation.loss) and not broken.any():
             return
@@ -412,19 +412,19 @@ class Evaluator:
         )
 
     def _names_of(self, components: np.ndarray) -> str:
-        """The parameters to which the marked components (size,) of the vector belong, for a message."""
+        """Name the parameters to which the marked components (size,) of the vector belong, for a message."""
         marked = self.layout.unravel(components.astype(np.float64))
         return ", ".join(f"'{name}'" for name, marks in marked.items() if marks.any())
 
 
 def _in_words(parameters: Parameters) -> str:
-    """Their names and values."""
+    """Write the names and values of parameters for a message."""
     found = {name: np.array2string(np.asarray(value), precision=4) for name, value in parameters.items()}
     return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
 
 
 def as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Parameters:
-    """Parameters with a float wherever the user's start has a number."""
+    """Return parameters with a float wherever the user's start has a number."""
     return {
         name: float(value) if value.ndim == 0 and not isinstance(start[name], np.ndarray) else value
         for name, value in parameters.items()

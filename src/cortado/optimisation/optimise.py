@@ -38,31 +38,30 @@ from cortado.words import counted, sized
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """Parameters by name -> the loss, and its gradient by the same names."""
 MOST_ITERATIONS = 10_000_000
-"""Updates of a search, in tasks too; more are taken for a mistake."""
+"""Most updates of a search, in tasks too; more are taken for a mistake."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """A function of the parameters, which returns its own gradient, as a `Optimisable`."""
+    """A problem made of a function that returns the loss of the parameters and its own gradient: an `Optimisable`."""
 
     function: LossFunction
 
     @property
     def fingerprint(self) -> str:
-        """The name of the function."""
+        """Return the name of the function."""
         kind = type(self.function)
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """What the function returns; raises `InputError` where an estimator is given, as the gradient is the function's
-        own."""
+        """Return the function's result; raise `InputError` for an estimator, as the gradient is the function's own."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out where a function makes its own.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
-    """The problem itself, or a function made into one; raises `InputError` for anything else."""
+    """Return the problem itself, or a function made into one; raise `InputError` for anything else."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")
     if hasattr(problem, "value_and_gradient"):
@@ -80,31 +79,31 @@ class Result:
     """The best parameters of an optimisation, with its history."""
 
     parameters: Parameters
-    """With the lowest loss seen."""
+    """Parameters with the lowest loss seen."""
     loss: float
-    """The lowest seen."""
+    """Lowest loss seen."""
     last_parameters: Parameters
     """The optimiser's last iterate."""
     history: tuple[Record, ...]
     """One per evaluation, in order."""
     updates: int
-    """That the optimiser made, with those replayed from the checkpoint."""
+    """Updates by the optimiser, with those replayed from the checkpoint."""
     evaluations: int
-    """How many there are in the history, with those replayed from the checkpoint."""
+    """Number of evaluations in the history, with those replayed from the checkpoint."""
     message: str
     """How it ended, a sentence."""
     converged: bool
-    """Whether the optimiser's own test was met, and the gradient agreed with what steps did; only L-BFGS has a test."""
+    """True where the optimiser's own test was met, and the gradient agreed with the steps; only L-BFGS has a test."""
     refused: int = 0
-    """Evaluations of which there is no run, as it diverged or a parameter was out of its range, so that the steps to
-    them were refused; they are not in the history."""
+    """Evaluations without a run, as it diverged or a parameter was out of its range, so that the steps to them were
+    refused; they are not in the history."""
     left_out: int = 0
-    """Runs that averages over ensembles left out, for the same reasons; of those that were not replayed."""
+    """Runs that averages over ensembles left out, for those reasons too; replayed evaluations do not count."""
     misled: bool = False
-    """Whether the gradient disagreed with what steps did, as beyond the horizon of `cortado.certify`, by which the
-    search cannot be trusted; `message` says what to try."""
+    """True where the gradient disagreed with the steps, as beyond the horizon of `cortado.certify`, so that the search
+    cannot be trusted; `message` says what to try."""
     stays: bool = False
-    """Whether the loss stayed at a good part of the first one, as in a wrong valley."""
+    """True where the loss stayed at a good part of the first one, as in a wrong valley."""
     problem: Any = field(default=None, repr=False)
     """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
     and in a result that was pickled."""
@@ -118,14 +117,14 @@ class Result:
         return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
-        """With the ends of runs, first and found, beside the target; the parameters; the losses of all evaluations."""
+        """Show in a notebook the ends of the first and the best run beside the target, parameters, and losses."""
         losses, start = [record.loss for record in self.history], self.history[0].parameters
         page: str = on_top("result_page")(self, self.message, self.problem, start, self.parameters, losses)
         return page
 
 
 def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
-    """The start as float64 arrays, or InputError if there is a parameter that cannot be optimised."""
+    """Return the start as float64 arrays; raise `InputError` for a parameter that cannot be optimised."""
     if not isinstance(start, Mapping):
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
@@ -140,7 +139,7 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
-    """Lower and upper bounds as vectors (size,), or InputError if they do not fit the parameters."""
+    """Return lower and upper bounds as vectors (size,); raise `InputError` if they do not fit the parameters."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
     unknown = sorted(set(bounds) - set(layout.names), key=str)
@@ -156,7 +155,7 @@ def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayou
 
 
 def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """The lower and upper bound of one parameter, each of its shape, infinite where there is none."""
+    """Return the lower and upper bound of one parameter, each of its shape, infinite where there is none."""
     try:
         lower, upper = pair
         low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
@@ -173,7 +172,7 @@ def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> t
 
 
 def require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
-    """Raise InputError if the start is outside of the bounds."""
+    """Raise `InputError` if the start is outside of the bounds."""
     outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
     for name, marks in outside.items():
         if marks.any():
@@ -184,7 +183,7 @@ def require_within(vector: Vector, lower: Vector, upper: Vector, layout: Paramet
 
 
 def require_count(iterations: int) -> None:
-    """Raise InputError unless the number of iterations is a positive integer, and one that a search can make."""
+    """Raise `InputError` unless the number of iterations is a positive integer that a search can make."""
     if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
         wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
         raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
@@ -199,7 +198,7 @@ def evaluate(
     loss_if_diverged: float | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """The loss of a problem at many points, in their order, with the same bits wherever they are computed.
+    """Return the losses of a problem at many points, in their order, bit for bit equal wherever they are computed.
 
     Parameters:
         problem: a `Problem`, or one in other coordinates (`cortado.optimisation.transforms.Transformed`).
@@ -342,16 +341,16 @@ def optimise(
 
 
 optimize = optimise
-"""The same, for those who spell it so."""
+"""`optimise`, for users who spell it with a z."""
 
 
 def _description(setting: object) -> str:
-    """The repr of a setting, without the address that a plain object shows in it."""
+    """Return the repr of a setting, without the address that a plain object shows in it."""
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))
 
 
 def _without_runs_in_words(refused: int, left_out: int) -> str:
-    """What to add to the message of a search that refused steps, and whose averages left runs out."""
+    """Return the sentence about refused steps and left-out runs that a search's message ends with."""
     why = ["refused " + counted(refused, "step")] * bool(refused)
     why += [f"left {counted(left_out, 'run')} out of its averages"] * bool(left_out)
     return f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""

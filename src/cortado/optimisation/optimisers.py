@@ -30,13 +30,13 @@ from cortado.optimisation.search import (
 from cortado.words import quoted
 
 MOST_TRIALS = 1_000
-"""Trials of an update; more are taken for a mistake, as each is a run."""
+"""Most trials of an update; more are taken for a mistake, as each is a run."""
 GROWTH = 3.0
 """How much longer than the best length the longest one may be at the next update."""
 SMALL = 0.01
-"""Of the first gradient: where L-BFGS ends with more, it is at no optimum."""
+"""Part of the first gradient above which the end of L-BFGS is no optimum."""
 MOST_MEMORY = 1_000
-"""Past updates that L-BFGS keeps; more are taken for a mistake, as some ten of them do."""
+"""Most past updates that L-BFGS keeps; more are taken for a mistake, as some ten suffice."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
@@ -71,11 +71,11 @@ class Adam:
         require_positive("epsilon", self.epsilon)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the learning rates are not those of these parameters."""
+        """Raise `InputError` if the learning rates are not those of these parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
+        """Make `search.iterations` updates by Adam, with one gradient each, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         theta = Iterate(search)
         m, v, t = np.zeros_like(theta.x), np.zeros_like(theta.x), 0
@@ -116,11 +116,11 @@ class GradientDescent:
         require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the learning rates are not those of these parameters."""
+        """Raise `InputError` if the learning rates are not those of these parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
+        """Make `search.iterations` updates by gradient descent, with one gradient each; evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         at, before = Iterate(search), search.start
         for _ in range(search.iterations):
@@ -167,13 +167,13 @@ class LBFGS:
         keep_own(self, "scale")
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the scales are not those of these parameters, or there is no memory for the updates."""
+        """Raise `InputError` if the scales are not those of these parameters, or there is no memory for the updates."""
         require_names("scale", self.scale, layout)
         numbers = 2.0 * self.memory * layout.size + 11.0 * self.memory**2
         require({f"{self.memory:,} past updates": 8.0 * numbers}, "take fewer of them, by memory")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates, of one or more evaluations each."""
+        """Make at most `search.iterations` updates by L-BFGS, of one or more evaluations each."""
         from scipy.optimize import minimize
 
         scale = search.layout.spread(self.scale)
@@ -232,13 +232,13 @@ class _Trial:
     gradient: Vector
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
-        """A loss and a gradient at y, which has none. Along the way from here they are those of the parabola
-        f + s t - 2 s t^2 at t = 1, where f is the loss here and s < 0 its slope; its minimum is at t = 1 / 4."""
+        """Return a loss and a gradient at y, where the run diverged. Along the way from here they are those of a
+        parabola f + s t - 2 s t^2 at t = 1, with its minimum at t = 1 / 4. f is the loss here, s < 0 its slope."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
-    """How it ended, by scipy's status, and by the part of the first gradient that is left."""
+    """Say how L-BFGS ended, by scipy's status, and by the part of the first gradient that is left."""
     share = f"the gradient is {left:.2g} of the first one"
     if status == 1:
         return f"L-BFGS made all its {iterations} iterations without converging: {share}. More may lower the loss."
@@ -253,7 +253,7 @@ def _lbfgs_in_words(status: int, iterations: int, left: float) -> str:
 
 
 def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:
-    """The bounds on (x - start) / scale, as scipy takes them; None if there are none at all."""
+    """Return the bounds on (x - start) / scale as scipy takes them; None if there are none at all."""
     if np.isinf(search.lower).all() and np.isinf(search.upper).all():
         return None
     lower, upper = (search.lower - search.start) / scale, (search.upper - search.start) / scale
@@ -261,7 +261,7 @@ def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] |
 
 
 def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vector) -> float:
-    """The greatest component, in units of `scale`, of the gradient without what points out of the bounds."""
+    """Return the greatest component, in units of `scale`, of the gradient within the bounds."""
     outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
     return float(np.max(np.abs(np.where(outwards, 0.0, scale * gradient))))
 
@@ -294,7 +294,7 @@ class LineSearch:
     trials: int = 5
     """Lengths that are tried at a time, at most 1,000."""
     shortest: float = 1.0 / 64.0
-    """Of these lengths, over the longest."""
+    """Shortest of these lengths, over the longest."""
     momentum: float = 0.5
     """How much of the direction before is kept, in [0, 1) [-]."""
 
@@ -311,12 +311,12 @@ class LineSearch:
         require_at_most("trials", self.trials, MOST_TRIALS)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the scales are not those of these parameters, or there is no memory for the trials."""
+        """Raise `InputError` if the scales are not those of these parameters, or there is no memory for the trials."""
         require_names("scale", self.scale, layout)
         require({f"{self.trials:,} trials": 16.0 * self.trials * layout.size}, "take fewer trials")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates, of one gradient and some trials each; evaluate the last iterate."""
+        """Make at most `search.iterations` updates, of a gradient and some trials each; evaluate the last iterate."""
         scale, at, reach = search.layout.spread(self.scale), Iterate(search), 1.0
         along = np.zeros_like(at.x)
         for _ in range(search.iterations):
@@ -335,7 +335,7 @@ class LineSearch:
 
 
 def unit(vector: Vector) -> Vector:
-    """A vector (size,) divided by its root mean square, or 0."""
+    """Divide a vector (size,) by its root mean square; a vector of zeros stays."""
     greatest = np.abs(vector).max(initial=0.0)
     scaled = vector / greatest if greatest else vector
     size = np.sqrt(np.mean(scaled**2)) if greatest else 1.0
@@ -347,7 +347,7 @@ BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "l
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """An optimiser from its name and its settings, or the object itself; raises `InputError` for anything else."""
+    """Return an optimiser by its name and its settings, or the object itself; raise `InputError` for anything else."""
     if isinstance(optimiser, str):
         return _named(optimiser, settings)
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
@@ -364,7 +364,7 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
 
 
 def _named(name: str, settings: Mapping[str, Any]) -> Optimiser:
-    """The optimiser of a name, with settings that must be its own and complete."""
+    """Make the optimiser of a name, with settings that must be its own and complete."""
     if name not in BY_NAME:
         raise InputError(f"The optimiser is {shown(name)}, but must be one of {quoted(BY_NAME)}, or an object.")
     known = {field.name: field.default is MISSING for field in fields(BY_NAME[name])}

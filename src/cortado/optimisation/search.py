@@ -27,15 +27,15 @@ from cortado.words import quoted
 Vector = npt.NDArray[np.float64]
 FORMAT = "cortado replay log 1"
 LONGEST_HEADER = 2**20
-"""Bytes of the first line of a log."""
+"""Most bytes of the first line of a log."""
 PerParameter = float | Mapping[str, float]
 HALVINGS = 10
-"""How often one step is halved before the search ends."""
+"""Most halvings of one step before the search ends."""
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Where each named parameter lies in the one vector that an optimiser sees."""
+    """The order and the shapes of named parameters in the one vector that an optimiser sees."""
 
     names: tuple[str, ...]
     # in the order in which they follow each other in the vector
@@ -44,40 +44,40 @@ class ParameterLayout:
 
     @classmethod
     def of(cls, parameters: Mapping[str, Vector]) -> Self:
-        """The layout of these parameters, in their order."""
+        """Return the layout of these parameters, in their order."""
         return cls(tuple(parameters), tuple(np.shape(value) for value in parameters.values()))
 
     @property
     def sizes(self) -> list[int]:
-        """The number of components of each parameter."""
+        """Return the number of components of each parameter."""
         return [int(np.prod(shape)) for shape in self.shapes]
 
     @property
     def size(self) -> int:
-        """The number of components of the vector."""
+        """Return the number of components of the vector."""
         return sum(self.sizes)
 
     def ravel(self, parameters: Mapping[str, Any]) -> Vector:
-        """The vector (size,) of parameters that have the names and shapes of this layout."""
+        """Return the vector (size,) of parameters that have the names and shapes of this layout."""
         parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
         return np.concatenate(parts)
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
-        """The parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
+        """Return the parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         return {
             name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
         }
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:
-        """One number for every component (size,), from one number or from one number per parameter."""
+        """Return a number for every component (size,), from one number or from one number per parameter."""
         by_name = values if isinstance(values, Mapping) else dict.fromkeys(self.names, values)
         return np.repeat([float(by_name[name]) for name in self.names], self.sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedEvaluation:
-    """One evaluation of the loss and its gradient."""
+    """One evaluation of the loss and its gradient, as a replay log keeps it."""
 
     parameters: Vector
     # (size,), each component in its parameter's unit
@@ -86,19 +86,19 @@ class LoggedEvaluation:
 
 
 class Log(Protocol):
-    """What the optimisation needs of a replay log."""
+    """A replay log of evaluations, as an optimisation needs it."""
 
     @property
     def fate(self) -> str:
-        """What becomes of the evaluations, for messages: the end of "the evaluations ..."."""
+        """Return the end of the sentence "the evaluations ..." that says what becomes of them."""
 
     def __len__(self) -> int: ...
 
     def read(self, index: int) -> LoggedEvaluation:
-        """The evaluation of that index, bit for bit as it was appended."""
+        """Return the evaluation of an index, bit for bit as it was appended."""
 
     def append(self, evaluation: LoggedEvaluation, /) -> None:
-        """Keep one more evaluation."""
+        """Append one more evaluation."""
 
     def close(self) -> None:
         """Free what the log holds open."""
@@ -113,7 +113,7 @@ class MemoryLog(list[LoggedEvaluation]):
         return self[index]
 
     def close(self) -> None:
-        """Does nothing: no file is open."""
+        """Do nothing: no file is open."""
 
 
 class ReplayLog:
@@ -163,21 +163,21 @@ class ReplayLog:
 
     @property
     def fate(self) -> str:
-        """Where the evaluations are kept."""
+        """Return the end of the sentence "the evaluations ..." that says where they are."""
         return f"are in '{self._path}'"
 
     def __len__(self) -> int:
         return self._count
 
     def read(self, index: int) -> LoggedEvaluation:
-        """The evaluation of that index, 0 <= index < len(self), bit for bit as it was appended."""
+        """Return the evaluation of an index, 0 <= index < len(self), bit for bit as it was appended."""
         self._file.seek(self._first_record + index * self._record_size)
         values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
         size = self._layout.size
         return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
-        """Write one more evaluation; it is on the disk on return. Raises ComputationError if the disk refuses."""
+        """Write one more evaluation; it is on the disk on return. Raises `ComputationError` if the disk refuses."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
         try:
@@ -192,11 +192,11 @@ class ReplayLog:
         self._count += 1
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the log."""
         self._file.close()
 
     def _count_whole(self) -> int:
-        """The number of whole records, without a torn last one; InputError if another one is damaged."""
+        """Return the number of whole records, without a torn last one; raise `InputError` if another one is damaged."""
         end = self._file.seek(0, os.SEEK_END)
         complete, whole = (end - self._first_record) // self._record_size, 0
         self._file.seek(self._first_record)
@@ -211,7 +211,7 @@ class ReplayLog:
 
 
 def _require_unused(path: Path) -> None:
-    """Raise InputError if there is a log with anything after its first line."""
+    """Raise `InputError` if there is a log with anything after its first line."""
     if not path.exists():
         return
     with open(path, "rb") as file:
@@ -225,7 +225,7 @@ def _require_unused(path: Path) -> None:
 
 
 def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
-    """Compare the first line with what is expected of it; the position of the first record [byte]."""
+    """Compare the first line of a log with the expected one; return the position of the first record [byte]."""
     try:
         found = parsed_json(file.readline(LONGEST_HEADER))
     except ValueError:
@@ -245,7 +245,7 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
 
 
 def _differing(former: str, given: str) -> tuple[str, str]:
-    """Of two texts made of as many parts, separated by semicolons, those that differ."""
+    """Return those parts of two texts that differ, where both have equally many, separated by semicolons."""
     formers, givens = former.split("; "), given.split("; ")
     if len(formers) != len(givens):
         return former, given
@@ -254,7 +254,7 @@ def _differing(former: str, given: str) -> tuple[str, str]:
 
 
 def _is_whole(record: bytes, index: int, size: int) -> bool:
-    """Whether these bytes are the record of that index, whole."""
+    """Test that these bytes are the whole record of an index."""
     if len(record) < size:
         return False
     content, (checksum,) = record[:-4], struct.unpack("<I", record[-4:])
@@ -268,8 +268,8 @@ class Search:
     evaluate: Callable[[Vector], tuple[float, Vector]]
     """Vector (size,) -> loss, gradient (size,); raises an error where there is no run, which ends the search."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
-    """The same, but None where there is no run, as it diverges or a parameter is out of its range; it is counted, and
-    the search goes on."""
+    """Vector (size,) -> loss, gradient (size,), or None where there is no run, as it diverges or a parameter is out of
+    its range; the search goes on, and counts it."""
     losses: Callable[[Sequence[Vector]], list[float]]
     """Vectors (size,) -> the loss of each, infinite where there can be no run, as it diverges or parameters
     are out of range; cheaper than so many evaluations."""
@@ -284,23 +284,23 @@ class Search:
     iterations: int
     """Greatest number of updates."""
     updated: Callable[[], None] = lambda: None
-    """Called after each update, by which those who follow the search count them."""
+    """Called after each update, so that the search counts it."""
 
     def project(self, vector: Vector) -> Vector:
-        """The nearest vector within the bounds."""
+        """Return the nearest vector within the bounds."""
         return np.clip(vector, self.lower, self.upper)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What an optimiser returns."""
+    """The result of an optimiser: its last iterate, and how the search ended."""
 
     last: Vector
     """(size,), the last iterate, which has been evaluated."""
     converged: bool
-    """Whether the optimiser's own test was met."""
+    """True where the optimiser's own test was met."""
     message: str
-    """A sentence."""
+    """A sentence about the end of the search."""
 
 
 @runtime_checkable
@@ -308,14 +308,14 @@ class Optimiser(Protocol):
     """An algorithm that lowers the loss."""
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the settings do not fit these parameters."""
+        """Raise `InputError` if the settings do not fit these parameters."""
 
     def minimise(self, search: Search) -> Outcome:
         """Lower the loss by at most `search.iterations` updates."""
 
 
 def require_positive(name: str, values: PerParameter) -> None:
-    """Raise InputError unless every number is positive and finite."""
+    """Raise `InputError` unless every number is positive and finite."""
     for value in values.values() if isinstance(values, Mapping) else [values]:
         number = as_number(value)
         if number is None or number <= 0.0:
@@ -323,14 +323,14 @@ def require_positive(name: str, values: PerParameter) -> None:
 
 
 def require_fraction(name: str, value: float) -> None:
-    """Raise InputError unless a number is in [0, 1)."""
+    """Raise `InputError` unless a number is in [0, 1)."""
     number = as_number(value)
     if number is None or not 0.0 <= number < 1.0:
         raise InputError(f"{name} must be a number in [0, 1), not {shown(value)}.")
 
 
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise InputError if a setting is given per parameter for others than these parameters."""
+    """Raise `InputError` if a setting is given by name for others than these parameters."""
     if isinstance(values, Mapping) and set(values) != set(layout.names):
         raise InputError(
             f"{name} is given for {quoted(values)}, but the optimised parameters are "
@@ -339,7 +339,7 @@ def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> N
 
 
 class Iterate:
-    """A point that has been evaluated, and moves."""
+    """An iterate of an optimiser: a point that has been evaluated, and moves to the next."""
 
     def __init__(self, search: Search):
         self._search, self.x = search, search.start
@@ -347,7 +347,7 @@ class Iterate:
 
     def move(self, target: Vector) -> float:
         """Go to a vector (size,), or, where it has no run, half of the way there, or a quarter, and so on, which is one
-        update. Returns which part of the way it was; raises the error of the last part where that has no run either."""
+        update. Returns the part of the way gone; raises the error of the last part where it has no run either."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)
@@ -359,5 +359,5 @@ class Iterate:
         return part
 
     def outcome(self, name: str) -> Outcome:
-        """That of an optimiser without a test of convergence."""
+        """Return the outcome of an optimiser without a test of convergence."""
         return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")

@@ -18,9 +18,9 @@ from cortado.errors import InputError, shown
 from cortado.files.output_files import write_atomically
 
 MOST_COMBINATIONS = 100_000
-"""Combinations; more are taken for a mistake."""
+"""Most combinations of a sweep; more are taken for a mistake."""
 _LONGEST_NAME = 120
-"""Characters of a folder's name."""
+"""Most characters of a folder's name."""
 _PAIRS = {"[": "]", "{": "}"}
 _PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
 """Names of folders that need no quotes in a shell."""
@@ -35,13 +35,13 @@ class Combination:
 
     @property
     def overrides(self) -> list[str]:
-        """The values as options ``--set`` of `cortado run` and `cortado optimise`."""
+        """Return the values as options ``--set`` of `cortado run` and `cortado optimise`."""
         return [f"{key}={value}" for key, value in self.values]
 
     @property
     def name(self) -> str:
-        """Name of its folder: the values; where these are long or strange, some of them with a checksum. It does not
-        depend on the other combinations of a sweep."""
+        """Return the name of its folder: the values; where these are long or strange, some of them with a checksum. It
+        does not depend on the other combinations of a sweep."""
         name = ",".join(self.overrides)
         if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
             return name
@@ -50,8 +50,8 @@ class Combination:
 
 
 def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
-    """Every combination of the values of all keys, the first key changing slowest; the values of ``zipped`` keys go
-    together, the first of one with the first of the others, and change fastest. Raises `InputError`."""
+    """Return every combination of the values of all keys, the first key changing slowest; the values of ``zipped`` keys
+    go together, the first of one with the first of the others, and change fastest. Raises `InputError`."""
     if not options and not zipped:
         raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
     keys, together = _values(options, "--set"), _values(zipped, "--zip")
@@ -70,7 +70,7 @@ def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Com
 
 
 def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
-    """The values of each key; raises `InputError`, in which the option has its name."""
+    """Return the values of each key; raise `InputError` in a sentence with the name of the option."""
     keys: dict[str, list[str]] = {}
     for option in options:
         key, equals, text = option.partition("=")
@@ -86,7 +86,7 @@ def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
 
 
 def _split(text: str) -> list[str]:
-    """Text at its commas, but not at those within brackets or quotes."""
+    """Split a text at its commas, but not at those within brackets or quotes."""
     parts, closing, quote = [""], [], ""
     for letter in text:
         if quote:
@@ -106,7 +106,7 @@ def _split(text: str) -> list[str]:
 
 NAME = "sweep.csv"
 MOST_NUMBERS = 12
-"""Of a list that the table shows; longer ones are in the result.json of each folder alone."""
+"""Most numbers of a list that the table shows; longer ones are in the result.json of each folder alone."""
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
@@ -134,7 +134,7 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def folders_in(folder: Path) -> list[str]:
-    """The names of the folders in the table of a sweep, in its order; none where there is no table that can be read."""
+    """Return the names of the folders in the table of a sweep, in its order; none without a table that can be read."""
     try:
         with open(folder / NAME, newline="", encoding="utf-8") as file:
             return [row["folder"] for row in csv.DictReader(file)]
@@ -143,12 +143,12 @@ def folders_in(folder: Path) -> list[str]:
 
 
 def failed(result: Mapping[str, Any]) -> bool:
-    """Whether a result has failures."""
+    """Return True if a result has failures."""
     return bool(result["failures"])
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Tables within tables as one, their names joined by full stops; short lists as JSON, longer ones left out."""
+    """Return tables within tables as one, with names joined by full stops; short lists as JSON, longer ones not."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -161,19 +161,19 @@ def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
-"""Orders between which one is looked for."""
+"""Range of orders in which one is looked for."""
 LOWEST, HIGHEST = 0.5, 2.0
 """Orders that are believed; the methods have 1 to 2. Values with another one are not in the range where differences
 shrink by a power of the size."""
 ROUND_OFF = 1e-6
-"""Relative: an order that is one of both but for this is believed."""
+"""Relative deviation within which an order at either end of the range is believed."""
 SAFE, UNSURE = 1.25, 3.0
 """Safety factors of Roache (1994): of three sizes whose order is believed, and of all others."""
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """Of a number f(h) = limit + C h^order, from its values at the three finest sizes h.
+    """An extrapolation of a number f(h) = limit + C h^order from its values at the three finest sizes h.
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
     Fluids Eng. 116 (1994), 405, by the procedure of I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001, for sizes
@@ -182,18 +182,18 @@ class Extrapolation:
     """
 
     order: float | None
-    """As observed; None where there is none."""
+    """Observed order; None where there is none."""
     limit: float | None
-    """In the unit of the values, of the order within `LOWEST` and `HIGHEST` that is nearest to the observed one."""
+    """Limit in the values' unit, by the order within `LOWEST` and `HIGHEST` that is nearest to the observed one."""
     error: float | None
-    """Of the value at the finest size, in its unit, with a safety factor: the limit is probably no further away. None
-    of what is not a number."""
+    """Error of the value at the finest size, in its unit, with a safety factor: the limit is probably no further away.
+    None where a value is not a number."""
     flag: str = ""
     """Why no order is observed, or the observed one not believed, in words; empty in the asymptotic range."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":
-        """``values`` (k,) at ``sizes`` (k,), k of at least 3, the finest one last."""
+        """Extrapolate ``values`` (k,) at ``sizes`` (k,), k of at least 3, the finest one last."""
         (h_3, h_2, h_1), (f_3, f_2, f_1) = sizes[-3:], values[-3:]
         fine, coarse = f_2 - f_1, f_3 - f_2
         if not np.isfinite([fine, coarse]).all():

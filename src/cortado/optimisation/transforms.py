@@ -28,18 +28,18 @@ class Bijector(Protocol):
     """A smooth map p(u) with its inverse and its adjoint."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        """p(u)."""
+        """Return the parameter p(u) at coordinates u."""
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """The u for which p(u) is ``parameter``, or nearest to it."""
+        """Return the u for which p(u) is ``parameter``, or nearest to it."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """The derivative of a loss with respect to u, given ``bar``, that with respect to p(u)."""
+        """Return the derivative of a loss with respect to u, given ``bar``, that with respect to p(u)."""
 
 
 @dataclass(frozen=True)
 class Logarithm:
-    """p = exp(u): a step in u multiplies the parameter, which stays positive."""
+    """The transform p = exp(u): a step in u multiplies the parameter, which stays positive."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):  # a problem refuses a parameter that is not finite
@@ -57,7 +57,7 @@ class Logarithm:
 
 @dataclass(frozen=True)
 class Softmax:
-    """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
+    """The transform p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return softmax(_fractions("coordinates", u), axis=1)
@@ -73,7 +73,7 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """p (steps, d) interpolated linearly in time between knots u (k, d) at even times from first to last step."""
+    """A transform of p (steps, d), linear in time between knots u (k, d) at even times from first to last step."""
 
     steps: int
     knots: int
@@ -84,12 +84,12 @@ class TimeInterpolation:
 
     @property
     def places(self) -> np.ndarray:
-        """(k,) the steps at which the knots are, counted from 0; in between where the numbers do not fit."""
+        """Return the steps (k,) at which the knots are, counted from 0; in between where the numbers do not fit."""
         return np.linspace(0.0, self.steps - 1.0, self.knots)
 
     @property
     def _weights(self) -> np.ndarray:
-        """(steps, knots)"""
+        """Return the weights (steps, knots) of knots in the values of steps."""
         places = np.linspace(0.0, self.knots - 1.0, self.steps)
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
@@ -105,25 +105,26 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """p = base + matrix u: such as accelerations after which a tank always stands where it shall, or a nozzle that
-    follows commands with a lag."""
+    """The transform p = base + matrix u, such as accelerations after which a tank always stands where it shall, or a
+    nozzle that follows commands with a lag."""
 
     def __init__(self, base: Any, matrix: Any):
-        """``base`` of the parameter's shape, in its unit; ``matrix`` of that shape followed by the shape of u."""
+        """Take a ``base`` of the parameter's shape and unit, and a ``matrix`` of that shape followed by the shape of
+        u."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """With a checksum of its numbers, by which a search that is resumed knows it."""
+        """Show a checksum of the numbers, by which a search that is resumed knows the transform."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return self.base + np.tensordot(self.matrix, _shaped("coordinates", u, self._shape), len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """The least of all u that come nearest to ``parameter``."""
+        """Return the least of all u for which p(u) comes nearest to ``parameter``."""
         offset = _shaped("values", parameter, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
         return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
@@ -133,7 +134,7 @@ class Affine:
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        """The shape of u."""
+        """Return the shape of u."""
         return self.matrix.shape[self.base.ndim :]
 
 
@@ -143,31 +144,31 @@ class OtherParameters:
     problem: Problem
 
     def parameters(self, u: Values) -> Values:
-        """The parameters of the problem that is transformed."""
+        """Return the parameters of the problem that is transformed, by name."""
         raise NotImplementedError
 
     def value(self, u: Values) -> Any:
-        """The loss of these parameters, by a run forward only."""
+        """Return the loss at coordinates u, by a run forward only."""
         return self.problem.value(self.parameters(u))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Batchable.room`."""
+        """Return how many points the problem can compute together, see `Batchable.room`."""
         return self.problem.room(estimator)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """See `Batchable.together`."""
+        """Estimate losses and gradients at several points in one batch, see `Batchable.together`."""
         require_points(points)
         return self.problem.together([self.parameters(u) for u in points], estimator)
 
 
 @fixed
 class Transformed(OtherParameters):
-    """A problem as a function of coordinates: those of the given bijectors, all other parameters as they are."""
+    """A problem as a function of coordinates: those of the given bijectors, and all other parameters as they are."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Raises `InputError` for coordinates of a parameter that the scene does not have."""
+        """Take a problem and bijectors by name; raise `InputError` for a parameter that the scene does not have."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -179,17 +180,17 @@ class Transformed(OtherParameters):
 
     @property
     def fingerprint(self) -> str:
-        """A text that identifies the problem and its coordinates."""
+        """Return a text that identifies the problem and its coordinates."""
         return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
-        """p(u) by name."""
+        """Return the parameters p(u) by name."""
         require_table("u", u, "{'viscosity': value}")
         known = {name: as_numbers(f"coordinate of {name}", u[name]) for name in self.coordinates.keys() & u.keys()}
         return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
 
     def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
-        """u by name."""
+        """Return the coordinates u by name."""
         require_table("parameters", parameters, "{'viscosity': value}")
         names = self.coordinates.keys() & parameters.keys()
         known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
@@ -198,24 +199,24 @@ class Transformed(OtherParameters):
     def value_and_gradient(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None
     ) -> tuple[float, Arrays]:
-        """The loss and its derivatives with respect to the coordinates."""
+        """Return the loss and its derivatives with respect to the coordinates."""
         found = self.estimate(u, gradient)
         return found.loss, found.gradient
 
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """The same, with what the estimator reports. The spread of an ensemble is one of coordinates."""
+        """Estimate loss and gradient at coordinates u; the spread of an ensemble is one of coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """A forward run that estimators can go back through."""
+        """Run the problem forward at coordinates u, so that estimators can go back through the run."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """See `Batchable.together`."""
+        """Estimate losses and gradients at several coordinates in one batch, see `Batchable.together`."""
         found = super().together(points, estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):
@@ -231,7 +232,7 @@ class TransformedPass:
         self.loss = forward_pass.loss
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """The gradient with respect to the coordinates."""
+        """Go back through the run, and return the gradient with respect to the coordinates."""
         gradient = self._pass.back(estimator, observe)
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
@@ -258,7 +259,7 @@ def _fractions(what: str, value: Any) -> np.ndarray:
 
 
 def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:
-    """The derivatives with respect to coordinates, given those with respect to the parameters."""
+    """Return the derivatives with respect to coordinates, given those with respect to the parameters."""
     names = coordinates.keys() & gradient.keys()
     return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}
 
@@ -268,25 +269,25 @@ class FixedParameters(OtherParameters):
     others alone. Ensembles vary the first positions around those that are fixed."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
-        """``fixed``: parameters by name, with ``initial_positions`` (n, d) [m]."""
+        """Take a problem and ``fixed`` parameters by name, with ``initial_positions`` (n, d) [m]."""
         self.problem, self._fixed = problem, fixed
         self.simulation = _Simulation(problem, fixed["initial_positions"])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle and copy the problem by the arguments that it was made from."""
         return FixedParameters, (self.problem, self._fixed)
 
     @property
     def fingerprint(self) -> str:
-        """A text that identifies the problem; it does not tell the fixed values apart."""
+        """Return a text that identifies the problem; it does not tell the fixed values apart."""
         return f"{self.problem.fingerprint}; fixed {', '.join(self._fixed)}"
 
     def parameters(self, u: Values) -> Values:
-        """The parameters of the problem that are not fixed."""
+        """Return the parameters of the problem: the fixed ones and those in ``u``."""
         return {**self._fixed, **u}
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """A forward run that estimators can go back through."""
+        """Run the problem forward, so that estimators can go back through the run."""
         return self.problem.forward_pass(self.parameters(parameters))
 
 

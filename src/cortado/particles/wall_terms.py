@@ -274,7 +274,7 @@ def share_kinds(precision: Precision) -> dict[str, Any]:
 def solid_kernel(
     discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
 ) -> Any:
-    """The kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
+    """Make the kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
     ``make(discretisation)`` gives W, a term of walls (`cortado.particles.terms`) that returns a number, of functions
     that Warp can differentiate; it knows entries of arrays of particle i, ``v_ij`` or ``v_j``, and ``constants``. As

@@ -298,7 +298,7 @@ class Containment:
         self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
         nothing = Poses.zeros(members, 0, layout.precision, device)
         self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
-        """Before and after a step."""
+        """Poses of moving solids before and after a step."""
         none = wp.zeros((members, 0), dtype=layout.precision.real, device=device)
         self._scales = none if moving is None else moving.sizes.scales
         self._constants: dict[str, Any] = {

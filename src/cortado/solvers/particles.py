@@ -93,19 +93,19 @@ class ParticleSolver(Staying):
             *(force for force in self.forces if isinstance(force, Part)),
         )
         self.substeps = 0
-        """Of diffusion, in each step."""
+        """Number of substeps of diffusion in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
         """Sorted, as they were at the start of the step."""
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
-        """What a state consists of."""
+        """The fields of a state."""
         check_fields(self.state_fields, layout.known)
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
         self._requires_grad = requires_grad
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
         """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
         self.loops: tuple[Loop, ...] = ()
-        """Those of a step, in the order in which they run."""
+        """The loops of a step, in the order in which they run."""
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
         self._neighbourhood: Any = None

@@ -31,18 +31,18 @@ from cortado.errors import ComputationError
 from cortado.optimisation.fitting.least_squares import Linearised, Part, Weighting, weighted
 
 MOST_TAKEN = 0.9
-"""Of the score's covariance that the fit may have taken; beyond it there are hardly more frames than parameters."""
+"""Greatest part of the score's covariance that a fit may have taken; beyond it there are too few frames."""
 LONGEST = 3.0
-"""Correlation times are at most so many times as long as what was measured."""
+"""Greatest correlation time, relative to the length of the record."""
 SHORTEST = 0.05
-"""Shorter ones, relative to the time between two frames, are none."""
+"""Correlation times below this, relative to the time between two frames, count as none."""
 SINGULAR = 1e-10
-"""Relative: where the Hessian has an eigenvalue below, a combination of parameters cannot be told."""
+"""Relative eigenvalue of the Hessian below which a combination of parameters cannot be told."""
 
 
 @dataclass(frozen=True)
 class Products:
-    """Sums over the numbers of a frame, of all pairs of frames."""
+    """Products of Jacobians and residuals, summed over the numbers of a frame, for all pairs of frames."""
 
     S: np.ndarray
     """(F, F, p, p) J_f^T C J_g"""
@@ -63,29 +63,29 @@ class Products:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """Of the score J^T e of one observation."""
+    """The covariance of the score J^T e of one observation, with the numbers of independent samples behind it."""
 
     B: np.ndarray
-    """(p, p)"""
+    """(p, p) covariance"""
     products: Products
     lost: float
-    """Share of B that the fit took on average."""
+    """Part of B that the fit took on average."""
     samples: float
-    """How many independent numbers a frame has."""
+    """Number of independent numbers in a frame."""
     frames: float
-    """How many independent frames there are, before they are whitened."""
+    """Number of independent frames, before they are whitened."""
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Of the variance of a combination of the parameters, by Satterthwaite, given N^-1; no more than there were
-        independent numbers to tell the correlation time from."""
+        """Return Satterthwaite's degrees of freedom of the variance of a combination of the parameters, given N^-1; no
+        more than there were independent numbers to tell the correlation time from."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
 
 
 def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: np.ndarray) -> float:
-    """T [s] of the noise, 0 where neighbouring frames are not correlated; ``inverse``: N^-1 of the fit with these
-    residuals."""
+    """Estimate the correlation time T [s] of the noise, 0 where neighbouring frames are not correlated; ``inverse``:
+    N^-1 of the fit with these residuals."""
     from scipy.optimize import brentq
 
     products, gap = Products.of(J, r), float(np.median(np.diff(times)))
@@ -96,7 +96,7 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
     found = float(np.diag(gram, 1).sum()) / total
 
     def excess(logarithm: float) -> float:
-        """How much greater the correlation would be with this T than it is."""
+        """Return how much a T, given by its logarithm, exceeds the found correlation of neighbouring frames."""
         R = np.exp(-np.abs(times[:, None] - times) / np.exp(logarithm))
         V = inverse @ np.einsum("kl,klpq->pq", R, products.S, optimize=True) @ inverse
         expected = R * total / len(r) - taken @ R - (taken @ R).T + np.einsum("pq,ghqp->hg", V, products.K)
@@ -111,13 +111,14 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """How many frames without correlation tell as much about a mean: F (1 - c) / (1 + c), c from frame to frame."""
+    """Return how many uncorrelated frames tell a mean equally well: F (1 - c) / (1 + c), c from frame to frame."""
     kept = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - kept) / (1.0 + kept))
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """The covariance of a fit's score J^T r, from whitened residuals r (F, m) and Jacobians J (F, m, p) of F frames.
+    """Estimate the covariance of a fit's score J^T r, from whitened residuals r (F, m) and Jacobians J (F, m, p) of F
+    frames. They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`.
 
     They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`."""
     F, products = len(r), Products.of(J, r)
@@ -139,8 +140,8 @@ def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: 
 
 
 def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
-    """Estimates of (tr C)^2 and tr C^2 without bias, from a matrix whose trace estimates tr C and whose squared norm
-    tr C^2 of F samples; of one number per frame, and of none that varies, both are the same."""
+    """Return estimates of (tr C)^2 and tr C^2 without bias, from a matrix whose trace estimates tr C and whose squared
+    norm tr C^2 of F samples. Of one number per frame, and of none that varies, both are equal."""
     trace, square = float(np.trace(gram)), float((gram**2).sum())
     if not trace > 0.0:
         return 1.0, 1.0
@@ -151,47 +152,47 @@ def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class FittedPart:
-    """An observation, beside what the fitted model says of it."""
+    """The fit to one observation: its residuals and how they scatter."""
 
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """(frames, m) predicted less measured, in the unit of the observation; 0 for what does not count."""
+    """(frames, m) predicted less measured, in the unit of the observation; 0 for numbers that do not count."""
     spread: float
     """Root mean square of the residuals."""
     inflation: float
-    """By how much correlation within frames makes variances larger than a count of numbers has it."""
+    """Factor by which correlation within frames makes variances larger than a count of numbers gives."""
     samples: float
-    """Independent numbers in a frame."""
+    """Number of independent numbers in a frame."""
     frames: float
-    """Independent frames."""
+    """Number of independent frames."""
 
     @property
     def label(self) -> str:
-        """Its name, with the experiment's number where there are several."""
+        """Return the observation's name, with the experiment's number where there are several."""
         return self.part.label
 
     @property
     def correlation_time(self) -> float:
-        """The time [s] over which residuals are correlated."""
+        """Return the time [s] over which residuals are correlated."""
         return self.weighting.correlation_time
 
 
 class Fitted(Protocol):
-    """What is fitted: a `LeastSquares`, or what has these of it."""
+    """A least-squares problem whose certainty can be told: a `LeastSquares`, or an object with its parts and labels."""
 
     @property
     def parts(self) -> list[Part]:
-        """The part of the fit that belongs to each observation."""
+        """Return the part of the fit that belongs to each observation."""
 
     @property
     def labels(self) -> list[str]:
-        """(free,) of the numbers."""
+        """Return the labels (free,) of the numbers that are searched."""
 
 
 @dataclass(frozen=True)
 class Certainty:
-    """Of an estimate, from the scatter of its residuals."""
+    """The certainty of an estimate, from the scatter of its residuals: Hessian, covariance and degrees of freedom."""
 
     hessian: np.ndarray
     """(free, free) N = J^T J of weighted Jacobians."""
@@ -200,12 +201,12 @@ class Certainty:
     degrees_of_freedom: np.ndarray
     """(free,) of Student's distribution."""
     scores: tuple[ScoreCovariance, ...]
-    """Of each part."""
+    """Score covariance of each part."""
     parts: tuple[FittedPart, ...]
 
     @classmethod
     def of(cls, problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> "Certainty":
-        """Raises `ComputationError` where a combination of parameters cannot be told."""
+        """Compute the certainty at a point; raise `ComputationError` if a combination of parameters cannot be told."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
@@ -221,7 +222,7 @@ class Certainty:
 
 
 def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> list[Weighting]:
-    """Weights that the residuals of a first fit ask for: correlated numbers weigh less, as they tell less."""
+    """Return weights by the residuals of a first fit: correlated numbers weigh less, as they tell less."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
     for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
@@ -233,19 +234,19 @@ def noise_of(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> l
 
 
 def counted_covariance(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """The covariance where every number was taken for independent of all others."""
+    """Return the covariance of the estimate if every number were independent of all others."""
     alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return inverse(problem, hessian(problem, at, alone))
 
 
 def hessian(problem: Fitted, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """N = J^T J of weighted Jacobians."""
+    """Return N = J^T J of the weighted Jacobians of a least-squares problem."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 
 def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
-    """N^-1; raises `ComputationError` where a combination of parameters cannot be told."""
+    """Return N^-1 of a problem's Hessian; raise `ComputationError` where a combination of parameters cannot be told."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
@@ -263,13 +264,13 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
 
 
 def spread(r: np.ndarray) -> float:
-    """Root mean square of the numbers that count."""
+    """Return the root mean square of the residuals that count, which are not 0."""
     count = np.count_nonzero(r)
     return float(np.sqrt((r**2).sum() / max(count, 1)))
 
 
 def _inflation(J: np.ndarray, r: np.ndarray) -> float:
-    """The variance of the score over the one that it would have if the residuals of a frame were independent."""
+    """Return the ratio of the score's variance to its variance if the residuals of a frame were independent."""
     counted = np.einsum("fmp,fmp->p", J, J) * np.mean(r**2)
     pooled = np.einsum("fmp,hm->fhp", J, r, optimize=True)
     has = counted > 0.0
@@ -277,7 +278,7 @@ def _inflation(J: np.ndarray, r: np.ndarray) -> float:
 
 
 def _freedom(scores: Sequence[ScoreCovariance], N_inverse: np.ndarray, direction: np.ndarray) -> float:
-    """Degrees of freedom of a number's variance, which is a sum over parts (Welch 1947)."""
+    """Return the degrees of freedom of a number's variance, which is a sum over parts (Welch 1947)."""
     a = N_inverse @ direction
     variances = np.array([a @ score.B @ a for score in scores])
     each = np.array([score.degrees_of_freedom(N_inverse, direction) for score in scores])

@@ -18,35 +18,35 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE = 1.3
-"""Residuals over the noise that was given."""
+"""Ratio of residuals to the given noise above which they are doubted."""
 STILL = 0.01
-"""Of the greatest change over the frames: numbers that the model says change by less stay as they are."""
+"""Of the greatest change over the frames: numbers whose predicted change is less count as still."""
 FEW_STILL = 20
-"""Numbers that stay as they are; of fewer nothing is said."""
+"""Fewest still numbers from which anything is said."""
 TOO_LARGE_IN_MOTION = 2.0
-"""Residuals of the numbers that change over those of the numbers that stay as they are."""
+"""Ratio of the residuals of moving numbers to those of still ones above which they are doubted."""
 EXACT = 1e-4
-"""Of the largest number measured: residuals that are smaller are those of a simulation, of which nothing is said."""
+"""Of the largest number measured: smaller residuals are those of a simulated measurement, and never doubted."""
 ROUNDING = 0.002
 """Of the largest number measured: half a step of 8 bits, below which residuals say nothing."""
 TOO_SLOW = 0.35
 """Correlation time of residuals, over the length of the record."""
 VAGUE = 1.0
-"""Standard error of a logarithm."""
+"""Standard error of a logarithm above which a number is hardly told."""
 GREATEST = 20.0
-"""Of these logarithms, in a sentence."""
+"""Greatest standard error of a logarithm that a sentence tells."""
 AT_BOUND = 1e-6
-"""Of a coordinate, or of 1 if that is more: an estimate that is nearer to a bound is at it."""
+"""Distance from a bound at which an estimate is at it, relative to the coordinate, or to 1 if that is more."""
 TOO_FAR = 3.0
-"""Distance between what two halves of a record say, over its error."""
+"""Distance between the estimates of two halves of a record, over its error, above which they are doubted."""
 SERIES = 4
-"""Numbers of a frame whose trends are looked at, each for itself."""
+"""Most numbers of a frame whose trends are looked at one by one."""
 SPARE = 3
-"""Frames more than numbers that are fitted, with which a cause is looked for."""
+"""Fewest frames beyond the number of fitted numbers with which a cause is looked for."""
 MOST_KEPT = 0.6
-"""Correlation of noise from frame to frame, beyond which it is told from no trend."""
+"""Correlation of noise from frame to frame above which it looks like any trend."""
 BY_CHANCE = 1e-3
-"""Probability of an effect as large by noise alone, below which it is said."""
+"""Probability of such an effect by noise alone, below which it is said."""
 LITTLE, MUCH = 0.05, 0.5
 """Of the squares of residuals: what explains less is not said, and of residuals that are doubted already a density or a
 slip that explains less."""
@@ -55,7 +55,7 @@ slip that explains less."""
 def doubts_of(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], certainty: Certainty
 ) -> tuple[str, ...]:
-    """None where the residuals look like noise, and tell the parameters."""
+    """Return sentences of doubt about a fit; none where the residuals look like noise and tell the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -88,8 +88,9 @@ def doubts_of(
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Root mean squares of the residuals (frames, m) of the numbers that the model says stay as they are, such as the
-    background of a video, which show the noise alone, and of the others; infinite and 0 where few stay."""
+    """Return root mean squares of the residuals (frames, m) of two kinds of numbers. The first are predicted not to
+    change, as a video's background, and show the noise alone, the second are all others; infinite and 0 where few are
+    still."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= STILL * np.max(change[counted], initial=0.0))
@@ -100,7 +101,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
 
 
 def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
-    """Of numbers that the bounds hold."""
+    """Return sentences about numbers that are held by their bounds."""
     found = []
     for which, ends in zip(("lower", "upper"), problem.coordinates.bounds, strict=True):
         for label, u, end, value in zip(problem.labels, at.u, ends, problem.coordinates.numbers(at.u), strict=True):
@@ -113,7 +114,7 @@ def _at_bounds(problem: LeastSquares, at: Linearised) -> list[str]:
 
 
 def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[str]:
-    """Of positive numbers that may as well be many times as large."""
+    """Return sentences about positive numbers that the residuals tell to no better than a large factor."""
     coordinates = problem.coordinates
     bars = np.where(coordinates.by_logarithm, np.sqrt(np.diag(certainty.covariance)), 0.0)
     return [
@@ -126,7 +127,7 @@ def _vague(problem: LeastSquares, at: Linearised, certainty: Certainty) -> list[
 def _halves(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], scores: Sequence[ScoreCovariance]
 ) -> list[str]:
-    """Where the first and the second half of the frames say different things: one step of Gauss and Newton for each."""
+    """Return sentences where the halves of the frames disagree, by one step of Gauss and Newton for each half."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -152,7 +153,7 @@ def _halves(
 
 @dataclass(frozen=True)
 class Widened:
-    """The problem with the sizes of causes besides, as `certainty` takes one."""
+    """A least-squares problem whose unknowns include the sizes of causes, as `certainty` takes one."""
 
     parts: list[Part]
     labels: list[str]
@@ -160,12 +161,12 @@ class Widened:
 
 @dataclass(frozen=True)
 class Explained:
-    """A cause that explains residuals by more than the noise does."""
+    """The size of a cause that explains residuals by more than noise does, and how much it explains."""
 
     sizes: np.ndarray
     """(causes,)"""
     share: float
-    """Of the sum of squares."""
+    """Part of the sum of squares that it explains."""
 
 
 def explained(
@@ -175,9 +176,9 @@ def explained(
     columns: Sequence[np.ndarray],
     is_doubted: bool = False,
 ) -> Explained | None:
-    """The size of a cause by one step of Gauss and Newton; ``columns`` (frames, m, causes) of each part, by how much
-    predictions change. None where it is within the noise, or cannot be told from the parameters. Residuals that are
-    doubted already are no noise: then how much a cause explains counts."""
+    """Estimate the size of a cause by one step of Gauss and Newton; ``columns`` (frames, m, causes) of each part tell
+    by how much predictions change. None where it is within the noise, or cannot be told from the parameters. Residuals
+    that are doubted already are no noise: then the part that a cause explains counts."""
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]
@@ -204,7 +205,7 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Sentences about the density and the slip of the container, which take a run, or two, of each experiment."""
+    """Return sentences about the container's density and slip, which take a run, or two, of each experiment."""
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
@@ -226,7 +227,7 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighti
 
 
 def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Linearised:
-    """Where the sum of squares of the linear model is least."""
+    """Return the point at which the sum of squares of the linear model is least."""
     N_inverse = inverse(wide, hessian(wide, before, weights))
     white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
     score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
@@ -235,7 +236,7 @@ def _step(wide: Widened, before: Linearised, weights: Sequence[Weighting]) -> Li
 
 
 def _fades_slowly(wide: Widened, weights: Sequence[Weighting]) -> bool:
-    """Whether the noise of some part is so much like itself from frame to frame that it is told from no trend."""
+    """Return True if the noise of some part is so correlated from frame to frame that it looks like any trend."""
     gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
     each = zip(weights, gaps, strict=True)
     return any(one.correlation_time and np.exp(-gap / one.correlation_time) > MOST_KEPT for one, gap in each)
@@ -246,7 +247,7 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Of single series: a line and a parabola in time."""
+    """Return sentences about trends in single series: a line and a parabola in time."""
     found = []
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured
@@ -267,7 +268,7 @@ def _trends(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 
 
 def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> list[str]:
-    """Of parts whose clock is not calibrated: by how much the predicted changes in time."""
+    """Return sentences about parts whose uncalibrated clock seems late, by the predicted changes in time."""
     found = []
     for k, part in enumerate(problem.parts):
         if CLOCK in part.observation.start:
@@ -287,8 +288,8 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 def _by_change(
     problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
 ) -> list[np.ndarray]:
-    """By how much predictions change with something else in each experiment, which a function says with the runs and
-    the runs along a tangent that it took; 0 where that cannot be told."""
+    """Return how much predictions change with a change in each experiment, which a function computes with the numbers
+    of runs and tangent runs that it took; 0 where that cannot be told."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
         try:
@@ -303,13 +304,13 @@ def _by_change(
 
 
 def _by_density(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """With the logarithm of all densities."""
+    """Return derivatives of predictions by the logarithm of all densities, and the runs that they took."""
     _, slopes = experiment.linearised(values, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
     return 1, 1, {name: slope[..., 0] for name, slope in slopes.items()}
 
 
 def _by_slip(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """With the other slip of the container, if it has one."""
+    """Return the change of predictions with the container's other slip, if it has one, and the runs that it took."""
     slip = getattr(experiment.simulation.scene.container, "slip", None)
     if slip is None:
         return 0, 0, {}

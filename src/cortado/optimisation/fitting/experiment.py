@@ -21,9 +21,9 @@ from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
 OF_THE_SCHEME = ("viscosity", "rest_density", "time_step")
-"""Parameters that say whether viscosity acts as velocities are at the start of a step or at its end."""
+"""Parameters that decide whether viscosity acts on the velocities at the start of a step or at its end."""
 ROOM = 16
-"""Steps by which a run grows at once where a clock is late."""
+"""Number of steps by which a run grows at once where a clock is late."""
 
 
 @fixed
@@ -69,19 +69,19 @@ class Experiment:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """The observations' own parameters, such as "camera.rotation", as a fit starts."""
+        """Return the observations' own parameters, such as "camera.rotation", as a fit starts."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """By the names of `start`, true for numbers that nothing that was measured depends on; an observation of one's
-        own need not say any."""
+        """Return masks by the names of `start`, true for numbers that no measurement depends on; an observation need
+        not have any."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """By the name of each clock that is calibrated its bounds [s]: half the length of the record to both sides."""
+        """Return the bounds [s] of each clock that is calibrated: half the length of the record to both sides."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -90,18 +90,18 @@ class Experiment:
         return found
 
     def simulated_by(self, simulation: Simulation) -> "Experiment":
-        """The same experiment by another simulation of as many particles."""
+        """Return this experiment with another simulation of the same number of particles."""
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """The same experiment, in the same arrays, with other numbers measured, (frames, m) by name."""
+        """Return this experiment, in its arrays, with other numbers measured, (frames, m) by name."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
         return found
 
     def predicted(self, parameters: Values) -> dict[str, np.ndarray]:
-        """By the name of each observation, what the simulation says of it, (frames, m)."""
+        """Return what the simulation predicts for each observation, (frames, m) by name."""
         frames, values = self._frames(parameters), self._shared(parameters)
         wanted = self._wanted(frames)
         return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
@@ -109,7 +109,7 @@ class Experiment:
     def linearised(
         self, parameters: Values, directions: Sequence[Values]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """The same, and its derivatives along directions, (frames, m, directions), by forward mode."""
+        """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by tangents."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
         frames = self._frames(parameters)
         wanted = self._wanted(frames)
@@ -142,7 +142,7 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> dict[str, Frames]:
-        """Where the frames of each observation are, by its clock; what is before the run is as its first state."""
+        """Return the frames of each observation by its clock; a frame before the run shows the first state."""
         found = {}
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -152,12 +152,12 @@ class Experiment:
         return found
 
     def _wanted(self, frames: Mapping[str, Frames]) -> list[int]:
-        """The states that are read, by the number of steps before them."""
+        """Return the numbers of steps before the states that observations read."""
         clocks = (own.around for name, own in frames.items() if CLOCK in self.observations[name].start)
         return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
-        """A problem of these steps at least, whose viscosity acts as it does in a run of a scene with these values."""
+        """Return a problem of at least these steps, whose viscosity acts as in a run of a scene with these values."""
         scene, steps = self.simulation.scene, self.problem.steps
         if wanted[-1] > steps:
             steps += -(-(wanted[-1] - steps) // ROOM) * ROOM
@@ -176,7 +176,7 @@ class Experiment:
     def _along(
         self, problem: Problem, steps: Sequence[int], values: Values, moves: Sequence[Values]
     ) -> tuple[dict[int, Any], Iterator[dict[int, Arrays]]]:
-        """States by the number of steps before them, and along each of some directions their tangents, by fields."""
+        """Run a problem; return states by the number of steps before them, and their tangents for each direction."""
         wanted, dimension, dots = set(steps), self.simulation.dimension, [dict[int, Arrays]() for _ in moves]
 
         def observe(kept: dict[int, Arrays], step: int, dot: State) -> None:
@@ -201,12 +201,12 @@ class Experiment:
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:
-        """The values that are parameters of the simulation, and not of one observation alone."""
+        """Return the values that are parameters of the simulation, and not of one observation alone."""
         own = self.start
         return {name: value for name, value in values.items() if name not in own}
 
     def _own(self, observation: str, values: Values) -> dict[str, np.ndarray]:
-        """Those of an observation, by its own names for them."""
+        """Return the values of an observation's own parameters, by its names for them."""
         return {
             key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
             for key in self.observations[observation].start

@@ -14,14 +14,14 @@ from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 from cortado.pictures.report import Figures
 
 GREATEST_SERIES = 4
-"""Numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
+"""Most numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""
 AGREE = 0.2
 """Light of a pixel that shows that two pictures agree there: a middle grey."""
 HEAD = ("parameter", "unit", "start", "found", "95 %, from", "to")
 
 
 def residual_figure(fitted: Fit, path: Path) -> Figures:
-    """Residuals over time, one panel for each observation."""
+    """Draw the residuals of a fit over time, one panel for each observation."""
     with drawing(path, height=1.4 + 2.3 * len(fitted.parts)) as figure:
         rows = figure.subplots(len(fitted.parts), 1, squeeze=False)[:, 0]
         for axes, part in zip(rows, fitted.parts, strict=True):
@@ -46,7 +46,7 @@ def _residuals(axes: object, part: FittedPart) -> None:
 
 
 def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
-    """The profile of each number, beside the parabola that its interval stands for."""
+    """Draw the profile of each number, beside the parabola that its interval stands for."""
     if not profiles:
         return []
     columns = min(len(profiles), 3)
@@ -68,7 +68,7 @@ def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
 
 
 def video_figures(fitted: Fit, folder: Path) -> Figures:
-    """Of each video its first frame, one in the middle and the last: measured, found, and how far apart they are."""
+    """Draw the first, the middle and the last frame of each video: measured, fitted, and their difference."""
     found: Figures = []
     for number, part in enumerate(fitted.parts):
         video = part.part.observation
@@ -91,7 +91,7 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
 
 
 def fit_page(fitted: Fit) -> str:
-    """HTML of a fit."""
+    """Return the HTML that a notebook shows of a fit."""
     rows = [
         (
             one.label.replace("_", " "),

@@ -52,20 +52,20 @@ NO_LESS_LIKELY = 9.0
 
 @dataclass(frozen=True)
 class Profile:
-    """The best sum of squares with one number held, over its values."""
+    """The least sum of squares with one number held, over values of that number."""
 
     label: str
     values: np.ndarray
     """(points,) of the number, in its unit."""
     deviance: np.ndarray
-    """(points,) by how much the sum of squares is larger than the least one, in squared standard errors."""
+    """(points,) excess of the sum of squares over the least one, in squared standard errors."""
     expected: np.ndarray
-    """(points,) the same of a model that is linear, from which the intervals come."""
+    """(points,) deviance of a linear model, from which the intervals come."""
 
 
 @dataclass(frozen=True)
 class FittedNumber:
-    """One of the numbers that were searched."""
+    """One number of a fit, with its standard error and its interval."""
 
     label: str
     start: float
@@ -77,7 +77,7 @@ class FittedNumber:
 
     @property
     def words(self) -> str:
-        """Such as "viscosity 2.63 ± 0.05 Pa s"."""
+        """Return the number with its error and unit, such as "viscosity 2.63 ± 0.05 Pa s"."""
         return f"{self.label.replace('_', ' ')} {with_error(self.value, self.error)} {unit_of(self.label)}".rstrip()
 
 
@@ -90,7 +90,7 @@ class Tried:
     end: np.ndarray
     """(free,) coordinates."""
     misfit: float
-    """The logarithm of the size of the residuals there, the mean over all numbers that were measured."""
+    """Logarithm of the size of the residuals at the end, averaged over all numbers that were measured."""
 
 
 @public
@@ -104,7 +104,7 @@ class Fit:
     coordinate_covariance: np.ndarray = field(repr=False)
     """(free, free) of the coordinates."""
     naive_covariance: np.ndarray = field(repr=False)
-    """(free, free) what a count of numbers would make of it: far too small, kept for comparison."""
+    """(free, free) covariance if all numbers were independent: far too small, kept for comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
     """(free,) of Student's distribution."""
     parts: tuple[FittedPart, ...] = field(repr=False)
@@ -112,7 +112,7 @@ class Fit:
     doubts: tuple[str, ...] = field(repr=False)
     """Sentences about where the residuals do not look like noise, so that the model is wrong by more than the bars."""
     converged: bool = True
-    """Whether it ended where the sum of squares is least around it, and not after the last iteration."""
+    """True where it ended at a minimum of the sum of squares, and not after the last iteration."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
     """The starts, and where the searches from them ended, this fit among them."""
     runs: int = 0
@@ -120,7 +120,7 @@ class Fit:
     tangents: int = 0
     """Runs along a tangent, each of one experiment."""
     refused: int = 0
-    """Points that were tried and whose runs diverged, of which the fit knows nothing."""
+    """Number of points that were tried and whose runs diverged, about which the fit knows nothing."""
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
@@ -132,41 +132,41 @@ class Fit:
 
     @property
     def values(self) -> dict[str, Any]:
-        """Parameters by name: arrays, or numbers."""
+        """Return the fitted parameters by name: arrays, or numbers."""
         return _plain(self.coordinates.values(self.u))
 
     @property
     def labels(self) -> list[str]:
-        """Of the numbers that were searched, in the order of the covariance."""
+        """Return the labels of the numbers that were searched, in the order of the covariance."""
         return self.coordinates.labels
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """(free, free) in the units of the parameters, of small errors."""
+        """Return the covariance (free, free) of the numbers in the parameters' units, which holds for small errors."""
         slopes = self.coordinates.slopes(self.u)
         return self.coordinate_covariance * np.outer(slopes, slopes)
 
     @property
     def standard_errors(self) -> dict[str, Any]:
-        """By name, in the shape and the unit of the parameter; 0 for a number that was not searched."""
+        """Return standard errors by name, in the shape and the unit of the parameter; 0 for a number not searched."""
         return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
     def correlation(self) -> np.ndarray:
-        """(free, free)"""
+        """Return the correlation matrix (free, free) of the fitted coordinates."""
         size = np.sqrt(np.diag(self.coordinate_covariance))
         return self.coordinate_covariance / np.maximum(np.outer(size, size), 1e-300)
 
     @property
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
-        """Pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
+        """Return pairs of numbers whose estimates are correlated by more than 0.9, and their correlation."""
         found, labels = self.correlation, self.labels
         pairs = combinations(range(len(labels)), 2)
         return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > ALIKE)
 
     def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
-        """By name, the lower and the upper end of an interval that contains the true value with this probability, if
-        the model is right; positive numbers have an interval of their logarithm. Raises `InputError`."""
+        """Return by name the lower and the upper end of an interval that contains the true value with this probability,
+        if the model is right; positive numbers have an interval of their logarithm. Raises `InputError`."""
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
         from scipy.stats import t as student
@@ -177,9 +177,8 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """The sum of squares over values of one number, with all others fitted anew at each: where it is not the
-        parabola of a linear model, the intervals are only rough. ``reach`` in standard errors to both sides. Raises
-        `InputError`."""
+        """Compute the sum of squares over values of one number, with all others fitted anew at each; where it is no
+        parabola, the intervals are only rough. ``reach`` in standard errors to both sides. Raises `InputError`."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -198,8 +197,8 @@ class Fit:
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """The logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it takes a
-        forward run.
+        """Return the logarithm of the posterior density, but for a constant, at coordinates (free,), for samplers; it
+        takes a forward run.
 
         The prior is flat in the coordinates, which are logarithms of positive numbers, within the bounds; outside, and
         where the run diverges, it is -inf. Near the estimate ``u`` it is the normal distribution of the error bars.
@@ -231,7 +230,7 @@ class Fit:
         return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
-        """Those that were searched, with the intervals of `intervals`."""
+        """Return the numbers that were searched, with the intervals of `intervals`."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
@@ -240,7 +239,7 @@ class Fit:
         return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
 
     def lines(self, confidence: float = 0.95) -> list[str]:
-        """One for each number: its value, its standard error, and its interval."""
+        """Return a line for each number: its value, its standard error, and its interval."""
         return [
             f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
             for one in self.numbers(confidence)
@@ -248,7 +247,7 @@ class Fit:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether it has not converged, or there are doubts."""
+        """Return True if the fit has not converged, or there are doubts."""
         return not self.converged or bool(self.doubts)
 
     def __repr__(self) -> str:
@@ -256,7 +255,7 @@ class Fit:
         return f"Fit({', '.join(one.words for one in self.numbers())}{ended})"
 
     def _repr_html_(self) -> str:
-        """With a table of the numbers, what is doubted, and residuals over time."""
+        """Show a table of the numbers, the doubts, and residuals over time in a notebook."""
         page: str = on_top("fit_page")(self)
         return page
 
@@ -265,7 +264,7 @@ class Fit:
 
     @property
     def cautions(self) -> list[str]:
-        """Sentences: what is not told apart, whether it ended too early, what was refused, and the doubts."""
+        """Return sentences about numbers not told apart, an early end, refused points, and doubts."""
         apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
         lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
@@ -274,12 +273,12 @@ class Fit:
 
 
 def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """By name arrays, but numbers for those of shape ()."""
+    """Return arrays by name, with numbers in place of arrays of shape ()."""
     return {name: array if array.shape else float(array) for name, array in arrays.items()}
 
 
 def with_error(value: float, error: float) -> str:
-    """A value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
+    """Write a value and its standard error, with two digits of the error where it begins with 1 to 3, else one."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -290,7 +289,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def unit_of(label: str) -> str:
-    """Of a number, by its label; empty where it has none."""
+    """Return the unit of a fitted number, by its label; empty where it has none."""
     name = label.partition("[")[0]
     return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
 
@@ -359,8 +358,8 @@ def fit(
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
-    """From one start: a first search, with residuals as they are, and a second one with weights that they ask for; with
-    the covariance, and what the residuals say of the noise and of the model."""
+    """Fit from one start: a first search with residuals as they are, and a second one with weights by these residuals.
+    The fit has its covariance and doubts about noise and model."""
     at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
@@ -390,8 +389,8 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None) -> Fit:
-    """Of this fit and of those from other starts that with the least residuals. Where it is not said how many, one
-    without doubt is the last, or one that ends where all others did."""
+    """Return the fit with the least residuals among this one and fits from other starts. Without a number of ``starts``
+    the search for others ends with a fit without doubt, or one that ends where all others did."""
     tried = list(found.tried)
     for start in other_starts(problem, OTHERS if starts is None else starts - 1):
         try:
@@ -409,7 +408,7 @@ def _best(problem: LeastSquares, found: Fit, iterations: int, starts: int | None
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
-    """The searches that ended in other valleys, the lowest one first."""
+    """Return the searches that ended in other valleys, the lowest one first."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
     near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
     others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
@@ -417,7 +416,7 @@ def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
 
 
 def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
-    """A sentence about the lowest of the other valleys, if its residuals are hardly larger."""
+    """Return a sentence about the lowest of the other valleys, if its residuals are hardly larger."""
     others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
     if not others:
         return []

@@ -19,9 +19,9 @@ from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation
 
 MOST_NUMBERS = 100
-"""That a fit searches: each costs a run along its tangent."""
+"""Most numbers that a fit searches: each costs a run along its tangent."""
 DIFFERENCE = 0.02
-"""Of the logarithm of a number, for an estimate of a derivative."""
+"""Step of a number's logarithm for the estimate of a derivative by a difference."""
 HARD_BY = 1e-3
 """Of the size of the residuals: by so much they change up to the points that stand for the first Jacobian."""
 MOST = 5
@@ -36,14 +36,14 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Numbers of parameters by name, in their order, and which of them are searched."""
+    """Numbers of parameters by name, in their order, with marks for the numbers that are searched."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
     at_start: np.ndarray
     """(all,) [unit of the parameter]"""
     logarithmic: np.ndarray
-    """(all,) whether a number is searched by its logarithm."""
+    """(all,) true for numbers that are searched by their logarithm."""
     lower: np.ndarray
     """(all,)"""
     upper: np.ndarray
@@ -57,8 +57,8 @@ class Coordinates:
         bounds: Mapping[str, tuple[Any, Any]] | None,
         unseen: Mapping[str, np.ndarray] | None = None,
     ) -> "Coordinates":
-        """``positive`` parameters are searched by their logarithm where all of their numbers are above 0; numbers that
-        are ``unseen`` are not searched. Raises `InputError` for what does not fit."""
+        """Make coordinates of a start: ``positive`` parameters are searched by their logarithm where all of their
+        numbers are above 0; numbers that are ``unseen`` are not searched. Raises `InputError` for what does not fit."""
         require_table("start", start, "{'viscosity': 0.5}")
         values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
         given = {} if bounds is None else bounds
@@ -87,17 +87,17 @@ class Coordinates:
 
     @property
     def free(self) -> np.ndarray:
-        """(all,) whether a number is searched: its bounds are not the same."""
+        """Return (all,) true for numbers that are searched: their bounds differ."""
         return self.lower < self.upper
 
     @property
     def by_logarithm(self) -> np.ndarray:
-        """(free,) whether a number is searched by its logarithm."""
+        """Return (free,) true for searched numbers that are searched by their logarithm."""
         return self.logarithmic[self.free]
 
     @property
     def labels(self) -> list[str]:
-        """Of the free numbers: the name of the parameter, with its index where it has several numbers."""
+        """Return the free numbers' labels: the parameter's name, with an index where it has several numbers."""
         every = [
             name if not shape else f"{name}[{', '.join(map(str, index))}]"
             for name, shape in zip(self.names, self.shapes, strict=True)
@@ -107,43 +107,43 @@ class Coordinates:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of the vector that is searched."""
+        """Return lower and upper bounds (free,) of the vector that is searched."""
         with np.errstate(divide="ignore"):
             logs = [np.where(self.logarithmic, np.log(np.maximum(e, 0.0)), e) for e in (self.lower, self.upper)]
         return logs[0][self.free], logs[1][self.free]
 
     @property
     def start(self) -> np.ndarray:
-        """The vector that is searched, at the start."""
+        """Return the vector (free,) that is searched, at the start."""
         return self.vector(self.at_start)
 
     def vector(self, numbers: np.ndarray) -> np.ndarray:
-        """(free,) of all numbers."""
+        """Return the coordinates (free,) of all numbers (all,)."""
         chosen, is_log = numbers[self.free], self.by_logarithm
         return np.where(is_log, np.log(np.where(is_log, chosen, 1.0)), chosen)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """(free,) numbers in the units of the parameters."""
+        """Return the searched numbers (free,) at coordinates u (free,), in the units of the parameters."""
         with np.errstate(over="ignore"):  # an interval may have no upper end
             return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
-        """(free,) the derivative of each number with respect to its coordinate."""
+        """Return the derivative (free,) of each searched number with respect to its coordinate."""
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
     def values(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Parameters by name."""
+        """Return parameters by name at coordinates u (free,)."""
         whole = self.at_start.copy()
         whole[self.free] = self.numbers(u)
         return self.named(whole)
 
     def named(self, whole: np.ndarray) -> dict[str, np.ndarray]:
-        """(all,) numbers as arrays by name."""
+        """Return all numbers (all,) as arrays by name."""
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """The direction of the parameters along each coordinate, only with the parameter that it moves."""
+        """Return the direction of the parameters along each coordinate, only with the parameter that it moves."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -152,14 +152,14 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float) -> dict[str, np.ndarray]:
-        """(free,) numbers as arrays by name, in which fixed numbers are ``otherwise``."""
+        """Return searched numbers (free,) as arrays by name, in which fixed numbers are ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
 def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bound, each of the parameter's shape."""
+    """Return lower and upper bound of a parameter, each of its shape."""
     if len(pair) != 2:
         raise InputError(f"bounds of {name} must be a pair, the lower and the upper one.")
     try:
@@ -175,7 +175,7 @@ def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """(frames, ...) what is new in each frame, with the same standard deviation."""
+    """Return values (frames, ...) less what the frame before predicts, with unchanged standard deviation."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -184,18 +184,18 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of one of the experiments."""
+    """An observation of one of the experiments of a fit."""
 
     experiment: int
     name: str
     label: str
-    """That tells it from the parts of other experiments."""
+    """Label that tells it from the parts of other experiments."""
     observation: Observation
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """By what the residuals of a part are divided, and how they are whitened in time."""
+    """The scale by which the residuals of a part are divided, and the correlation time by which they are whitened."""
 
     scale: float
     """[unit of the observation]"""
@@ -203,7 +203,7 @@ class Weighting:
     """[s]"""
 
     def of(self, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """(frames, ...)"""
+        """Return values (frames, ...) whitened in time and divided by the scale."""
         return whitened(values, times, self.correlation_time) / self.scale
 
 
@@ -213,19 +213,19 @@ class Linearised:
 
     u: np.ndarray
     residuals: list[np.ndarray]
-    """Of each part, predicted less measured, (frames, m), 0 for what does not count."""
+    """Residuals of each part, predicted less measured, (frames, m), 0 for numbers that do not count."""
     jacobians: list[np.ndarray]
-    """Of each part, (frames, m, free)."""
+    """Jacobians of each part, (frames, m, free)."""
 
 
 def weighted(parts: Sequence[Part], weights: Sequence[Weighting], values: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """(frames, ...) of each part, as its weighting has them."""
+    """Return values (frames, ...) of each part, whitened and divided by its weighting."""
     each = zip(parts, weights, values, strict=True)
     return [weight.of(own, part.observation.times) for part, weight, own in each]
 
 
 class LeastSquares:
-    """The problem as a search sees it, which counts what it costs."""
+    """The least-squares problem of several experiments that a search solves; it counts its runs."""
 
     def __init__(
         self,
@@ -246,23 +246,23 @@ class LeastSquares:
 
     @property
     def labels(self) -> list[str]:
-        """(free,) of the numbers that are searched."""
+        """Return the labels (free,) of the numbers that are searched."""
         return self.coordinates.labels
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        """The residuals of each part; raises `DivergedError` where the run diverges."""
+        """Return the residuals of each part at u; raise `DivergedError` where the run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
         return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
 
     def linearised(self, u: np.ndarray) -> Linearised:
-        """At a point, by tangents."""
+        """Return residuals and Jacobians at a point, by tangents."""
         return self._along(u, range(len(u)))
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """At a point, with derivatives of positive numbers by differences: a forward run costs less than one along a
-        tangent, and this is enough to search. Raises `DivergedError`."""
+        """Return residuals and Jacobians at a point, with derivatives of positive numbers by differences: a forward run
+        costs less than one along a tangent, and this is enough to search. Raises `DivergedError`."""
         positive = self.coordinates.by_logarithm
         at = self._along(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -277,7 +277,7 @@ class LeastSquares:
         return at
 
     def _along(self, u: np.ndarray, columns: Iterable[int]) -> Linearised:
-        """Residuals, and derivatives along some of the coordinates."""
+        """Return residuals, and derivatives along some of the coordinates."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in columns}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
@@ -295,18 +295,18 @@ class LeastSquares:
         return Linearised(u.copy(), residuals, jacobians)
 
     def stacked(self, at: Linearised, weights: Sequence[Weighting]) -> tuple[np.ndarray, np.ndarray]:
-        """The Jacobian (numbers, free) and the residuals (numbers,) of all parts, weighted."""
+        """Return the weighted Jacobian (numbers, free) and residuals (numbers,) of all parts."""
         J = [own.reshape(-1, len(at.u)) for own in weighted(self.parts, weights, at.jacobians)]
         return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
     def sum_of_squares(self, residuals: Sequence[np.ndarray], weights: Sequence[Weighting]) -> float:
-        """The sum of squares of weighted residuals."""
+        """Return the sum of squares of weighted residuals."""
         return float(sum((r**2).sum() for r in weighted(self.parts, weights, residuals)))
 
     def _run(
         self, number: int, values: dict[str, np.ndarray], along: Sequence[dict[str, np.ndarray]]
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """What an experiment predicts, and its derivatives along directions, if there are any; counted."""
+        """Run an experiment; return its predictions, and their derivatives along directions, if there are any."""
         experiment, at = self.experiments[number], self.values_of(number, values)
         self.runs, self.tangents = self.runs + 1, self.tangents + len(along)
         try:
@@ -316,7 +316,7 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Those that an experiment has: all but those of observations of others."""
+        """Return the values that an experiment has: all but those of other experiments' observations."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
 
@@ -325,7 +325,7 @@ class LeastSquares:
 
 
 class TrialPoints:
-    """Points with their residuals, in coordinates in which the first Jacobian is orthonormal: it knows no units."""
+    """Points of a search with their residuals, in coordinates in which the first Jacobian is orthonormal."""
 
     def __init__(self, problem: LeastSquares, weights: Sequence[Weighting], at: Linearised):
         J, r = problem.stacked(at, weights)
@@ -338,18 +338,18 @@ class TrialPoints:
             self.add(at.u + change * np.eye(len(at.u))[k], moved)
 
     def add(self, u: np.ndarray, residuals: list[np.ndarray]) -> int:
-        """A point that was run; returns its number."""
+        """Add a point that was run, and return its number."""
         self._points.append(u)
         self._residuals.append(residuals)
         return len(self._points) - 1
 
     @property
     def are_many(self) -> bool:
-        """Whether to begin anew from the lowest, before they take too much memory."""
+        """Return True where the search should begin anew from the lowest point, before points take too much memory."""
         return len(self._points) >= MOST * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:
-        """At one of the points."""
+        """Return residuals and estimated Jacobians at one of the points, by its number."""
         x = np.array(self._points) @ self._metric.T
         parts = [np.array(part) for part in zip(*self._residuals, strict=True)]
         flat = [part.reshape(len(x), -1) / scale for part, scale in zip(parts, self._scales, strict=True)]
@@ -360,8 +360,9 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """(d, points) weights of the values at points ``x`` (points, d), whose sums are the slopes at one of the points of
-    what interpolates them. ``products`` (points, points) of the values at two points, summed over all residuals."""
+    """Return weights (d, points) of the values at points ``x`` (points, d), whose sums are the slopes of an
+    interpolation at one of them. ``products`` (points, points) of the values at two points, summed over all
+    residuals."""
     from scipy.spatial.distance import cdist
 
     points, d = x.shape
@@ -377,13 +378,13 @@ def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarra
 
 
 def _covariance(apart: np.ndarray) -> np.ndarray:
-    """Of the noise at points that are so many widths apart."""
+    """Return the covariance of a smooth random function between points ``apart``, in units of its width."""
     smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
     return smooth + ROUND_OFF * np.eye(len(apart))
 
 
 def _most_likely_width(apart: np.ndarray, linear: np.ndarray, products: np.ndarray) -> float:
-    """That with the greatest likelihood of the contrasts that no linear function changes; a single one tells none."""
+    """Return the width of greatest likelihood for the contrasts that no linear function changes; one tells none."""
     from scipy.linalg import null_space
 
     contrasts = null_space(linear.T)

@@ -21,9 +21,9 @@ from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 CLOCK = "start"
-"""The parameter of an observation that says when its frames are."""
+"""The name of an observation's parameter that says when its frames are."""
 LEAST_FRAMES = 4
-"""Of an observation: the scatter from frame to frame is what error bars are made of."""
+"""Fewest frames of an observation: error bars are made of the scatter from frame to frame."""
 
 
 @dataclass(frozen=True)
@@ -48,24 +48,24 @@ class Observation(Protocol):
     measured: np.ndarray
     """(frames, m); NaN for a number that does not count."""
     noise: float | None
-    """Standard deviation of a number, as far as it is known; None where the residuals shall tell."""
+    """Standard deviation of a number, as far as it is known; None leaves it to the residuals."""
     unit: str
-    """Of the numbers."""
+    """Unit of the numbers."""
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Its own parameters, such as those of a camera, as the fit starts. One that is called "start" is a clock [s]:
-        frames are later by as much as it grows, which an `Experiment` sees to."""
+        """Return the observation's own parameters, such as those of a camera, as the fit starts. One that is called
+        "start" is a clock [s]: frames are later by as much as it grows, which an `Experiment` sees to."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(m,) what a state predicts, given values of its own parameters."""
+        """Return the numbers (m,) that a state predicts, given values of the observation's own parameters."""
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """(m, directions) the derivatives of `value` along directions."""
+        """Return the derivatives (m, directions) of `value` along directions."""
 
 
 class Again:
-    """An observation with other numbers measured."""
+    """An observation with other numbers in place of its measured ones."""
 
     def __init__(self, observation: Observation, measured: np.ndarray):
         _, values, _ = checked(observation.times, measured, observation.noise)
@@ -81,17 +81,17 @@ class Again:
 
 @dataclass(frozen=True)
 class Frames:
-    """Where the frames of an observation are between the steps of a run: in between two states what they predict is
-    interpolated linearly."""
+    """The places of an observation's frames between the steps of a run; predictions of two states are interpolated
+    linearly."""
 
     steps: np.ndarray
     """(frames,) number of steps before each frame."""
     shares: np.ndarray
-    """(frames,) of the state after the next step, from 0 to 1."""
+    """(frames,) share of the state after the next step, from 0 to 1."""
 
     @classmethod
     def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
-        """Raises `InputError` for times beyond the run."""
+        """Find frames at times [s] among the steps of a run; raise `InputError` for times beyond the run."""
         places = times / time_step
         if places[-1] > steps + 1e-6:
             raise InputError(
@@ -103,20 +103,20 @@ class Frames:
 
     @property
     def needed(self) -> set[int]:
-        """The states that are read."""
+        """Return the numbers of steps before the states that frames read."""
         return {int(k) for k in self.steps} | {int(k) + 1 for k in self.steps[self.shares > 0.0]}
 
     @property
     def around(self) -> set[int]:
-        """The states that `rates` reads."""
+        """Return the numbers of steps before the states that `rates` reads."""
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """(frames, ...) of what was read of the states, by how much it changes in a second."""
+        """Return the rates of change (frames, ...) per second of readings of states, by the number of steps."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """(frames, ...) of what was read of the states."""
+        """Interpolate readings of states to the frames, (frames, ...)."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -125,12 +125,12 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """The parameter of a clock that is calibrated, which shows ``start`` [s] of the run where it should show 0."""
+    """Return the parameter of a calibrated clock, which shows ``start`` [s] of the run where it should show 0."""
     return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
 
 
 def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray]:
-    """The same; raises `InputError` where anything else is calibrated."""
+    """Return the parameter of a calibrated clock; raise `InputError` where anything else is calibrated."""
     for name in calibrate:
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -138,8 +138,8 @@ def only_a_clock(calibrate: Sequence[str], start: float) -> dict[str, np.ndarray
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """The times, the numbers and the noise of an observation; raises `InputError` for what cannot be fitted. ``clock``
-    [s] is added to the times."""
+    """Return the times, the numbers and the noise of an observation; raise `InputError` for arrays that cannot be
+    fitted. ``clock`` [s] is added to the times."""
     moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
@@ -164,7 +164,7 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
 
 @fixed
 class Video:
-    """Frames of a video, beside pictures of the simulation."""
+    """An observation of a fit: the frames of a video, compared with pictures of the simulation."""
 
     unit = "of light"
 
@@ -202,16 +202,16 @@ class Video:
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """The camera as it was aimed, and its clock, as far as they are calibrated."""
+        """Return the camera as it was aimed, and its clock, as far as they are calibrated."""
         return {**self.calibration.start, **self._clock}
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:
-        """By name, true for the numbers of the camera that no picture shows."""
+        """Return masks by name, true for the numbers of the camera that no picture shows."""
         return self.calibration.unseen
 
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(rows, columns, 3) of a state, with values of what is calibrated."""
+        """Return the picture (rows, columns, 3) of a state, with values of calibrated parameters."""
         return self._renderer(own).render(at.state.positions, at.state.mass_fractions, at.colours)
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -227,7 +227,7 @@ class Video:
         return np.stack(found, axis=1)
 
     def _renderer(self, own: Mapping[str, np.ndarray]) -> Renderer:
-        """That of the view with these values; the last one is kept."""
+        """Return the renderer of the view with these values; the last one is kept."""
         if not self.calibration.names:
             return self.renderer
         key = b"".join(np.asarray(own[name]).tobytes() for name in self.calibration.names)
@@ -238,7 +238,7 @@ class Video:
 
 @fixed
 class SensorSeries:
-    """What a sensor measured over time."""
+    """An observation of a fit: the numbers that a sensor measured over time."""
 
     def __init__(
         self,
@@ -277,7 +277,7 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """By the adjoint of each number, which is all that sensors have."""
+        """Return the derivatives along directions, by the adjoint of each number, which is all that sensors have."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -289,7 +289,7 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """Where tracers are over time. A tracer moves as the particles around its first place do:
+    """An observation of a fit: tracers' places over time. A tracer moves as the particles around its first place do:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 

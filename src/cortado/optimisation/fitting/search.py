@@ -63,21 +63,20 @@ APART = 0.2
 
 @dataclass(frozen=True)
 class Searched:
-    """Where a search ended."""
+    """The end of a search: its last point, the next step, and the gain that the step promises."""
 
     at: Linearised
     """The last point that was run; its Jacobian is an estimate."""
     next: np.ndarray
-    """(free,) where the next step leads, which was not run."""
+    """(free,) end of the next step, which was not run."""
     gain: float
-    """By how much that lowers the sum of squares of the linear model."""
+    """Predicted decrease of the sum of squares by the next step."""
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], trials: int) -> tuple[Linearised, bool]:
-    """Where the sum of squares is least, with the Jacobian by tangents near there; and whether it was found, else the
-    lowest point that was run: a search up to where its estimate of the Jacobian serves, tangents, and a search from
-    there with these."""
+    """Find the least sum of squares: search while the estimated Jacobian serves, take tangents, and search on with
+    these. Return the point with its Jacobian by tangents and True, or the lowest point and False."""
     for _ in range(MOST_JACOBIANS):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, NEARBY / squares)
@@ -150,7 +149,7 @@ def next_point(
     damping: float = 0.0,
     fixed: Sequence[int] = (),
 ) -> tuple[np.ndarray, float]:
-    """Where the sum of squares of the linear model is least, within the bounds, and by how much it is lower there."""
+    """Return the minimum of the linear model's sum of squares within the bounds, and how much lower it is there."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -172,8 +171,8 @@ def next_point(
 def over_the_bars(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]
 ) -> tuple[Linearised, bool | None]:
-    """The end of a search with slopes that hold over the width of the bars, and whether they settled; None where the
-    tangents do hold."""
+    """Return the end of a search with slopes that hold over the width of the bars, and whether they settled; None where
+    the tangents do hold."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -193,7 +192,7 @@ def over_the_bars(
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -> np.ndarray:
-    """(free, free) columns of independent moves by so many standard errors, none longer than a step of a search."""
+    """Return columns (free, free) of independent moves by `REACH` standard errors, none longer than a search's step."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (ROUND_OFF * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -202,7 +201,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting]) -
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axis: np.ndarray) -> bool:
-    """Whether at the end of an axis it is as the tangents say, on the side to which the search did not get."""
+    """Test whether residuals at the end of an axis are as the tangents say, on the side where the search was not."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= ROUNDING * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -219,7 +218,7 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Sequence[Weight
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Sequence[Weighting], axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """The same point with differences along the axes as its Jacobian, and the points that were run for them.
+    """Return a point with differences along the axes as its Jacobian, and the points that were run for them.
 
     Of the differences to both sides and of that across the one in which least changes is taken: the point itself may
     lie on a kink, or in a hole that is far narrower than the bars."""
@@ -241,7 +240,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """The point that is so far away, within the bounds, with the Jacobian of this one; none where its run diverges."""
+    """Return the point ``shift`` away, within the bounds, with this one's Jacobian; none where its run diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -250,16 +249,15 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """The logarithm of the size of the residuals, the mean over all numbers that were measured: of Gaussian noise whose
-    size is not known, the least is the likeliest."""
+    """Return the logarithm of the residuals' size, averaged over all measured numbers: for Gaussian noise of unknown
+    size, the least is the likeliest."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 
 
 def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
-    """At most so many points (free,), that which explains best what was measured first: of a Sobol sequence over the
-    bounds, and over two decades to both sides of positive numbers without bounds. All other numbers are those of the
-    start."""
+    """Return at most ``count`` points (free,), best first, of a Sobol sequence over the bounds, and over two decades to
+    both sides of positive numbers without bounds. All other numbers are those of the start."""
     start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds
     reach = np.where(problem.coordinates.by_logarithm, RANGE, 0.0)
     lower, upper = (
@@ -280,7 +278,7 @@ def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _sequence(searched: np.ndarray) -> np.ndarray:
-    """(points, free) from 0 to 1, each number of those that are searched evenly."""
+    """Return points (points, free) from 0 to 1 that cover each searched number evenly."""
     from scipy.stats import qmc
 
     dimensions = int(searched.sum())

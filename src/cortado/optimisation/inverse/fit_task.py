@@ -32,25 +32,25 @@ from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 LIGHT = 0.5
-"""Pixels of a mask that are brighter count."""
+"""Brightness above which a pixel of a mask counts."""
 
 
 class ExperimentTables(Table):
-    """The table of a file with one more experiment."""
+    """The table [problem] of a file with one more experiment."""
 
     problem: ProblemTable
 
 
 @dataclass(frozen=True)
 class MeasuredScene:
-    """A scene, and what was measured."""
+    """A scene with the measurements of an experiment, as read from a file."""
 
     file: str
     scene: Scene
     problem: ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
-        """On a device; raises `InputError` and `SceneError` for data that cannot be read, or does not fit."""
+        """Make the experiment on a device; raise `InputError` or `SceneError` for data that do not fit or open."""
         simulation, folder = Simulation(self.scene, device, precision), Path(self.file).parent
         last = self.problem.steps * float(self.scene.solver.time_step)
         found = {}
@@ -64,19 +64,19 @@ class MeasuredScene:
 
 @dataclass(frozen=True)
 class FitTask:
-    """Measured experiments, and which parameters are fitted to them."""
+    """A task of `cortado fit`: measured experiments, and the parameters that are fitted to them."""
 
     experiments: tuple[MeasuredScene, ...]
     fit: FitTable
 
     @property
     def scene(self) -> Scene:
-        """The scene of the first experiment."""
+        """Return the scene of the first experiment."""
         return self.experiments[0].scene
 
 
 def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> FitTask:
-    """Read one from a TOML file; raises `SceneError` in one sentence."""
+    """Read a task of `cortado fit` from a TOML file; raise `SceneError` in one sentence."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:
@@ -89,7 +89,7 @@ def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Fit
 
 
 def _also(path: Path) -> MeasuredScene:
-    """One more experiment, whose file may have a table [fit] of its own, which is not looked at."""
+    """Read one more experiment from its file, which may have a table [fit] of its own that is ignored."""
     found, _ = _read(read_toml(path), os.fspath(path), ExperimentTables)
     if found.problem.also:
         raise SceneError(
@@ -108,8 +108,8 @@ def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[Measured
 
 @singledispatch
 def observation(table: MeasuredTable, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """What a table describes, up to the ``last`` time of the run [s]; its files are in a folder. Raises
-    `InputError`."""
+    """Make the observation that a table describes, up to the ``last`` time of the run [s]; its files are in a folder.
+    Raises `InputError`."""
     raise NotImplementedError(type(table))
 
 
@@ -175,14 +175,14 @@ def _(table: TracksTable, simulation: Simulation, folder: Path, last: float) -> 
 
 
 def _instants(times: np.ndarray, apart: float) -> tuple[np.ndarray, np.ndarray]:
-    """The times that are further apart than that, in order, and of each time which of them it is."""
+    """Return the times that are further apart than ``apart``, in order, and each given time's index among them."""
     each, which = np.unique(times, return_inverse=True)
     begins = np.diff(each, prepend=-np.inf) > apart
     return each[begins], np.cumsum(begins)[which] - 1
 
 
 def _within(times: np.ndarray, last: float) -> np.ndarray:
-    """Which of some times are within the run; the others are left out."""
+    """Return a mask of the times that are within the run."""
     return (times >= -1e-12) & (times <= last * (1.0 + 1e-9))
 
 

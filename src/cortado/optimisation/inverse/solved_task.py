@@ -30,37 +30,37 @@ from cortado.scene.parameters import Axis
 from cortado.scene.scene import Scene
 
 MOST_CURVES = 12
-"""Parameters with more components get no picture of their own."""
+"""Most components of a parameter that gets a picture of its own."""
 TITLES = ("first guess", "found", "target")
 IMAGES = 6
-"""Images that show the course of the optimisation."""
+"""Number of images that show the course of the optimisation."""
 EVALUATIONS = (1, 5, 20, 100)
-"""Whose runs are shown, as far as the search went; 0 is the first guess."""
+"""Evaluations whose runs are shown, as far as the search went; 0 is the first guess."""
 Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
 
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """Pictures and films, (caption, path) of each."""
+    """Pictures and films of a solved task, with (caption, path) of each."""
 
     found: Figures = field(default_factory=list)
-    """The run with what was found, in motion."""
+    """The run with the found parameters, in motion."""
     compared: Figures = field(default_factory=list)
     """Before, found and target."""
     parameters: Figures = field(default_factory=list)
-    """What was found against what was hidden."""
+    """Found parameters against the hidden ones."""
     search: Figures = field(default_factory=list)
     """How the search went."""
 
     def __add__(self, other: "TaskFigures") -> "TaskFigures":
-        """These, and then those of another."""
+        """Return these figures followed by another task's."""
         return TaskFigures(**{name: figures + getattr(other, name) for name, figures in vars(self).items()})
 
 
 @dataclass(frozen=True)
 class KnotValues:
-    """Of one parameter; between two knots it changes along a straight line."""
+    """The values of one parameter at knots in time, between which it changes along a straight line."""
 
     times: np.ndarray
     """(k,) [s] A step has the value of its middle, so the first knot is half a step after the start of the run; that of
@@ -73,13 +73,13 @@ class KnotValues:
     """(k, d) the course with these knots that is nearest to the true one; None where a picture is the target."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
-        """By names; without the true values where there are none."""
+        """Return the arrays by name; without the true values where there are none."""
         known = {} if self.true is None else {"true": self.true}
         return {"times": self.times, "estimate": self.estimate, **known}
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """By name, of the parameters that were searched by their knots; ``coordinates`` of the search give ``estimate``."""
+    """Return by name the knots of parameters that were searched by knots; ``coordinates`` of the search give values."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():
@@ -95,13 +95,13 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
 
 
 def _without_round_off(values: np.ndarray) -> np.ndarray:
-    """To twelve digits of the largest: what a user wrote comes back from the course as it was written."""
+    """Round values to twelve digits of the largest: a user's numbers come back from the course as they were written."""
     largest = np.abs(values).max()
     return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
 
 
 def task_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
-    """Draw them into a folder."""
+    """Draw plots and pictures of a solved task into a folder."""
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
     figures = TaskFigures(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
@@ -149,7 +149,7 @@ def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """The estimate of a parameter over the evaluations; of one that changes over time, the last estimate over time."""
+    """Draw the estimate of a parameter over the evaluations, or the last estimate of one that changes over time."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task, name, estimate)
@@ -171,7 +171,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Of the numbers of a parameter, of one over time those of a row: its axes, its phases, or else counted."""
+    """Name the components of a parameter, of one over time those of a row: its axes, its phases, or numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
@@ -189,14 +189,14 @@ def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
 
 
 def begin_shaded(made: Setup) -> None:
-    """Compile what will draw them while the search goes on, which leaves a core to spare."""
+    """Compile the renderer of shaded pictures while the search goes on, which leaves a core to spare."""
     simulation = made.problem.simulation
     artist = painter(made.task.scene, simulation.positions, simulation.device)
     compile_meanwhile(artist, simulation.device)
 
 
 def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
-    """Draw them into a folder."""
+    """Draw shaded pictures and films of a solved task into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
     steps = np.unique(np.linspace(0, made.problem.steps, max(picture.searched_frames, 2)).astype(int)).tolist()
 
@@ -232,7 +232,7 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
-    """That of films of states after so many steps."""
+    """Return the pace of films whose frames are the states after these numbers of steps."""
     if scene.solver.chooses:
         return Pace.unknown(len(steps))
     pace = pace_of(float(scene.solver.time_step) * np.asarray(steps), scene.picture or Picture())
@@ -240,7 +240,7 @@ def step_pace(scene: Scene, steps: Sequence[int]) -> Pace:
 
 
 def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
-    """The runs after a number of steps, side by side, each with its name."""
+    """Lay out the pictures of runs after a number of steps, side by side, each with its name."""
     scene, across = made.task.scene, len(runs) if len(runs) < 4 else 2
     picture, half = scene.picture or Picture(), len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}

@@ -55,7 +55,7 @@ ESTIMATORS: dict[str, AdjointEstimator] = {
 
 
 def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
+    """Return values by name as arrays, or as one of the words where a parameter can be random; raise `field_error`."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
     found = {}
@@ -69,7 +69,7 @@ def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> d
 
 
 def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Values by name, where ``drag.k = 2.0`` is a table in a table."""
+    """Return values by name, where ``drag.k = 2.0`` came as a table in a table."""
     found = {}
     for name, value in values.items():
         deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
@@ -78,17 +78,17 @@ def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def _names(info: ValidationInfo) -> Collection[str]:
-    """Of all parameters, those of parts of packages among them where whoever reads the tables says which."""
+    """Return the names of all parameters, with those of parts of packages if the reader of the tables knows these."""
     return (*NAMES, *(info.context or {}).get("names", ()))
 
 
 def _offered(info: ValidationInfo) -> str:
-    """Which names are right: of parameters that the scene has, where whoever reads the tables says which."""
+    """Name in words the right parameters: the scene's, if the reader of the tables knows these."""
     return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
 
 
 def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """The name of a parameter; raises a `field_error` where whoever reads the tables says which names are right."""
+    """Check the name of a parameter; raise a `field_error` if the reader of the tables knows other names only."""
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
     return name if info.context else check(name)
@@ -103,14 +103,14 @@ def _array(name: str, value: Any) -> Any:
 
 
 def _is_numeric(value: Any) -> bool:
-    """Whether there is a finite number, or nothing else in a list that is not empty."""
+    """Test for a finite number, or a list, not empty, of nothing else."""
     if isinstance(value, list):
         return bool(value) and all(map(_is_numeric, value))
     return as_number(value) is not None
 
 
 def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The JSON schema of values by name; parameters that can be random may be one of the words too."""
+    """Return the JSON schema of values by name; parameters that can be random may be one of the words too."""
     allowed = [{"enum": list(words)}] if words else []
     properties = {
         name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
@@ -193,7 +193,7 @@ AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(disc
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
-    """Factors that grow to 1; raises a `field_error`."""
+    """Check that factors grow to 1, and return them; raise a `field_error` if not."""
     with suppress(ValidationError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
@@ -263,7 +263,7 @@ class ProblemTable(Table):
 
     @property
     def compared(self) -> list[int]:
-        """The numbers of the states that are compared."""
+        """Return the numbers of steps before the states that are compared."""
         return [round(self.steps * (k + 1) / self.frames) for k in range(self.frames)]
 
 
@@ -319,7 +319,7 @@ class GradientTable(Table):
         return self
 
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
-        """As an object; ``executor`` computes the samples of an ensemble."""
+        """Make the gradient estimator of the table; ``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
             coefficient = one.coefficient if self.coefficient is None else self.coefficient
@@ -368,7 +368,7 @@ class OptimiseTable(Table):
         return self
 
     def algorithm(self) -> Optimiser:
-        """The optimiser as an object."""
+        """Make the optimiser of the table."""
         setting = "scale" if self.optimiser in WITH_A_SCALE else "learning_rate"
         given = {setting: self.learning_rate, "tolerance": self.tolerance}
         made: Optimiser = BY_NAME[self.optimiser](**{key: one for key, one in given.items() if one is not None})
@@ -376,7 +376,7 @@ class OptimiseTable(Table):
 
 
 class TaskTables(Table):
-    """The two tables of a task."""
+    """The tables [problem] and [optimise] of a task."""
 
     problem: ProblemTable
     optimise: OptimiseTable
@@ -399,14 +399,15 @@ class FitTable(Table):
 
 
 class FitTables(Table):
-    """The two tables of a task whose target was measured."""
+    """The tables [problem] and [fit] of a task whose target was measured."""
 
     problem: ProblemTable
     fit: FitTable
 
 
 def file_schema() -> dict[str, Any]:
-    """Of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what must fit together."""
+    """Return the JSON schema of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what
+    must fit together."""
     models = (Scene, TaskTables, FitTables, DatasetTables)
     scene, task, fit, data_set = (model.model_json_schema() for model in models)
     tables = {**scene["$defs"], **task["$defs"], **fit["$defs"], **data_set["$defs"]}
@@ -423,5 +424,5 @@ def file_schema() -> dict[str, Any]:
 
 
 def file_schema_text() -> str:
-    """The schema as it is shipped."""
+    """Return the JSON schema as the text that is shipped."""
     return json.dumps(file_schema(), indent=1, ensure_ascii=False) + "\n"

@@ -36,18 +36,18 @@ _ALGORITHMS = {
 }
 DRAWN = {"heart": heart, "rosetta": rosetta}
 GIVEN = Words("given")
-"""What a sentence says of a key that should be left out."""
+"""The value that a message shows for a key that should be left out."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """An inverse problem: a scene, a target, and how it is searched. Parameters over time have a row for each step."""
+    """An inverse problem: a scene, a target, and a search. Parameters over time have a row for each step."""
 
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
     true_parameters: Arrays
-    """Those of the run that made the target; none where the target is a picture."""
+    """Parameters of the run that made the target; none where the target is a picture."""
     start: dict[str, Any]
     """Parameters with which the search starts; arrays, or the word "random"."""
     known: Known
@@ -90,7 +90,8 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
 
 
 def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
-    """The parameters of a scene, and the tables of a model, which name such parameters; raises `SceneError`."""
+    """Read the tables of a model, whose keys are names of a scene's parameters, and return the parameters and the
+    tables; raise `SceneError`."""
     try:
         known = known_in(scene)
         names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
@@ -104,7 +105,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Values with a row for each step where they change over time; raises `SceneError` for one that does not fit."""
+    """Return values with a row for each step where they change over time; raise `SceneError` for a wrong shape."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -142,7 +143,7 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
-    """Raises `SceneError` for an option that does not fit the others, so that none is silently ignored."""
+    """Raise `SceneError` for an option that does not fit the others, so that none is silently ignored."""
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -178,7 +179,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
 def _check_bounds(
     name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene, known: Known
 ) -> None:
-    """Raises `SceneError` for bounds that do not fit the start."""
+    """Raise `SceneError` for bounds that do not fit the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
         raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
@@ -208,8 +209,8 @@ def _check_bounds(
 
 
 def _shapes(parameter: Parameter, scene: Scene, steps: int) -> list[tuple[int, ...]]:
-    """The shapes that a parameter may have; () is a number. The scene is cut into particles, which may take a second,
-    only where the parameter has a value for each of them."""
+    """Return the shapes that a parameter may have; () is a number. The scene is cut into particles, which may take a
+    second, only where the parameter has a value for each of them."""
     particles = len(fluid_particles(scene).positions) if parameter.axis is Axis.PARTICLE else 0
     return parameter.shapes(steps, len(scene.phase), (particles, scene.dimension))
 
@@ -219,7 +220,7 @@ def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
 
 
 def task_in_words(task: Task) -> list[str]:
-    """What is searched and what it shall reach, and how; a paragraph each."""
+    """Describe what a task searches, what it shall reach, and how, in a paragraph each."""
     problem, settings = task.problem, task.optimise
     seconds = problem.steps * task.scene.solver.time_step
     compared = "images" if problem.loss == "image" else "positions of all particles"
@@ -246,7 +247,7 @@ def _listed(names: object) -> str:
 
 
 def _asked(task: Task) -> str:
-    """What the check of the task asks for; empty where it asks for nothing."""
+    """Write in words what the check of a task asks for; empty where it asks for nothing."""
     check = task.optimise.check
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
@@ -259,7 +260,7 @@ def _asked(task: Task) -> str:
 
 @dataclass(frozen=True)
 class Setup:
-    """The arguments for `cortado.optimise`, and the target that its result is compared with."""
+    """A task on a device: the arguments for `cortado.optimise`, and the target that its result is compared with."""
 
     task: Task
     problem: Problem
@@ -276,21 +277,21 @@ class Setup:
 
     @property
     def search(self) -> Transformed:
-        """The last of the searches, that of the task itself."""
+        """Return the last of the searches, that of the task itself."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:
-        """The picture (rows, columns, 3) of a state."""
+        """Render the picture (rows, columns, 3) of a state."""
         assert self.renderer is not None
         return _image(self.renderer, end)
 
     def true_parameter(self, name: str) -> np.ndarray | None:
-        """The parameter's value in the run that made the target; None where a picture is the target."""
+        """Return a parameter's value in the run that made the target; None where a picture is the target."""
         return self.task.true_parameters.get(name)
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
-    """The task on a device; raises `InputError` for a picture that cannot be read."""
+    """Set up a task on a device; raise `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     found = _coordinates(task, start)
@@ -333,12 +334,12 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
 
 
 def _image(renderer: Renderer, end: Snapshot) -> np.ndarray:
-    """The picture (rows, columns, 3) of a state."""
+    """Render the picture (rows, columns, 3) of a state."""
     return renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
 
 def _picture(task: Task, renderer: Renderer) -> np.ndarray:
-    """The picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, the last phase on the
+    """Read the picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, last phase on
     first."""
     name, scene = task.problem.picture, task.scene
     assert name is not None
@@ -382,7 +383,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
 
 
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Bounds of coordinates, by name.
+    """Return bounds of coordinates by name.
 
     Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
     logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.

@@ -23,36 +23,36 @@ from cortado.simulation import Simulation
 Table = Mapping[str, Any]
 """Arrays by name."""
 KEPT = 4
-"""Numbers of steps whose layers a simulation keeps for the next call."""
+"""Most layers of one simulation, by their numbers of steps, that are kept for the next call."""
 
 
 class Bridge(ABC):
-    """What these functions need of another program."""
+    """The functions of another program, such as JAX or PyTorch, that calls of layers need."""
 
     stack: Callable[[list[Any]], Any]
-    """Arrays of the other program as one with a first axis."""
+    """Stacks arrays of the other program along a first axis."""
 
     @abstractmethod
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """What a layer returns, by name, differentiable."""
+        """Apply a layer to arrays by name, differentiably, and return its results by name."""
 
     @abstractmethod
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """An array of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
+        """Return an array of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
 
     @abstractmethod
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Arrays of a layer as arrays of the other program, with memory of their own."""
+        """Copy arrays of a layer to arrays of the other program."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """An array on the host, in float64; raises `InputError`."""
+        """Copy an array to the host, in float64; raise `InputError` for anything else."""
         return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """The states that a step leads to again and again, with the next row of each array, and the first one, along a
-        first axis."""
+        """Return the states to which a step leads again and again, with the next row of each array, and the first one,
+        along a first axis."""
         states = [state]
         for k in range(count):
             states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
@@ -60,7 +60,7 @@ class Bridge(ABC):
 
 
 def steps_layer(simulation: Simulation, steps: int) -> Steps:
-    """So many steps; those of the last few numbers of steps are kept."""
+    """Return the layer of ``steps`` steps of a simulation; layers of the last few numbers of steps are kept."""
     if not isinstance(simulation, Simulation):
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
     steps = whole_number("steps", steps, 1)
@@ -69,7 +69,7 @@ def steps_layer(simulation: Simulation, steps: int) -> Steps:
 
 
 def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, parameters: Values | None) -> Any:
-    """A state of Cortado's, the first one if left out, as a table of arrays."""
+    """Return a state of Cortado's, the first one if left out, as a table of arrays of the other program."""
     layer = steps_layer(simulation, 1)
     with layer.turn:
         first = simulation.on_device(given, parameters=dict(_table("parameters", parameters)))
@@ -79,7 +79,7 @@ def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, pa
 def restart_state(
     bridge: Bridge, simulation: Simulation, given: Table, parameters: Values | None
 ) -> RestartState | tuple[RestartState, ...]:
-    """The other way round."""
+    """Return a table of the other program's arrays as a state, from which Cortado can restart."""
     layer = steps_layer(simulation, 1)
     arrays = {name: bridge.numbers(f"state {name}", value) for name, value in _table("state", given).items()}
     check_state({name: array.shape for name, array in arrays.items()}, layer.states.shapes)
@@ -89,14 +89,14 @@ def restart_state(
 
 
 def step(bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int) -> dict[str, Any]:
-    """The state after so many steps."""
+    """Return the state after ``steps`` steps from a given one."""
     return part(_applied(bridge, steps_layer(simulation, steps), given, parameters), STATE)
 
 
 def rollout(
     bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int, record_every: int
 ) -> dict[str, Any]:
-    """The states after every so many steps, the first one included, along a first axis."""
+    """Return the states after every ``record_every`` steps, the first one included, along a first axis."""
     steps, every = whole_number("steps", steps, 1), whole_number("record_every", record_every, 1)
     if steps % every:
         raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
@@ -122,31 +122,31 @@ def rollout(
 
 
 def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None) -> Callable[[Table, Table | None], Any]:
-    """The loss of a problem as a function of parameters, and of a state."""
+    """Return the loss of a problem as a function of parameters, and of a state."""
     layer = Value(problem, gradient)
 
     def loss(parameters: Table, given: Table | None = None) -> Any:
-        """The loss under these parameters, of the problem that begins at a state if one is given."""
+        """Return the loss under these parameters, of the problem that begins at a state if one is given."""
         return _applied(bridge, layer, given, parameters)[LOSS]
 
     return loss
 
 
 def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[[Table, Table | None], Any]:
-    """A sensor or a quantity of the particles as a function of a state and of parameters."""
+    """Return a sensor or a quantity of the particles as a function of a state and of parameters."""
     if not isinstance(simulation, Simulation):
         raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
     layer = Measure(simulation, what)
 
     def reading(given: Table, parameters: Table | None = None) -> Any:
-        """What is read of a state, of which the pressure is that of the step that begins there."""
+        """Return the reading of a state; a pressure is that of the step that begins there."""
         return _applied(bridge, layer, given, parameters)[READING]
 
     return reading
 
 
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, colours: Any) -> Any:
-    """A picture of particles."""
+    """Render a picture of particles, differentiably."""
     layer = getattr(renderer, "_layer", None) or Picture(renderer)
     renderer.__dict__["_layer"] = layer
     given = {"positions": positions, "fractions": fractions, "colours": colours}
@@ -164,7 +164,7 @@ def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Tabl
 
 
 def _table(what: str, given: Table | None) -> Table:
-    """What was given, nothing if it was left out; raises `InputError` for anything but a table by names."""
+    """Return a given table, an empty one if it was left out; raise `InputError` for anything but a table by names."""
     found = {} if given is None else given
     require_table(what, found, "{'gravity': array}" if what == "parameters" else "{'positions': array, ...}")
     for name in found:

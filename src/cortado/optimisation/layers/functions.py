@@ -47,10 +47,10 @@ LOSS, READING, PICTURE = "loss", "reading", "picture"
 
 
 class OfSimulation(Layer):
-    """A layer of a simulation. Its arrays are those of a state, and parameters over a number of steps."""
+    """A layer whose arrays are a state of a simulation, and its parameters over a number of steps."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
-        """``each`` as that of `LayerParameters`."""
+        """Prepare a layer over ``steps`` steps; ``each`` is explained in `LayerParameters`."""
         super().__init__()
         self._simulation, self._each = simulation, each
         self.states = named_states(simulation)
@@ -63,7 +63,7 @@ class OfSimulation(Layer):
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses it."""
+        """Return the lock that a thread holds while it uses the simulation."""
         return self._simulation.turn
 
     def check(self, given: Shapes) -> None:
@@ -71,12 +71,12 @@ class OfSimulation(Layer):
         self._parameters.check(given, with_state=True)
 
     def _last_step(self) -> dict[str, Array]:
-        """What steps were chosen by, where they were: it has no derivative."""
+        """Return a zero adjoint for the last step's length, where a scene has it: it has no derivative."""
         return {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
 
 
 class Steps(OfSimulation):
-    """So many steps of a simulation, from a state to a later one."""
+    """A layer that takes a number of steps of a simulation, from a state to a later one."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
         self._steps = check_steps(steps)
@@ -115,7 +115,7 @@ class Steps(OfSimulation):
         return Steps(self._simulation.batch_of(size), self._steps, each=True)
 
     def _derivatives(self, given: Named) -> dict[str, Any]:
-        """With respect to a state, as a stepper takes them."""
+        """Return derivatives with respect to a state in the form that a stepper takes."""
         own = part(given, STATE)
         fields = self.states.written({name: array for name, array in own.items() if name in self.states.fields})
         found = {name: fields.numbers(name) for name in own if name in self.states.fields}
@@ -123,13 +123,13 @@ class Steps(OfSimulation):
         return found | {name: np.reshape(on_host(own[name]), members) for name in (STATE_TIME,) if name in own}
 
     def _named(self, found: dict[str, Any]) -> dict[str, Array]:
-        """The other way round."""
+        """Return derivatives of a stepper with respect to a state as named arrays of the layer."""
         fields = {**self.states.narrowed(found), STATE_TIME: np.asarray(found[STATE_TIME])}
         return named(STATE, {**fields, **self._last_step()})
 
 
 class Evaluation:
-    """One forward run of a problem, of which derivatives are computed when they are asked for."""
+    """A forward run of a problem, whose derivatives are computed when they are asked for."""
 
     def __init__(self, problem: Problem, values: Arrays, estimator: GradientEstimator, with_state: bool):
         self._problem, self.values, self._estimator, self._with_state = problem, values, estimator, with_state
@@ -142,7 +142,7 @@ class Evaluation:
 
     @property
     def gradient(self) -> Arrays:
-        """The derivatives of the loss by the names of arrays of the layer, in float64, of a batch with a first axis."""
+        """Return the loss's derivatives by names of arrays, in float64, of a batch with a first axis."""
         if self._found is None:
             assert self._run is not None and isinstance(self._estimator, AdjointEstimator)
             if self._with_state:
@@ -155,7 +155,7 @@ class Evaluation:
         return self._found
 
     def along(self, dots: Named) -> Any:
-        """The derivative of the loss along tangents: by forward mode, unless an estimator was asked for."""
+        """Return the derivative of the loss along tangents: by forward mode, unless an estimator was asked for."""
         if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
             return self._problem.tangent(self.values, part(dots, PARAMETER))
         terms = [self.gradient[name] * dot for name, dot in dots.items()]
@@ -163,10 +163,11 @@ class Evaluation:
 
 
 class Value(OfSimulation):
-    """The loss of a problem. Its arrays are parameters, and those of a state if the problem is to begin there."""
+    """A layer whose result is a problem's loss. Its arrays are parameters, and a state's if the problem begins
+    there."""
 
     def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
-        """``gradient``: the estimator that reverse mode goes by, `gradients.Exact` by default."""
+        """Prepare the layer; reverse mode goes by the estimator ``gradient``, `gradients.Exact` by default."""
         if not isinstance(problem, Problem):
             raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
         super().__init__(problem.simulation, problem.steps, each)
@@ -216,7 +217,7 @@ class Value(OfSimulation):
         return {LOSS: np.where(self._moved(dots), found, 0.0)}
 
     def _moved(self, dots: Named) -> Any:
-        """Of each scene, (batch,) or (), whether a tangent is not 0; tangents that all scenes of a batch share are of
+        """Return for each scene, (batch,) or (), whether a tangent is not 0; tangents shared by a batch count for
         each."""
         found = np.zeros(self.outputs()[LOSS], dtype=bool)
         for name, dot in dots.items():
@@ -233,15 +234,15 @@ class Value(OfSimulation):
 
 
 def _times(found: np.ndarray, bar: Any) -> np.ndarray:
-    """A derivative, of a batch with a first axis for the scenes, times that with respect to the loss; 0 where this is
-    0, also of what has no numbers."""
+    """Return a derivative times that with respect to the loss, of a batch with a first axis; 0 where the latter is 0,
+    even without numbers."""
     factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
     return np.where(factor == 0.0, 0.0, found) * factor
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What derivatives of a reading need."""
+    """A state that was read, with all that the reading's derivatives need."""
 
     snapshot: Snapshot
     step: Residual
@@ -249,8 +250,8 @@ class Look:
 
 
 class Measure(OfSimulation):
-    """What a sensor, or by its name a quantity of the particles, is. Its arrays are those of a state, and parameters of
-    the step after it."""
+    """A layer that reads a sensor, or by its name a quantity of the particles. Its arrays are those of a state, and
+    parameters of the step after it."""
 
     def __init__(self, simulation: Simulation, what: Sensor | str):
         if simulation.batch is not None:
@@ -301,7 +302,7 @@ class Measure(OfSimulation):
         return {READING: moment.tangents([name], fields.numpy(self._simulation.dimension), row)[name]}
 
     def _back(self, look: Look, bar: np.ndarray) -> dict[str, Any]:
-        """From the adjoint of the reading to those of all arrays, float64."""
+        """Turn the adjoint of the reading into those of all arrays, float64."""
         snapshot, rollout = look.snapshot, self._rollout
         found = {str(self._name): bar} if self._sensor is None else self._sensor.adjoint(snapshot, bar)
         whole = adjoint_on_device(found, snapshot).through_quantities(snapshot)
@@ -319,8 +320,8 @@ class Measure(OfSimulation):
 
 
 class Picture(Layer):
-    """Pictures of a renderer. Its arrays are positions (n, d) [m] and, where wanted, mass fractions (n, phases) and
-    colours (phases, 3). They pass through the host."""
+    """A layer that renders pictures. Its arrays are positions (n, d) [m] and, where wanted, mass fractions (n, phases)
+    and colours (phases, 3). They pass through the host."""
 
     def __init__(self, renderer: Renderer):
         super().__init__()

@@ -30,13 +30,13 @@ STATE, PARAMETER = "state ", "parameter "
 """What the names of fields of a state, and of parameters, begin with among those of a layer's arrays: so they do not
 meet, and sentences begin with them."""
 POSITIONS = (STATE + "positions", "positions")
-"""What a layer that looks at particles calls where they are."""
+"""Names of the positions in layers that look at particles."""
 LAST_STEP = "time_step"
-"""The length of the step that led to a state, which a scene has that chooses it [s]."""
+"""The length of the step that led to a state, in a scene that chooses its steps [s]."""
 KEPT = 2
-"""Sizes of batches of a layer that are kept for the next call."""
+"""Most sizes of batches of a layer that are kept for the next call."""
 MOST_KNOWN = 256
-"""Checksums of states that are remembered."""
+"""Most checksums of states that are remembered."""
 Array = Any
 """A Warp array of numbers, or one of NumPy's. Where a shape is (), it may be (1,)."""
 Named = Mapping[str, Array]
@@ -54,72 +54,70 @@ class Layer(ABC):
     real: type
     """The NumPy type of the numbers of all arrays."""
     device: Any
-    """Where they are; parameters, and other small ones, are read on the host wherever they are."""
+    """Device of the arrays; parameters, and other small ones, are read on the host wherever they are."""
     on_device: frozenset[str] = frozenset()
-    """The names of those that must be there."""
+    """Names of the arrays that must be on the device."""
     kept_bytes: int = 0
-    """About what a residual holds."""
+    """About how many bytes a residual holds."""
     unmapped: str = ""
-    """What has no `many`, in words, where there is none."""
+    """A name in words for a layer without `many`; else empty."""
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}
 
     @abstractmethod
     def check(self, given: Shapes) -> None:
-        """Raises `InputError`, in a sentence, for arrays of other names or shapes than it takes."""
+        """Raise `InputError`, in a sentence, for arrays of other names or shapes than the layer takes."""
 
     @abstractmethod
     def outputs(self) -> dict[str, tuple[int, ...]]:
-        """The names and the shapes of what it returns."""
+        """Return the names and the shapes of the layer's results."""
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """What it returns, and, to ``keep``, a residual for `pull` and `push`, else None."""
+        """Return the layer's results, and, to ``keep``, a residual for `pull` and `push`, else None."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
-        """Reverse mode: from the adjoints of what it returned, 0 where they are left out, to those of all arrays that
-        were given."""
+        """Pull back (reverse mode): from adjoints of the results, 0 where left out, to those of all given arrays."""
 
     @abstractmethod
     def push(self, residual: Any, dots: Named) -> Named:
-        """Forward mode: from tangents of arrays that were given, 0 where they are left out, to those of what it
-        returned."""
+        """Push forward (forward mode): from tangents of given arrays, 0 where left out, to those of the results."""
 
     def check_mapped(self) -> None:
-        """Raises `InputError`, in a sentence, where there is no `many`."""
+        """Raise `InputError`, in a sentence, where the layer has no `many`."""
         if self.unmapped:
             raise InputError(
                 f"{self.unmapped} cannot be mapped over a further axis: map over one axis, of what has none."
             )
 
     def many(self, size: int) -> "Layer":
-        """The same function of so many arrays of each kind at once, one behind the other along a first axis."""
+        """Return a layer that evaluates ``size`` arrays of each kind at once, stacked along a first axis."""
         return OneByOne(self, size)
 
     def batched(self, size: int) -> "Layer":
-        """The same, of which the last ones are kept."""
+        """Return the layer of `many`; those of the last few sizes are kept."""
         self.check_mapped()
         return kept_or_made(self._batched, size, self.many, KEPT)
 
 
 @dataclass(frozen=True)
 class Lost:
-    """An evaluation of several that has no numbers."""
+    """An evaluation among several of a layer that has no numbers."""
 
     given: Shapes
-    """Of what it was given."""
+    """Shapes of its arguments."""
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Derivatives in these shapes: 0 where only zeros are given of those that they are linear in, else NaN."""
+        """Return derivatives in these shapes: 0 where all given arrays are 0, else NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
 
 class OneByOne(Layer):
-    """Several evaluations of a layer that takes them only one after the other."""
+    """A layer of several evaluations that takes them one after the other."""
 
     def __init__(self, layer: Layer, size: int):
         super().__init__()
@@ -143,7 +141,7 @@ class OneByOne(Layer):
         return stacked([one for one, _ in found]), [residual for _, residual in found] if keep else None
 
     def _evaluated(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Of one of them, which goes without numbers where its particles have none, or one of them is lost."""
+        """Evaluate one entry, without numbers where its particles have none, or one of them is lost."""
         shapes = {name: np.shape(array) for name, array in given.items()}
         positions = next((array for name, array in given.items() if name in POSITIONS), np.zeros(1))
         lost = Lost(shapes, "its particles had been lost in steps before it.")
@@ -170,7 +168,7 @@ class OneByOne(Layer):
 
 
 def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) -> V:
-    """What is kept under a key, or else is made now, of the ``most`` that were asked for last."""
+    """Return the value kept under a key, or make it now; only the ``most`` that were asked for last are kept."""
     found = kept.pop(key, None) or make(key)
     kept[key] = found  # the last one
     while len(kept) > most:
@@ -184,22 +182,22 @@ def on_host(array: Array) -> np.ndarray:
 
 
 def part(given: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Of named arrays those of a kind, without its name."""
+    """Return named arrays of a kind, without the kind in their names."""
     return {name.removeprefix(kind): array for name, array in given.items() if name.startswith(kind)}
 
 
 def named(kind: str, found: Mapping[str, Any]) -> dict[str, Any]:
-    """The other way round."""
+    """Return arrays with a kind in front of their names."""
     return {kind + name: array for name, array in found.items()}
 
 
 def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
-    """One entry of the first axis of each array, or several in another order."""
+    """Return one entry of the first axis of each array, or several in another order."""
     return {name: _rows(array, chosen) for name, array in given.items()}
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Arrays of the same names with a first axis for each of the tables, on the device of the first ones."""
+    """Stack arrays of equal names along a first axis for the tables, on the device of the first table's."""
     tables = list(found)
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
@@ -224,7 +222,7 @@ def _stack(arrays: list[Array]) -> Array:
 
 
 class NamedStates:
-    """Makes states of one simulation from named arrays, and named arrays from its states.
+    """A converter of one simulation's states from named arrays, and to named arrays.
 
     They have the names and shapes of the fields of a `RestartState`, of a batch with a first axis for the scenes, and a
     ``time`` [s]. All are of the simulation's precision.
@@ -238,7 +236,7 @@ class NamedStates:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shapes of all arrays of a state, by name."""
+        """Return the shapes of all arrays of a state, by name."""
         simulation = self._simulation
         members = () if simulation.batch is None else (simulation.batch,)
         last = {LAST_STEP: members} if simulation.scene.solver.chooses else {}
@@ -246,11 +244,11 @@ class NamedStates:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The names of those that are on the device."""
+        """Return the names of the arrays that are on the device."""
         return self._simulation.initial.names
 
     def state(self, given: Named, parameters: Arrays) -> DeviceState:
-        """A state of the simulation, in arrays of its own. ``parameters`` are those of the steps that follow.
+        """Return a state of the simulation, in arrays of its own. ``parameters`` are those of the steps that follow.
 
         Raises `InputError` for one that does not make sense in this scene. On a GPU, where it would have to be read,
         it is not looked at, as derivatives are not.
@@ -269,7 +267,7 @@ class NamedStates:
         return DeviceState(arrays, scenes)
 
     def arrays(self, state: DeviceState) -> dict[str, Array]:
-        """What `state` takes, of a state that steps led to."""
+        """Return the named arrays of a state that steps led to, as `state` takes them."""
         members = self.shapes[STATE_TIME]
         clocks = [scene.clock for scene in state.scenes]
         found: dict[str, Array] = self.read(state.arrays)
@@ -281,7 +279,7 @@ class NamedStates:
         return found
 
     def written(self, given: Named) -> State:
-        """Fields, or derivatives with respect to them, as Cortado has them, 0 where they are left out."""
+        """Copy fields, or derivatives with respect to fields, to a state of Cortado's, 0 where they are left out."""
         state = self._simulation.solver.new_state()
         for name, array in given.items():
             own = self._narrow(name, state.numbers(name))
@@ -292,30 +290,30 @@ class NamedStates:
         return state
 
     def read(self, state: State) -> dict[str, Array]:
-        """Arrays by name, made from fields of a state as Cortado has them."""
+        """Return named arrays of the fields of a state of Cortado's."""
         return self.narrowed({name: state.numbers(name) for name in self.fields})
 
     def narrowed(self, found: Named) -> dict[str, Array]:
-        """Of fields whose vectors have three components those with as many as the scene has."""
+        """Return fields whose three-component vectors are cut to the scene's components."""
         each = {field.name: field.entry for field in self._simulation.initial.fields}
         narrow = {name: self._narrow(name, found[name]) for name in each}
         wide = {name for name, entry in each.items() if entry is Entry.DOUBLE}
         return {name: on_host(array) if name in wide else array.contiguous() for name, array in narrow.items()}
 
     def _narrow(self, name: str, whole: wp.array) -> wp.array:
-        """A view of a field that is numbers, of vectors of those components that the scene has."""
+        """Return a view of a field's numbers, of vectors with the scene's components."""
         field = next(field for field in self._simulation.initial.fields if field.name == name)
         if field.entry is not Entry.VECTOR or self._simulation.dimension == 3:
             return whole
         return whole[:, :, :2] if whole.ndim == 3 else whole[:, :2]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
-        """(members,) in float64."""
+        """Return a named array as numbers (members,) in float64, 0 where it is left out."""
         members = self._simulation.batch or 1
         return on_host(given[name]).astype(np.float64).reshape(members) if name in given else np.zeros(members)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
-        """Of a state at a time, which may have been rounded. Where it is that of a whole number of steps, it counts
+        """Return the clock of a state at a time, which may have been rounded. For a whole number of steps it counts
         them, so that the times of later steps have the bits of one run."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
@@ -324,7 +322,7 @@ class NamedStates:
         return Clock(steps, steps * step) if abs(time - steps * step) <= room * time else Clock(0, time)
 
     def _judged(self, arrays: State, clocks: list[Clock], parameters: Arrays) -> tuple[Origin, ...]:
-        """Of which particles the scenes of a state are."""
+        """Check a state's scenes, and return the origins of their particles."""
         known = self._known.get(_checksum(arrays)) if self._simulation.device.is_cpu else None
         if known is not None:
             return known
@@ -347,7 +345,7 @@ class NamedStates:
 
 
 def check_state(given: Shapes, wanted: Shapes) -> None:
-    """Raises `InputError` for arrays of other names or shapes than those of a state."""
+    """Raise `InputError` for arrays of other names or shapes than those of a state."""
     if not given:
         raise InputError(f"state is left out, but must have {', '.join(wanted)} in this scene.")
     if given.keys() != wanted.keys():
@@ -358,7 +356,7 @@ def check_state(given: Shapes, wanted: Shapes) -> None:
 
 
 def named_states(simulation: Simulation) -> NamedStates:
-    """What makes the states of a simulation for all of its layers."""
+    """Return the converter of a simulation's states that all of its layers share."""
     found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
     simulation.__dict__["_named_states"] = found
     return found
@@ -384,7 +382,7 @@ class LayerParameters:
         self._rows = DeviceRows(simulation, self._space)
 
     def check(self, given: Shapes, with_state: bool) -> None:
-        """Raises `InputError` for arrays that no parameters have."""
+        """Raise `InputError` for arrays of other names or shapes than the parameters'."""
         for name, shape in part(given, PARAMETER).items():
             shapes = self._space.shapes(name)
             if with_state and name in self._simulation.known.state:
@@ -393,19 +391,19 @@ class LayerParameters:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
     def values(self, given: Named) -> Arrays:
-        """As problems take them, in float64."""
+        """Return parameters as problems take them, in float64."""
         own = part(given, PARAMETER)
         return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
     def on_device(self, given: Named) -> dict[str, Array]:
-        """As steppers take them: those over time that are on the device stay there."""
+        """Return parameters as steppers take them: those over time that are on the device stay there."""
         own = part(given, PARAMETER)
         stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
         others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
         return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
 
     def _shaped(self, name: str, array: Array) -> Array:
-        """Of each evaluation, one that is the same in all steps gets an axis for them."""
+        """Return a parameter's array with an axis for steps where a batch's evaluations have one value for all."""
         shapes = self._space.shapes(name)
         if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
             return array.reshape((array.shape[0], 1, *array.shape[1:]))
@@ -413,8 +411,8 @@ class LayerParameters:
         return array.reshape(()) if is_number else array
 
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Derivatives with respect to values, of a batch with a first axis for the scenes, in their shapes; those on
-        the device have them."""
+        """Return derivatives with respect to values, of a batch with a first axis for the scenes, in the values'
+        shapes; those on the device have them."""
         shared = {}
         for name, bar in found.items():
             if isinstance(bar, np.ndarray):

@@ -41,11 +41,11 @@ except ModuleNotFoundError as error:
 
 SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
 MOST_KEPT = 2**30
-"""Bytes of residuals that wait for a derivative; the oldest ones beyond are computed again when they are needed."""
+"""Most bytes of residuals that wait for a derivative; older ones are computed again when they are needed."""
 TICKET = 2
-"""How many whole numbers it has: that of the residual, and that of an entry, where a layer is mapped over several."""
+"""Whole numbers of a ticket: the number of the residual, and that of an entry, where a layer is mapped over several."""
 LONGER = 64
-"""So many foreign functions whose programs are gone are kept."""
+"""Most foreign functions that are kept although their programs are gone."""
 Kept = tuple[Layer, int | None, Any]
 """A layer, over how many entries it is mapped, None if it is not, and its residual."""
 Names = tuple[str, ...]
@@ -57,7 +57,7 @@ Way = Literal["push", "pull"]
 
 
 class Residuals:
-    """Residuals that wait for a derivative, by their numbers."""
+    """A store of residuals that wait for a derivative, by their numbers."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[int, Kept] = OrderedDict()
@@ -67,7 +67,7 @@ class Residuals:
         return len(self._kept)
 
     def put(self, kept: Kept) -> int:
-        """The number of one."""
+        """Store a residual and return its number."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._kept[number] = kept
@@ -76,7 +76,7 @@ class Residuals:
             return number
 
     def get(self, number: int, last: bool) -> Kept | None:
-        """That of a number; None if it is gone, as it is once somebody was the ``last`` to take it."""
+        """Return a residual by its number, and forget it for the ``last`` caller; None if it is gone."""
         with self._lock:
             return self._kept.pop(number, None) if last else self._kept.get(number)
 
@@ -85,8 +85,8 @@ RESIDUALS = Residuals()
 
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
-    """What a layer returns, mapped over so many entries along a first axis; and, to ``keep``, the tickets (entries, 2)
-    of its residual, or (2,), else 0."""
+    """Return a layer's results, mapped over ``entries`` entries along a first axis; and, to ``keep``, the tickets
+    (entries, 2) of its residual, or (2,), else 0."""
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
     number = RESIDUALS.put((own, entries, residual)) if keep else 0
@@ -97,8 +97,9 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """What a layer pushes the tangents ``others`` of arrays ``given`` to it to, or pulls the adjoints of what it
-    returned to, by the tickets of its residual.
+    """Push tangents ``others`` of the arrays ``given`` to a layer forward, or pull adjoints of its results back, by the
+    tickets of its residual. Of a layer mapped over entries, the derivative is mapped over these, over a part of them,
+    as where it is differentiated along several directions, or not at all.
 
     Mapped over so many entries, of a layer that was mapped over these, over a part of them, as where it is
     differentiated along several directions, or not at all."""
@@ -137,19 +138,19 @@ def _derived(way: Way, arrays: Arrays, *, layer: Layer, names: Names, along: Nam
 
 
 def _results(*avals: Any, layer: Layer, sizes: Sizes, keep: bool = False, **others: Any) -> list[Any]:
-    """The shapes and types of what a layer returns."""
+    """Return the abstract shapes and types of a layer's results."""
     found = [jax.core.ShapedArray((*sizes, *shape), layer.real) for shape in layer.outputs().values()]
     return [*found, jax.core.ShapedArray((*sizes, TICKET), np.int32)] if keep else found
 
 
 def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: Any) -> list[Any]:
-    """Those of some arrays that were given."""
+    """Return the abstract shapes and types of some of the given arrays."""
     each = dict(zip(names, avals, strict=False))
     return [jax.core.ShapedArray(each[name].shape, each[name].dtype) for name in along]
 
 
 def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[..., list[Any]]) -> Any:
-    """A primitive that runs a function of arrays, of what is mapped with one axis for all of it."""
+    """Make a JAX primitive that runs a function of arrays, with one axis for all mapped ones."""
     made = Primitive(f"cortado_{name}")
     made.multiple_results = True
     made.def_abstract_eval(results)
@@ -195,7 +196,7 @@ pull_p = _primitive("pull", partial(_derived, "pull"), _of_given)
 
 
 def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: Any) -> tuple[Any, Any]:
-    """The rule of forward mode of a layer."""
+    """Apply JAX's rule of forward mode for a layer: results, and their tangents by the residual's number."""
     *found, number = evaluate_p.bind(*arrays, keep=True, **options)
     there = [(name, dot) for name, dot in zip(options["names"], dots, strict=True) if type(dot) is not ad.Zero]
     along, own = tuple(name for name, _ in there), [dot for _, dot in there]
@@ -208,14 +209,14 @@ def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: An
 def _transposed(
     transpose: Any, bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any
 ) -> list[Any]:
-    """The rule of reverse mode of a linear primitive, whose first arrays have no derivative: its transpose."""
+    """Apply the rule of reverse mode of a linear primitive, whose first arrays have no derivative: its transpose."""
     own = [ad.instantiate_zeros(bar) for bar in bars]
     found = transpose.bind(number, *given[: len(names)], *own, names=names, along=along, **options)
     return [None] * (1 + len(names)) + list(found)
 
 
 def _linear_forward(primitive: Any, given: Arrays, dots: Arrays, *, names: Names, **options: Any) -> tuple[Any, Any]:
-    """The rule of forward mode of a linear primitive, whose first arrays have no derivative."""
+    """Apply the rule of forward mode of a linear primitive, whose first arrays have no derivative."""
     fixed = 1 + len(names)
     if any(type(dot) is not ad.Zero for dot in dots[1:fixed]):
         raise InputError(SECOND)
@@ -233,17 +234,17 @@ for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
 
 
 class JaxBridge(Bridge):
-    """What calls of layers need of JAX."""
+    """The functions of JAX that calls of layers need."""
 
     stack = staticmethod(jnp.stack)
 
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """What a layer returns, by name."""
+        """Apply a layer to JAX arrays by name, and return its results by name."""
         found = evaluate_p.bind(*given.values(), layer=layer, names=tuple(given), sizes=(), keep=False)
         return dict(zip(layer.outputs(), found, strict=True))
 
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """An array of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
+        """Return an array of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
         real = np.dtype(layer.real)
         if real == np.float64 and not jax.config.jax_enable_x64:
             raise InputError(
@@ -260,13 +261,13 @@ class JaxBridge(Bridge):
         return value.astype(real)
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Arrays of a layer as JAX's."""
+        """Copy arrays of a layer to JAX arrays."""
         return {name: self.array(name, np.array(on_host(array)), layer) for name, array in found.items()}
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """One step after the other, but in a program that is compiled a loop."""
+        """Take one step after the other; in a compiled program as a loop."""
         if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
             return super().repeated(step, state, rows, count)
 
@@ -279,14 +280,14 @@ class JaxBridge(Bridge):
 
 
 def _array(array: Any) -> Array:
-    """One that is there, in its memory."""
+    """Return a JAX array as a NumPy or Warp array in its memory."""
     if not isinstance(array, jax.Array) or next(iter(array.devices())).platform == "cpu":
         return np.asarray(array)
     return wp.from_dlpack(array.reshape(array.shape or (1,)))
 
 
 def _jax_array(found: Array, wanted: Any) -> Any:
-    """A JAX array of what a layer returned."""
+    """Return the result of a layer as a JAX array of the wanted shape and type."""
     if isinstance(found, wp.array) and not found.device.is_cpu:
         return jnp.from_dlpack(found).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)
@@ -304,8 +305,8 @@ class ForeignFunction:
 
     @WARP
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """The call within a function that JAX traces; ``shapes`` are those of what the function returns, ``results``
-        have the shapes that JAX is to have it in, and the types."""
+        """Call the function within a function that JAX traces; ``shapes`` are those of its results, ``results`` have
+        the shapes and types in which JAX is to have them."""
         given = [array.reshape(array.shape or (1,)) for array in arrays]
         dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
         kinds = tuple((array.ndim, str(array.dtype)) for array in given)
@@ -327,7 +328,7 @@ def _let_go(number: int) -> None:
 
 @cache
 def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], ...]) -> Any:
-    """What calls a function by its number, with so many arrays of these numbers of axes and types."""
+    """Make the JAX function that calls a function by its number, with arrays of these numbers of axes and types."""
 
     def call(*arguments: Any) -> None:
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
@@ -355,14 +356,14 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
 
 
 def _print(*words: Any, **options: Any) -> None:
-    """What Warp's foreign functions print, which is the traceback of each error, but for errors of ours: JAX raises
-    them with their sentence, and their traceback says nothing more. Warp has no setting for it."""
+    """Print for Warp's foreign functions the traceback of each error, but for errors of ours: JAX raises them with
+    their sentence, and their traceback says nothing more. Warp has no setting for it."""
     if not isinstance(sys.exc_info()[1], CortadoError):
         print(*words, **options)
 
 
 def _in_order(device: Any) -> AbstractContextManager[Any]:
-    """On a GPU, in a stream of ours, after and before what is in that of the program, which cannot be captured."""
+    """Return a context in a GPU stream of ours, after and before the work of the program's stream."""
     return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
 
 

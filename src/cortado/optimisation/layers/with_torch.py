@@ -28,51 +28,51 @@ Tensors = tuple[Any, ...]
 
 @dataclass(eq=False)
 class Call:
-    """One application of a layer, and what its derivatives need."""
+    """One application of a layer to tensors, with all that its derivatives need."""
 
     layer: Layer
     names: tuple[str, ...]
-    """Of its tensors, in their order."""
+    """Names of its tensors, in their order."""
     keep: bool
-    """Whether derivatives are likely to be asked for."""
+    """True where derivatives are likely to be asked for."""
     residual: Any = None
     many: "Call | None" = field(default=None, repr=False)
-    """The application to several of each tensor that `torch.vmap` has made of it."""
+    """The mapped application to several of each tensor that `torch.vmap` has made."""
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
-        """What the layer returns, as tensors."""
+        """Evaluate the layer, and return its results as tensors."""
         with _in_order(_device(self.layer)):
             found, self.residual = self.layer.evaluate(_arrays(self.names, tensors), keep)
             return _tensors(self.layer, found, self.layer.outputs())
 
     def kept(self, tensors: Tensors) -> Any:
-        """What derivatives need, which is computed now where nobody said before that it would be needed."""
+        """Return the residual for derivatives, which is computed now if nobody asked for it before."""
         if self.residual is None:
             self.evaluate(tensors, keep=True)
         return self.residual
 
     def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
-        """The adjoints of all tensors, each on its device."""
+        """Return the adjoints of all tensors, each on its device, by reverse mode of the layer."""
         with _in_order(_device(self.layer)):
             found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
             each = zip(self.names, tensors, strict=True)
             return tuple(_tensor(found[name], tensor.shape, tensor.dtype, tensor.device) for name, tensor in each)
 
     def push(self, tensors: Tensors, dots: Tensors) -> Tensors:
-        """The tangents of what the layer returns."""
+        """Return the tangents of the layer's results."""
         with _in_order(_device(self.layer)):
             found = self.layer.push(self.kept(tensors), _arrays(self.names, dots))
             return _tensors(self.layer, found, self.layer.outputs())
 
     def batched(self, size: int) -> "Call":
-        """The application to so many of each tensor."""
+        """Return the application to ``size`` of each tensor."""
         if self.many is None or self.many.layer is not self.layer.batched(size):
             self.many = Call(self.layer.batched(size), self.names, self.keep)
         return self.many
 
 
 class Evaluate(torch.autograd.Function):
-    """A layer."""
+    """The application of a layer as a function of PyTorch's automatic differentiation."""
 
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
@@ -103,8 +103,8 @@ class Evaluate(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A derivative of a layer, which has none of its own. Its tensors are those of the layer, and the adjoints or the
-    tangents behind them."""
+    """A derivative of a layer as a function of PyTorch, without derivatives of its own. Its tensors are those of the
+    layer, and the adjoints or the tangents behind them."""
 
     @staticmethod
     def of(call: Call, tensors: Tensors, given: Tensors) -> Tensors:
@@ -124,7 +124,7 @@ class _Linear(torch.autograd.Function):
 
 
 def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
-    """How a derivative is mapped: as one of the application to several tensors where these are mapped too, and else as
+    """Return the `vmap` of a derivative: that of the mapped application where its tensors are mapped too, and else
     several derivatives of the one application."""
 
     def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
@@ -142,7 +142,7 @@ def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
 
 
 class Pull(_Linear):
-    """The derivative of a layer in reverse mode."""
+    """The derivative of a layer in reverse mode, as a function of PyTorch."""
 
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
@@ -150,7 +150,7 @@ class Pull(_Linear):
 
 
 class Push(_Linear):
-    """The derivative of a layer in forward mode."""
+    """The derivative of a layer in forward mode, as a function of PyTorch."""
 
     @staticmethod
     def forward(call: Call, *tensors: Any) -> Tensors:
@@ -162,13 +162,13 @@ for _one in (Pull, Push):
 
 
 class TorchBridge(Bridge):
-    """What calls of layers need of PyTorch."""
+    """The functions of PyTorch that calls of layers need."""
 
     stack = staticmethod(torch.stack)
 
     @torch.compiler.disable
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """What a layer returns, by name."""
+        """Apply a layer to tensors by name, and return its results by name."""
         unpack = torch.autograd.forward_ad.unpack_dual
         tangents = any(unpack(tensor).tangent is not None for tensor in given.values())
         keep = tangents or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given.values()))
@@ -176,7 +176,7 @@ class TorchBridge(Bridge):
         return dict(zip(layer.outputs(), found, strict=True))
 
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """A tensor of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
+        """Return a tensor of the layer's precision as it is, or numbers as one; raise `InputError` for any other."""
         real = _dtype(layer)
         if not isinstance(value, torch.Tensor):
             return torch.as_tensor(np.array(as_precise_numbers(what, value)), dtype=real, device=_device(layer))
@@ -191,12 +191,12 @@ class TorchBridge(Bridge):
         return value.to(real)
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
-        """Arrays of a layer as tensors of their own."""
+        """Copy arrays of a layer to tensors."""
         shapes = {name: tuple(array.shape) for name, array in found.items()}
         return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """A tensor, or what else it may be, on the host."""
+        """Copy a tensor, or other numbers, to the host in float64."""
         whole = isinstance(value, torch.Tensor) and value.dtype not in (torch.float16, torch.bfloat16)
         return as_precise_numbers(what, value.detach().cpu().numpy() if whole else value)
 
@@ -211,7 +211,7 @@ def _device(layer: Layer) -> Any:
 
 @contextmanager
 def _in_order(device: Any) -> Iterator[None]:
-    """On a GPU, after what PyTorch computes in its stream, and before what it computes there next."""
+    """Run launches on a GPU after PyTorch's work in its stream, and before its next work there."""
     if device.type != "cuda":
         yield
         return
@@ -222,7 +222,7 @@ def _in_order(device: Any) -> Iterator[None]:
 
 
 def _arrays(names: Any, tensors: Tensors) -> dict[str, Array]:
-    """Tensors, but those that are left out, in their memory."""
+    """Return tensors, but those that are left out, as arrays in their memory, by name."""
     each = zip(names, tensors, strict=True)
     return {name: _array(tensor) for name, tensor in each if tensor is not None}
 
@@ -233,21 +233,21 @@ def _array(tensor: Any) -> Array:
 
 
 def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
-    """What a layer returned; what may be elsewhere than on its device is on the host."""
+    """Return a layer's results as tensors; arrays that may be elsewhere than on its device go to the host."""
     real, device = _dtype(layer), _device(layer)
     each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
     return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
 
 
 def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
-    """An array of the same memory, or where it is of another type or on another device a copy."""
+    """Return an array as a tensor in its memory, or as a copy where the type or the device differs."""
     own = wp.to_torch(array) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
     assert own.numel() == prod(shape)
     return own.to(dtype=dtype, device=device).reshape(tuple(shape))
 
 
 def _in_front(tensors: Tensors, dims: Sequence[int | None], size: int) -> Tensors:
-    """Tensors with the axis that they are mapped over in front."""
+    """Return tensors with the axis that they are mapped over in front."""
     each = zip(tensors, dims, strict=True)
     return tuple(
         None if tensor is None else tensor.movedim(dim, 0) if dim is not None else tensor.expand(size, *tensor.shape)

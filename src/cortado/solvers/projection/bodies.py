@@ -53,7 +53,7 @@ class Held:
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
-        """The sums of the sizes."""
+        """The sums of the sizes of gamma and of its torque."""
 
     def at_rest(self) -> "Held":
         """Return a copy that shares the arrays of this body but begins at rest."""
@@ -191,7 +191,7 @@ class BodiesAdjoint:
         layout = bodies.layout
         self._held = [Held(own.body, layout, Start.of(own), "_bar") for own in changes]
         self.drift_bar = wp.zeros_like(bodies.drift)
-        """That of the drift of one iteration."""
+        """The adjoint of the drift of one iteration."""
         self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
         self._faster = {name: wp.zeros_like(changes[0].turned_end) for name in ("V_bar", "W_bar")}
         self._none = {"L_bar": wp.zeros_like(changes[0].turned_end)}

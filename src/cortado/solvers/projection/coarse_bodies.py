@@ -149,7 +149,7 @@ class CoarseBodies:
         self._each = 3 * dimension - 3
         self._roots = [matrix(*_root(held.body.table.mass.inertia).ravel()) for held in bodies.held]
         self.rows = self._each * len(bodies.held)
-        """How many there are."""
+        """Number of rows of all bodies."""
         self._none = layout.arrays(none=precision.real)["none"]
 
     def begin(self, context: StepContext, grid: Named, around: Named, B: wp.array) -> None:
