@@ -1,5 +1,11 @@
 """A good scene, and bad ones: (name, what to replace in the good one, by what, the field that the sentence names)."""
 
+from contextlib import contextmanager
+
+import pytest
+
+from cortado import InputError
+
 GOOD_SCENE = """\
 name = "two blocks"
 dimension = 3
@@ -64,6 +70,14 @@ def plane(**changes) -> dict:
 def assert_one_sentence(text: str) -> None:
     assert text.splitlines() == [text] and text[-1] in ".?" and len(text) < 500
     assert "\x00" not in text and ".." not in text.replace("...", "")
+
+
+@contextmanager
+def one_sentence(words: str | None = None, error: type[Exception] = InputError):
+    """What is refused within is told in one sentence, in which the expression ``words``, if any, is found."""
+    with pytest.raises(error, match=words) as caught:
+        yield caught
+    assert_one_sentence(str(caught.value))
 
 
 _SPHERE = 'shape = "sphere"\ncentre = [0.2, 0.45, 0.12]\nradius = 0.1'

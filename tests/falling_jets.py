@@ -16,7 +16,7 @@ TIMES = {"inviscid": 5.0, "viscous": 7.0}
 particles, which nothing pulls from below, come as a blob: as much flows there as must, within 1 %, only from 4.5 on."""
 
 
-def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, discretisation=C2, device="cpu"):
+def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, device="cpu"):
     """A jet that falls out of a nozzle, so many particles wide: the width or radius over that of continuity where it is
     1.5, 2, 2.5 and 3 times as fast, the greatest gap along it in spacings, and the share of it in one piece, all of
     the last 3 / 10 of `TIMES` the speed in the nozzle over gravity."""
@@ -40,7 +40,7 @@ def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, discretisat
         spacing,
         dimension,
         "float32",
-        discretisation,
+        C2,
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
         fluid=[],
         emitter=jet,
@@ -57,17 +57,12 @@ def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, discretisat
         out = (x @ down < 0.0) & (x @ down > -depth)
         heights = np.sort(x[(x @ down < 2.0 * spacing) & (x @ down > -depth)] @ down)
         gaps.append(np.diff(heights).max() / spacing)
-        joined.append(largest_share(x[out], 1.8 * spacing))
+        joined.append(np.bincount(pieces(x[out], 1.8 * spacing)).max() / out.sum())
         rows.append([_spread(x, v, down, speed, faster, spacing) for faster in FASTER])
     width, fall = np.nanmean(np.array(rows), axis=0).T
     whole = _size(layer[:, :-1], spacing)
     continuity = whole * (speed / fall) ** (1.0 / (dimension - 1))
     return width / continuity, float(np.max(gaps)), float(np.mean(joined))
-
-
-def largest_share(x, reach):
-    """The share of the particles in the largest piece of those that are within reach of one another."""
-    return np.bincount(pieces(x, reach)).max() / len(x)
 
 
 def _spread(x, v, down, speed, faster, spacing):

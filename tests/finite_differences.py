@@ -41,10 +41,10 @@ def all_ways_agree(
         np.testing.assert_allclose(difference, slope, rtol=rtol, atol=atol, err_msg=name)
 
 
-def plateau(errors: Sequence[float], width: int = PLATEAU) -> float:
+def plateau(errors: Sequence[float]) -> float:
     """Of errors at neighbouring steps, the greatest of so many in a row, where that is least."""
-    assert len(errors) >= width
-    return float(min(max(errors[k : k + width]) for k in range(len(errors) - width + 1)))
+    assert len(errors) >= PLATEAU
+    return float(min(max(errors[k : k + PLATEAU]) for k in range(len(errors) - PLATEAU + 1)))
 
 
 def central_difference(

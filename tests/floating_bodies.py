@@ -5,30 +5,23 @@ from typing import Any
 import numpy as np
 
 from cortado import Scene, Simulation
-from scenes import box
+from scenes import box, pool
 
 STEP = 0.001
 """Of the time in which a sphere gets faster [s]."""
 
 
-def floating_box(long: int, duration: float = 1.5) -> dict[str, float]:
+def floating_box(long: int) -> dict[str, float]:
     """A box of half the density of water, half as high as it is long, that is let go at the height at which it should
     float: its draft over that, the mean of the second half of a run. ``long``: its particles along; ``duration`` in
     seconds, for a box of 0.4 m."""
     spacing, density, sides = 0.4 / long, 500.0, np.array([0.4, 0.2])
     wanted = density / 1000.0 * sides[1]
     step = 0.04 * spacing
-    scene = Scene(
-        dimension=2,
-        discretisation={"spacing": spacing},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
-        solid=[box([0.3, 0.4 - wanted], [0.7, 0.4 - wanted + sides[1]], name="box", motion="free", density=density)],
-        solver={"kind": "projection", "time_step": step},
-    )
-    simulation = Simulation(scene)
-    steps = int(duration / step)
+    solid = box([0.3, 0.4 - wanted], [0.7, 0.4 - wanted + sides[1]], name="box", motion="free", density=density)
+    solver = {"kind": "projection", "time_step": step}
+    simulation = Simulation(pool([1.0, 0.4], [1.0, 1.0], spacing, 5.0, solid=[solid], solver=solver))
+    steps = int(1.5 / step)
     run = simulation.run(steps, record_every=max(steps // 200, 1))
     level = len(simulation.positions) * spacing**2 + density / 1000.0 * np.prod(sides)
     drafts = level - (run.solids["box"].positions[:, 1] - 0.5 * sides[1])
@@ -75,23 +68,14 @@ def added_mass(across: int, deep: int, settling: int, iterations: int, steps: in
     than it would otherwise: of water without end C is 0.5."""
     spacing = 0.02
     side = deep * spacing
-    middle = [0.5 * side] * 3
+    middle, ball = [0.5 * side] * 3, {"name": "ball", "shape": "sphere", "motion": "free", "density": 1000.0}
     scene = Scene(
         dimension=3,
         discretisation={"spacing": spacing},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
         fluid=[{"shape": "box", "lower": [0.0] * 3, "upper": [side] * 3, "phase": "water"}],
         container=box([0.0] * 3, [side, side + 6.0 * spacing, side], periodic=[True, False, True]),
-        solid=[
-            {
-                "name": "ball",
-                "shape": "sphere",
-                "centre": middle,
-                "radius": 0.5 * across * spacing,
-                "motion": "free",
-                "density": 1000.0,
-            }
-        ],
+        solid=[{**ball, "centre": middle, "radius": 0.5 * across * spacing}],
         solver={"kind": "projection", "time_step": STEP, "iterations": iterations},
     )
     simulation = Simulation(scene)

@@ -17,14 +17,14 @@ PROJECTION = {"kind": "projection"}
 PCISPH = {"kind": "pcisph", "density_tolerance": 0.001, "maximum_iterations": 100}
 
 
-def exact_mode(ohnesorge: float, dimension: int = 2, mode: int = 2) -> tuple[float, float]:
+def exact_mode(ohnesorge: float, dimension: int = 2) -> tuple[float, float]:
     """Frequency and damping of a drop, in units of sqrt(sigma / (rho R^3)); the Ohnesorge number is mu / sqrt(rho sigma
     R).
 
     In the plane the root of the linear problem with viscosity: a potential flow and one of vorticity, without shear
     stress at the surface (Lamb 1932, art. 355, on a sphere). In space, for small viscosity, Lamb's.
     """
-    n, nu = mode, ohnesorge
+    n, nu = 2, ohnesorge
     if dimension == 3:
         damping, free = (n - 1) * (2 * n + 1) * nu, n * (n - 1) * (n + 2)
         return sqrt(free - damping**2), damping

@@ -3,8 +3,8 @@ Engineers and Scientists, section 6.3."""
 
 import numpy as np
 
-from cortado import Scene, Simulation
-from scenes import box
+from cortado import Simulation
+from scenes import box, pool
 
 GRAVITY = 9.81
 SOONER = 1.3
@@ -29,24 +29,10 @@ def piston(deep: int, depth_times_wavenumber: float, steepness: float, device: s
     times = np.arange(0.0, end + 0.02, 0.01)
     places = 0.5 * stroke * np.minimum(times / period, 1.0) * np.sin(omega * times)
     middle, edge = np.array([-0.25, 0.75]), 5.0 * spacing
-    scene = Scene(
-        dimension=2,
-        discretisation={"spacing": spacing},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [long, 1.0], "phase": "water"}],
-        container={"shape": "box", "lower": [-1.0, 0.0], "upper": [long, 2.0]},
-        solid=[
-            box(
-                [-0.5, -edge],
-                [0.0, 1.5 + edge],
-                name="piston",
-                motion="path",
-                times=times.tolist(),
-                positions=[[middle[0] + x, middle[1]] for x in places],
-            )
-        ],
-        solver={"kind": "projection", "time_step": step},
-    )
+    path = {"times": times.tolist(), "positions": [[middle[0] + x, middle[1]] for x in places]}
+    solid = box([-0.5, -edge], [0.0, 1.5 + edge], name="piston", motion="path", **path)
+    tables = {"container": box([-1.0, 0.0], [long, 2.0]), "solver": {"kind": "projection", "time_step": step}}
+    scene = pool([long, 1.0], [long, 2.0], spacing, solid=[solid], **tables)
     every = max(int(0.02 / step), 1)
     run = Simulation(scene, device).run(int(end / step), record_every=every)
     clock = np.arange(len(run.positions)) * every * step

@@ -14,6 +14,40 @@ def box(lower: Sequence[float], upper: Sequence[float], **more: Any) -> dict[str
     return {"shape": "box", "lower": lower, "upper": upper, **more}
 
 
+def pool(upper: Sequence[float], room: Sequence[float], spacing: float = 0.05, viscosity: float = 0.001, **tables: Any):
+    """Water from a corner of a box up to ``upper``, in a box up to ``room`` [m], with tables that replace its own."""
+    corner = [0.0] * len(room)
+    own = {
+        "dimension": len(room),
+        "discretisation": {"spacing": spacing},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
+        "fluid": [box(corner, upper, phase="water")],
+        "container": box(corner, room),
+        "solver": {"kind": "projection", "time_step": 0.001},
+    }
+    return Scene(**{**own, **tables})
+
+
+def pool_text(
+    upper: Sequence[float],
+    room: Sequence[float],
+    solver: str,
+    spacing: float = 0.05,
+    viscosity: float = 1.0,
+    lower: Sequence[float] = (0.0, 0.0),
+) -> str:
+    """The text of a scene file in the plane: a box of water in a box, which ends with the keys of its [solver]."""
+    return f"""
+dimension = 2
+discretisation = {{ spacing = {spacing} }}
+phase = [{{ name = "water", rest_density = 1000.0, viscosity = {viscosity} }}]
+fluid = [{{ shape = "box", lower = {list(lower)}, upper = {upper}, phase = "water" }}]
+container = {{ shape = "box", lower = [0.0, 0.0], upper = {room} }}
+[solver]
+{solver}
+"""
+
+
 def splash(**solver: Any) -> Scene:
     """125 particles that fall from rest and splash in a box (the report's gradient analysis)."""
     block = {"shape": "box", "lower": [0.0, 0.3, 0.0], "upper": [0.25, 0.55, 0.25], "phase": "water"}
@@ -109,9 +143,9 @@ def scatter(positions: np.ndarray, spacing: float) -> None:
     positions[-3:, 1] += 3 * spacing
 
 
-def thrown(simulation, seed=3):
+def thrown(simulation):
     """Positions and velocities of a state with scatter in both."""
-    random, x, v = np.random.default_rng(seed), simulation.positions, simulation.velocities
+    random, x, v = np.random.default_rng(3), simulation.positions, simulation.velocities
     spacing = simulation.scene.discretisation.spacing
     inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
     return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}

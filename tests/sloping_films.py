@@ -11,7 +11,7 @@ NU = 0.1
 """[m2/s]"""
 
 
-def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, strain=1.2, device="cpu"):
+def sloping_film(slope, deep, solver=PROJECTION, device="cpu"):
     """The mean speed of a film, so many particles deep, over g sin(a) H^2 / (3 nu). The film is mixed on a slope of 0.1
     first. Also of each sixth of the time in which it is measured."""
     spacing = DEPTH / deep
@@ -22,7 +22,7 @@ def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, strain=1.2, 
         size = np.sqrt(1.0 + slope**2)
         return simulated(
             spacing,
-            discretisation=discretisation,
+            discretisation=C2,
             phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1000.0 * NU}],
             fluid=[box([0.0, 0.0], [16.0 * spacing, DEPTH])],
             container={
@@ -40,7 +40,7 @@ def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, strain=1.2, 
     steep, flat = simulation(0.1), simulation(slope)
     mixed = steep.step(steep.state(), {}, steps=int(3.0 * diffusion / step))
     settled = flat.step(mixed, {}, steps=int(2.0 * diffusion / step))
-    time = max(strain * NU / (GRAVITY * slope * DEPTH), 2.0 * diffusion)
+    time = max(1.2 * NU / (GRAVITY * slope * DEPTH), 2.0 * diffusion)
     steps = int(time / step)
     run = flat.run(steps, state=settled, record_every=max(steps // 240, 1))
     rate = run.velocities[1:, :, 0].mean(axis=1) / (GRAVITY * slope / np.sqrt(1.0 + slope**2) * DEPTH**2 / (3.0 * NU))

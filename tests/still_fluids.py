@@ -37,7 +37,7 @@ class StillWater(NamedTuple):
     """The mean height over that at first, at the end."""
 
 
-def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu", dimension=2):
+def still_water(deep, time=2.5, discretisation=C2, device="cpu", dimension=2):
     """Of water so many particles deep."""
     spacing = 1.0 / deep
     simulation = simulated(
@@ -47,11 +47,11 @@ def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisati
         discretisation=discretisation,
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
         fluid=[box([0.0] * dimension, [0.8, 1.0, 0.8][:dimension])],
-        solver={**solver, "time_step": time_step},
+        solver={**PROJECTION, "time_step": 0.001},
         device=device,
         **tank(dimension),
     )
-    steps = round(time / time_step)
+    steps = round(time / 0.001)
     run = simulation.run(steps, record_every=max(steps // 500, 1), record=["pressure"])
     late = run.times > 0.8 * time
     x = run.positions[late].mean(axis=0)
@@ -66,7 +66,7 @@ def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisati
 
     speed = np.sqrt((run.velocities[late] ** 2).sum(axis=2).mean())
     level = run.positions[-1, :, 1].mean() / run.positions[0, :, 1].mean()
-    multiplier = errors(run.others["pressure_impulse"] / time_step)
+    multiplier = errors(run.others["pressure_impulse"] / 0.001)
     return StillWater(float(speed), errors(run.quantities["pressure"]), multiplier, float(level))
 
 

@@ -8,9 +8,9 @@ import pytest
 
 import cortado
 import cortado.environments
-from cortado import InputError
-from cortado.errors import CortadoError
-from scenes import plane
+from bad_scenes import one_sentence
+from cortado import CortadoError, InputError
+from scenes import plane, pool
 from scenes import scene as box
 
 PADDLE = {"name": "paddle", "shape": "box", "lower": [0.5, 0.1], "upper": [0.6, 0.4], "motion": "path"}
@@ -25,15 +25,8 @@ def at():
 
     jax.config.update("jax_enable_x64", True)
     made = SimpleNamespace(jax=jax, jnp=jax.numpy, layer=cortado.jax)
-    made.scene = cortado.Scene(
-        dimension=2,
-        discretisation={"spacing": 0.05},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.3], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.8]},
-        solid=[{**PADDLE, "velocity": [0.0, 0.0]}],
-        solver={"kind": "projection", "time_step": 0.002},
-    )
+    tables = {"solid": [{**PADDLE, "velocity": [0.0, 0.0]}], "solver": {"kind": "projection", "time_step": 0.002}}
+    made.scene = pool([0.4, 0.3], [0.8, 0.8], viscosity=1.0, **tables)
     made.simulation = cortado.Simulation(made.scene, precision="float64")
     made.state, made.gravity = made.layer.state(made.simulation), jax.numpy.array([0.0, -9.81])
     made.problem = cortado.Problem(made.simulation, 4, cortado.losses.CentreOfMass([0.2, 0.1]))
@@ -464,9 +457,8 @@ THEIRS = {
 @pytest.mark.parametrize("use", [*LAYERS, *ENVIRONMENTS, *FITS])
 def test_a_bad_use_is_refused_in_a_sentence(at, use):
     call, words = {**LAYERS, **ENVIRONMENTS, **FITS}[use]
-    with pytest.raises(CortadoError, match=words) as caught:
+    with one_sentence(words, error=CortadoError):
         call(at)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("use", THEIRS)

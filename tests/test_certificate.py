@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import DivergedError, InputError, Problem, Simulation, gradients, losses
+from cortado import DivergedError, InputError, Problem, Simulation, gradients, load_scene, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.consistency import balanced
 from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
@@ -19,7 +19,6 @@ from cortado.certificate.loss_history import LossHistory, in_float64
 from cortado.pictures.run_pictures import gradient_check
 from cortado.problem import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene.scene import load_scene
 from cortado.sph.free_energy import FREE_ENERGIES
 from scenes import jet, plane, plane_of_three, pour, scene, splash, two_layers
 
@@ -178,17 +177,16 @@ def picture(simulation):
     return losses.Image(renderer, np.random.default_rng(1).random(renderer.shape))
 
 
-def two_frames(simulation):
-    return losses.Frames({3: losses.FinalPositions(0.9 * simulation.positions), 8: Spread()})
-
-
 SMALL_PICTURE = {"view": "top", "resolution": [12, 10]}
 IN_SINGLE = {
     "3-D": (splash, lambda simulation: losses.FinalPositions(simulation.positions)),
     "2-D, centre of mass": (plane, lambda simulation: losses.CentreOfMass([0.3, 0.1])),
     "3-D, two fluids, a picture": (lambda: two_layers(render=SMALL_PICTURE), picture),
     "2-D, three fluids, a loss of one's own": (plane_of_three, lambda simulation: Spread()),
-    "2-D, nozzle, two frames": (jet, two_frames),
+    "2-D, nozzle, two frames": (
+        jet,
+        lambda made: losses.Frames({3: losses.FinalPositions(0.9 * made.positions), 8: Spread()}),
+    ),
     "3-D, a function of Warp arrays": (scene, lambda simulation: recorded),
 }
 

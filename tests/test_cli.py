@@ -33,7 +33,8 @@ from cortado.runs.run_folder import FIGURES
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
-SCENES, TASKS = BAD_SCENES[::8], BAD_TASKS[::8]
+BAD = [("run", "scene.toml", GOOD_SCENE, bad) for bad in BAD_SCENES[::8]]
+BAD += [("optimise", "task.toml", GOOD_TASK, bad) for bad in BAD_TASKS[::8]]
 """Some of the bad ones, all of which tests/test_scene.py and tests/test_task.py have."""
 RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoint"}
 
@@ -231,35 +232,6 @@ def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command,
 # ---- wrong input -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in SCENES], ids=[bad[0] for bad in SCENES])
-def test_a_bad_scene_is_refused(cortado_command, folder, old, new, field):
-    Path("scene.toml").write_text(GOOD_SCENE.replace(old, new, 1))
-    assert_refused(cortado_command("run", "scene.toml", "--out", "dam"), "scene.toml: ", field)
-    assert_nothing_made(folder)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["scene.toml", "--steps", "0"], "steps is 0"),
-        (["scene.toml", "--steps", "-3"], "steps is -3"),
-        (["scene.toml", "--record-every", "0"], "--record-every is 0"),
-        (["scene.toml", "--record-every", "-2"], "--record-every is -2"),
-        (["scene.toml", "--device", "tpu"], "device is 'tpu'"),
-        (["scene.toml", "--device", "cuda:99"], "device is 'cuda:99'"),
-        (["scene.toml", "--device", 5000 * "a"], "aaa..., but must be one of"),
-        (["scene.toml", "--precision", "float16"], "precision is 'float16'"),
-        (["scene.toml", "--set", "solver.time_step"], "not an override"),
-        (["scene.toml", "--set", "solver.timestep=0.1"], "did you mean time_step?"),
-        (["absent.toml"], "absent.toml: the scene cannot be read"),
-        (["."], "cannot be read"),
-    ],
-)
-def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, words):
-    assert_refused(cortado_command("run", *arguments, "--out", "dam"), words)
-    assert_nothing_made(folder)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -275,6 +247,18 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
         (["gradients"], "a command is missing, one of check; see cortado gradients --help."),
         (["bench"], "cortado bench is now python -m benchmarks bench, in a clone of the repository."),
         (["gradients", "study", "--reduced"], "cortado gradients study is now python -m experiments study"),
+        (["run", "scene.toml", "--steps", "0"], "steps is 0"),
+        (["run", "scene.toml", "--steps", "-3"], "steps is -3"),
+        (["run", "scene.toml", "--record-every", "0"], "--record-every is 0"),
+        (["run", "scene.toml", "--record-every", "-2"], "--record-every is -2"),
+        (["run", "scene.toml", "--device", "tpu"], "device is 'tpu'"),
+        (["run", "scene.toml", "--device", "cuda:99"], "device is 'cuda:99'"),
+        (["run", "scene.toml", "--device", 5000 * "a"], "aaa..., but must be one of"),
+        (["run", "scene.toml", "--precision", "float16"], "precision is 'float16'"),
+        (["run", "scene.toml", "--set", "solver.time_step"], "not an override"),
+        (["run", "scene.toml", "--set", "solver.timestep=0.1"], "did you mean time_step?"),
+        (["run", "absent.toml"], "absent.toml: the scene cannot be read"),
+        (["run", "."], "cannot be read"),
         (["run", "scene.toml", "--steps", "many"], "--steps is 'many', but must be a whole number; see cortado run "),
         (["run", "scene.toml", "--steps"], "--steps is given without a value"),
         (["run", "scene.toml", "--stesp", "3"], "--stesp is unknown; --steps may be meant"),
@@ -501,10 +485,11 @@ def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
     assert "gravity.png" in figures("found")
 
 
-@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in TASKS], ids=[bad[0] for bad in TASKS])
-def test_a_bad_task_is_refused(cortado_command, folder, old, new, field):
-    Path("task.toml").write_text(GOOD_TASK.replace(old, new, 1))
-    assert_refused(cortado_command("optimise", "task.toml", "--out", "found"), "task.toml: ", field)
+@pytest.mark.parametrize("command, file, good, bad", BAD, ids=lambda one: one[0] if isinstance(one, tuple) else "")
+def test_a_bad_file_is_refused(cortado_command, folder, command, file, good, bad):
+    _, old, new, field = bad
+    Path(file).write_text(good.replace(old, new, 1))
+    assert_refused(cortado_command(command, file, "--out", "found"), f"{file}: ", field)
     assert_nothing_made(folder)
 
 

@@ -53,11 +53,6 @@ def escaped(scene: Scene, trajectory: Trajectory) -> int:
     return int(np.count_nonzero(~scene.container.contains(everywhere.astype(np.float64), 0.0)))
 
 
-def worst_density_error(trajectory: Trajectory) -> float:
-    """The greatest average compression after the first ten steps."""
-    return float(trajectory.density_errors[10:].max())
-
-
 def energies(scene: Scene, trajectory: Trajectory) -> np.ndarray:
     """(frames,) mean of v^2 / 2 - g . x over the particles [J/kg], from the lowest place in the container on."""
     gravity = np.array(scene.forces.gravity)
@@ -85,7 +80,7 @@ def _check(scene: Scene, steps: int) -> None:
     assert escaped(scene, trajectory) == 0
     energy = energies(scene, trajectory)
     assert energy.max() <= 1.001 * energy[0] and energy[-1] < energy[0]  # walls do no work
-    assert worst_density_error(trajectory) <= 0.01
+    assert trajectory.density_errors[10:].max() <= 0.01
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -17,31 +17,9 @@ from cortado.discretise.shapes import wrapped
 from cortado.optimisation import datasets
 from cortado.optimisation.datasets import DatasetTable, Sample, one_run
 from full_disk import largest_file
+from scenes import pool_text
 
-SCENE = """
-name = "columns"
-dimension = 2
-[discretisation]
-spacing = 0.1
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 1.0
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.4, 0.4]
-phase = "water"
-[container]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [1.0, 1.0]
-[forces]
-gravity = [0.0, -9.81]
-[solver]
-kind = "pcisph"
-time_step = 0.004
-"""
+SCENE = pool_text([0.4, 0.4], [1.0, 1.0], 'kind = "pcisph"\ntime_step = 0.004', spacing=0.1)
 TABLE = """
 [dataset]
 steps = 6

@@ -20,7 +20,7 @@ from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
 from cortado.runs.recording import EverySteps, FramesPerSecond
 from cortado.scene.stability import stability_limits
-from scenes import jet, plane, stability_limit, two_layers
+from scenes import box, jet, plane, pool, stability_limit, two_layers
 
 
 @pytest.fixture(autouse=True)
@@ -234,17 +234,14 @@ def test_energies_are_those_of_the_particles(make):
     assert f"energy {summary.last.total:.4g} J" in str(summary)
 
 
+LIGHT = {"name": "water", "rest_density": 800.0, "viscosity": 0.1}
+
+
 def test_densities_are_those_of_the_rest_lattice():
     """Fluid that fills a periodic box has its rest density everywhere, less a slack."""
-    scene = cortado.Scene(
-        dimension=2,
-        discretisation={"spacing": 0.05},
-        phase=[{"name": "water", "rest_density": 800.0, "viscosity": 0.1}],
-        fluid=[{"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "phase": "water"}],
-        container={"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "periodic": [True, True]},
-        forces={"gravity": [0, 0]},
-        solver={"kind": "pcisph", "time_step": 0.001},
-    )
+    room = box([0.0, 0.0], [0.5, 0.5], periodic=[True, True])
+    tables = {"container": room, "forces": {"gravity": [0, 0]}, "solver": {"kind": "pcisph", "time_step": 0.001}}
+    scene = pool([0.5, 0.5], [0.5, 0.5], phase=[LIGHT], **tables)
     simulation = cortado.Simulation(scene, precision="float64")
     rollout = simulation.rollout(2)
     last = rollout.forward(keep=False)
@@ -270,18 +267,10 @@ def test_densities_leave_out_what_waits_in_an_emitter():
 def test_densities_at_the_end_are_those_beside_solids_where_they_are_then():
     """And not where they were at the start, where fluid is by now: as frames record them of a solid that came to
     rest."""
-    box = {"name": "paddle", "shape": "box", "lower": [0.15, 0.0], "upper": [0.25, 0.6]}
-    simulation = cortado.Simulation(
-        cortado.Scene(
-            dimension=2,
-            discretisation={"spacing": 0.05},
-            phase=[{"name": "water", "rest_density": 800.0, "viscosity": 0.1}],
-            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.4], "phase": "water"}],
-            container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 0.8]},
-            solid=[{**box, "motion": "path", "times": [0.0, 0.2], "positions": [[0.2, 0.3], [0.4, 0.3]]}],
-            solver={"kind": "projection", "time_step": 0.004},
-        )
-    )
+    path = {"motion": "path", "times": [0.0, 0.2], "positions": [[0.2, 0.3], [0.4, 0.3]]}
+    paddle = box([0.15, 0.0], [0.25, 0.6], name="paddle", **path)
+    tables = {"phase": [LIGHT], "solid": [paddle], "solver": {"kind": "projection", "time_step": 0.004}}
+    simulation = cortado.Simulation(pool([0.8, 0.4], [0.8, 0.8], **tables))
     steps = 60
     rollout = simulation.rollout(steps)
     found = RunSummary(simulation, rollout, rollout.forward(keep=False), 1.0).densities

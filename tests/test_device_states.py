@@ -8,8 +8,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import InputError, Simulation
-from cortado.errors import DivergedError
+from cortado import DivergedError, InputError, Simulation
 from cortado.optimisation.layers.functions import Steps
 from cortado.optimisation.layers.layer import PARAMETER, STATE, named
 from cortado.optimisation.layers.layer import on_host as arrays_on_host

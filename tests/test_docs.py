@@ -149,11 +149,6 @@ PAGES = sorted(path for path in DOCS.rglob("*.md"))
 CODE_OF_A_PAGE = re.compile(r"^(```+|~~~+).*?^\1$|^(?: {4}.*\n)+|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 
 
-def prose(path: Path) -> str:
-    """A page without its code."""
-    return CODE_OF_A_PAGE.sub("", path.read_text(encoding="utf-8"))
-
-
 def pages_of(page: Path) -> list[Path]:
     """The pages that the tables of contents of a page list."""
     found = []
@@ -171,7 +166,7 @@ def test_every_page_is_in_one_table_of_contents():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS).as_posix())
 def test_a_page_has_one_title_links_and_pictures_that_are_there(page):
-    text = prose(page)
+    text = CODE_OF_A_PAGE.sub("", page.read_text(encoding="utf-8"))
     assert len(re.findall(r"^# .+", text, re.MULTILINE)) == 1
     assert [alt for alt in re.findall(r"!\[(.*?)\]\(", text, re.DOTALL) if len(alt) < 10] == []
     links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]

@@ -17,10 +17,6 @@ from cortado.environments.catalogue import TASKS
 from cortado.environments.task import Position, Velocity
 from cortado.environments.terms import Distance, Missed, OneBox, Share, Spread, StepEnd
 
-SOME = ("Carry", "Raft")
-"""Between them solids on a path, and one that floats."""
-OTHERS = sorted(TASKS.keys() - set(SOME))
-
 
 @pytest.fixture(scope="module")
 def environments():
@@ -35,8 +31,8 @@ def environments():
     return of
 
 
-def actions_of(env, count, seed=0):
-    return np.random.default_rng(seed).uniform(-1.2, 1.2, (count, *env.action_space.shape))
+def actions_of(env, count):
+    return np.random.default_rng(0).uniform(-1.2, 1.2, (count, *env.action_space.shape))
 
 
 def episode(env, actions, seed):
@@ -46,27 +42,18 @@ def episode(env, actions, seed):
     return np.array([first, *(one[0] for one in found)]), np.array([one[1] for one in found])
 
 
-def checked_by_gymnasium(env, recwarn):
-    """A `ResourceWarning` is of something that another test has left, which Python collects here."""
-    check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
-    said = [str(one.message) for one in recwarn if not issubclass(one.category, ResourceWarning)]
-    assert not [sentence for sentence in said if "infinity" not in sentence]
-
-
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.filterwarnings("error::cortado.CortadoWarning")
 def test_the_scene_of_a_task_is_nothing_to_warn_of(name):
     assert TASKS[name]().scene.solver.time_step > 0.0
 
 
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("name", TASKS)
 def test_gymnasium_has_nothing_to_say(environments, name, recwarn):
-    checked_by_gymnasium(environments(name), recwarn)
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_gymnasium_has_nothing_to_say_of_the_others(environments, name, recwarn):
-    checked_by_gymnasium(environments(name), recwarn)
+    """A `ResourceWarning` is of something that another test has left, which Python collects here."""
+    check_env(environments(name).unwrapped, skip_render_check=True, skip_close_check=True)
+    said = [str(one.message) for one in recwarn if not issubclass(one.category, ResourceWarning)]
+    assert not [sentence for sentence in said if "infinity" not in sentence]
 
 
 def test_the_same_seed_has_the_same_bits_and_another_one_others(environments):
@@ -121,7 +108,7 @@ def test_sensors_are_observed_as_a_simulation_reads_them():
             cortado.environments.make_vec("Raft", 2, sensors=bad)
 
 
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.parametrize("name", ["Carry", "Raft"])  # between them solids on a path, and one that floats
 def test_each_scene_of_a_batch_has_the_bits_of_a_single_one(environments, name):
     env, envs = environments(name), gymnasium.make_vec(f"cortado/{name}-v0", num_envs=2, precision="float64")
     actions = actions_of(env, 2)
@@ -136,8 +123,10 @@ def test_each_scene_of_a_batch_has_the_bits_of_a_single_one(environments, name):
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def differentiated_by_its_twin(env):
-    """The loss is minus the return, and the gradient that of differences."""
+@pytest.mark.parametrize("name", TASKS)
+def test_the_loss_of_the_twin_is_minus_the_return(environments, name):
+    """And its gradient that of differences."""
+    env = environments(name).unwrapped
     actions = actions_of(env, 2)
     _, rewards = episode(env, actions, 5)
     twin = env.twin(2)
@@ -148,16 +137,6 @@ def differentiated_by_its_twin(env):
     h = 1e-6
     difference = (twin.value(actions + h * direction) - twin.value(actions - h * direction)) / (2.0 * h)
     assert gradient.any() and np.isclose(difference, (gradient * direction).sum(), rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", SOME)
-def test_the_loss_of_the_twin_is_minus_the_return(environments, name):
-    differentiated_by_its_twin(environments(name).unwrapped)
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_so_it_is_of_the_others(environments, name):
-    differentiated_by_its_twin(environments(name).unwrapped)
 
 
 ESTIMATORS = [cortado.gradients.AdjointViscosity(), cortado.gradients.EnsembleMean(samples=4, spread=0.01)]

@@ -203,8 +203,8 @@ def test_gradients_equal_those_of_the_twin(estimator, dimension):
 # ---- smoothing ------------------------------------------------------------------------------------------------------
 
 
-def random_bar(simulation, seed=2):
-    bar, random = simulation.solver.new_state(), np.random.default_rng(seed)
+def random_bar(simulation):
+    bar, random = simulation.solver.new_state(), np.random.default_rng(2)
     arrays = bar.numpy(simulation.dimension)
     values = {name: random.standard_normal(array.shape) + 1.0 for name, array in arrays.items()}
     bar.set(values)

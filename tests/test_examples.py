@@ -20,14 +20,13 @@ import cortado.cli.commands.optimise
 import cortado.cli.commands.run
 import cortado.cli.commands.sweep
 from compiling_notice import without_compiling
+from cortado import CortadoWarning, load_scene
 from cortado.cli import main
 from cortado.cli.commands.new import new_scene, templates
-from cortado.errors import CortadoWarning
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_picture
 from cortado.rollout.run_checks import unstable_sentence
 from cortado.scene.parameter_values import Tilt
-from cortado.scene.scene import load_scene
 
 FOLDER = Path(__file__).parents[1] / "examples"
 MISTAKES = {

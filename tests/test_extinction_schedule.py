@@ -8,9 +8,8 @@ import pytest
 
 import cortado.render.scene_renderer
 from bad_tasks import GOOD_TASK, PLANE_PICTURE, TINY_LATTE
-from cortado import optimise
+from cortado import SceneError, optimise
 from cortado.cli import main
-from cortado.errors import SceneError
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.task import load_task, setup
 from cortado.optimisation.optimisers import Adam
@@ -34,11 +33,6 @@ def images(made, values):
     return [loss.image(end) for loss, end in zip(losses, ends, strict=True)]
 
 
-def covering(image, background, colour):
-    """(rows, columns) share of the background that is hidden."""
-    return ((image - background) / (np.array(colour) - background))[..., 0]
-
-
 @pytest.mark.parametrize("fineness", [0.5, 0.25])
 def test_a_layer_is_as_opaque_as_its_spacing_is_thick(file, monkeypatch, fineness):
     """How fine the nodes are does not change how opaque the plane is; factors of the extinction do."""
@@ -46,7 +40,8 @@ def test_a_layer_is_as_opaque_as_its_spacing_is_thick(file, monkeypatch, finenes
     task = load_task(file, [STAGED, "render.extinction=20.0", "problem.distance=squared_difference"])
     made = setup(task, "cpu", "float64")
     x = made.problem.simulation.positions
-    thin, full = (covering(image, [0.3, 0.2, 0.1], [0.9, 0.8, 0.7]) for image in images(made, {"initial_positions": x}))
+    behind, fluid = np.array([0.3, 0.2, 0.1]), np.array([0.9, 0.8, 0.7])
+    thin, full = (((one - behind) / (fluid - behind))[..., 0] for one in images(made, {"initial_positions": x}))
     middle = (slice(10, 13), slice(4, 7))  # of the fluid, whose coverage there is 1 within 5 %
     np.testing.assert_allclose(-np.log(1.0 - full[middle]), 20.0 * 0.05, rtol=0.05)
     np.testing.assert_allclose(-np.log(1.0 - thin[middle]), 0.25 * 20.0 * 0.05, rtol=0.05)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cortado.errors import ComputationError, InputError
+from cortado import ComputationError, InputError, Trajectory
 from cortado.files.image_encoding import BITS, moving_picture, to_srgb, write_video, writing
 from cortado.pictures import plots
 from cortado.pictures.image_files import COFFEE, MILK, heart
 from cortado.pictures.run_pictures import density_errors
-from cortado.runs.trajectory import Trajectory
 from full_disk import largest_file
 
 

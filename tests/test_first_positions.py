@@ -45,21 +45,31 @@ def test_two_particles_at_one_place_are_refused(make, apart):
     problem.value({"initial_positions": problem.simulation.positions})
 
 
-def test_two_particles_at_one_place_across_a_period_are_refused():
-    problem, x = problem_of(plane(container=PERIODIC))
-    x = x.copy()
-    x[9] = x[2] + [2.0 * 0.4, 0.0]
-    with pytest.raises(InputError, match="particles 2 and 9 at one place"):
-        problem.value({"initial_positions": x})
+def once_round(x):
+    return np.where(np.arange(len(x))[:, None] == 9, x[2] + [2.0 * 0.4, 0.0], x)
 
 
-@pytest.mark.parametrize("make", [plane, scene])
-def test_a_lattice_that_would_burst_is_refused(make):
-    problem, x = problem_of(make())
-    with pytest.raises(
-        InputError, match=r"^Particles at initial_positions have 1\.\d+ times the rest density .* compressed"
-    ):
-        problem.value({"initial_positions": squeezed(x, 0.9)})
+def burst(x):
+    return squeezed(x, 0.9)
+
+
+BURST = "Particles at initial_positions have "
+
+
+@pytest.mark.parametrize(
+    ("made", "options", "moved", "words"),
+    [
+        (plane(container=PERIODIC), {}, once_round, "particles 2 and 9 at one place"),
+        (plane(), {}, burst, rf"^{BURST}1\.\d+ times the rest density .* compressed"),
+        (scene(), {}, burst, rf"^{BURST}1\.\d+ times the rest density .* compressed"),
+        (plane(), {"batch": 3}, lambda x: np.stack([x, burst(x), x]), f"^In scene 1 of the batch, {BURST}"),
+    ],
+    ids=["across a period", "in the plane", "in space", "one of a batch"],
+)
+def test_positions_that_cannot_be_are_refused(made, options, moved, words):
+    problem, x = problem_of(made, **options)
+    with pytest.raises(InputError, match=words):
+        problem.value({"initial_positions": moved(x)})
 
 
 def test_a_lattice_that_is_squeezed_a_little_is_warned_of_once():
@@ -89,12 +99,6 @@ def test_positions_that_move_little_by_little_are_judged_where_they_come_to():
     with pytest.raises(InputError, match="compressed"):
         for factor in np.arange(0.96, 0.85, -0.004):
             problem.value({"initial_positions": squeezed(x, factor)})
-
-
-def test_each_scene_of_a_batch_is_judged():
-    problem, x = problem_of(plane(), batch=3)
-    with pytest.raises(InputError, match=r"^In scene 1 of the batch, Particles at initial_positions have"):
-        problem.value({"initial_positions": np.stack([x, squeezed(x, 0.9), x])})
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])

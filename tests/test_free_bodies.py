@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from cortado import InputError, Problem, Scene, SceneError, Simulation
+from cortado import InputError, Problem, SceneError, Simulation, Trajectory
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.gradients import ImplicitPressure, Tape
 from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.solid_motion import posed
-from cortado.runs.trajectory import Trajectory
 from cortado.scene.solids import AnySolid
 from cortado.solvers.contact_kernels import STIFFNESS
 from finite_differences import central_difference
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
-from scenes import thrown
+from scenes import pool, thrown
 
 RAFT = {
     "name": "raft",
@@ -41,19 +40,7 @@ FAR_AWAY = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.2, 0.1], "phase": "
 
 
 def plane(*solids, **tables):
-    fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "water"}
-    return Scene(
-        **{
-            "dimension": 2,
-            "discretisation": {"spacing": 0.05},
-            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
-            "fluid": [fluid],
-            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
-            "solver": {"kind": "projection", "time_step": 0.001},
-            "solid": list(solids),
-            **tables,
-        }
-    )
+    return pool([0.6, 0.4], [1.0, 1.0], viscosity=1.0, solid=list(solids), **tables)
 
 
 def space(*solids, **tables):

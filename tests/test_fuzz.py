@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortado.errors import InputError
+from cortado import InputError, Trajectory
 from cortado.optimisation.inverse.task import load_task
-from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import scene_from_dict
 from fuzz import answers, bases, judge, oddities
 from fuzz.campaign import Campaign

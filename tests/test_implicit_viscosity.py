@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import CortadoError, Problem, Simulation, gradients, losses
+from cortado import CortadoError, CortadoWarning, Problem, Simulation, gradients, losses
 from cortado.cli import main
-from cortado.errors import CortadoWarning
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.sph.implicit_viscosity import ImplicitViscousStress
 from scenes import HONEY, plane, scene

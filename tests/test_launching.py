@@ -6,13 +6,12 @@ import pickle
 import pytest
 import warp as wp
 
-from cortado import Problem, Simulation, losses
+from cortado import InputError, Problem, Simulation, losses
 from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.launching import Bundles, KernelLauncher, bound, launch, launch_together, watched
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
-from cortado.errors import InputError
 from cortado.gradients.adjoint_filters import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import fill_kernel

@@ -113,18 +113,6 @@ def test_gradient_equals_warps_tape(name):
         assert np.linalg.norm(gradient[key] - taped[key]) <= 1e-9 * np.linalg.norm(gradient[key]), key
 
 
-@scenes
-def test_same_bits_twice_and_under_a_memory_budget(name):
-    problem, point, _, (loss, gradient) = case(name)
-    state_bytes = sum(array.capacity for array in problem.simulation.initial.arrays())
-    frugal = Problem(problem.simulation, problem.steps, problem.loss, memory_budget=12 * state_bytes)
-    for other in (Problem(problem.simulation, problem.steps, problem.loss), frugal):
-        found, bits = other.value_and_gradient(point)
-        assert found == loss
-        assert all(bits[key].tobytes() == gradient[key].tobytes() for key in SIZES)
-    assert len(frugal._rollout._checkpoints) < 16
-
-
 def test_float32_is_near_float64():
     wide, narrow = (simulation_of("two layers", precision) for precision in ("float64", "float32"))
     (loss, exact), (found, gradient) = (
@@ -275,16 +263,15 @@ def no_functions(precision, phases):
     raise ValueError("not today")
 
 
-def functions_of_three(precision, phases):
-    return quartic_functions(precision, 3)
-
-
 @pytest.mark.parametrize(
     ("functions", "said"),
     [
         (lambda precision, phases: 3, "quartic's functions must return an object .* but its gradient is None"),
         (no_functions, r"FreeEnergy quartic's functions fail: ValueError: not today\.$"),
-        (functions_of_three, "quartic's functions cannot be compiled: .* and return a vector of 2 fractions"),
+        (
+            lambda precision, phases: quartic_functions(precision, 3),
+            "quartic's functions cannot be compiled: .* and return a vector of 2 fractions",
+        ),
     ],
 )
 def test_functions_that_are_none_of_a_free_energy_are_refused(functions, said):

@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
+from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, Trajectory, certify
 from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.pictures.run_pictures import run_page
-from cortado.runs.trajectory import Trajectory
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.fields import rotation_matrix
 from cortado.scene.motions import greatest_speed
 from cortado.scene.scene_warnings import standing_sentences
 from cortado.scene.stability import stability_limits
 from finite_differences import both_modes, central_difference
-from scenes import box, jet
+from scenes import box, jet, pool
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
 ROTOR = box([0.2, 0.15], [0.4, 0.25], name="rotor", motion="path", angular_velocity=6.0, velocity=[0.2, 0.1], slip="no")
@@ -38,19 +37,8 @@ CONVERGED = {"kind": "projection", "time_step": 0.001, "iterations": 8}
 
 
 def plane(*solids, **tables):
-    fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "water"}
-    return Scene(
-        **{
-            "dimension": 2,
-            "discretisation": {"spacing": 0.05},
-            "phase": [WATER],
-            "fluid": [fluid],
-            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "slip": "no"},
-            "solver": {"kind": "projection", "time_step": 0.001},
-            "solid": list(solids),
-            **tables,
-        }
-    )
+    own = {"phase": [WATER], "container": box([0.0, 0.0], [1.0, 1.0], slip="no"), "solid": list(solids)}
+    return pool([0.6, 0.4], [1.0, 1.0], **{**own, **tables})
 
 
 def space(**tables):
@@ -422,14 +410,7 @@ def test_a_solid_that_no_run_moved_is_a_sentence():
 )
 def test_a_solid_that_moves_along_a_wall_and_ends_on_it_is_told(lower, motion, told):
     piston = {"name": "piston", "shape": "box", "lower": [0.2, lower], "upper": [0.4, 0.5 - lower], "motion": "path"}
-    scene = Scene(
-        dimension=2,
-        discretisation={"spacing": 0.05},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "box", "lower": [0.4, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
-        solid=[{**piston, **motion}],
-        solver={"kind": "projection", "time_step": 0.002},
-    )
+    beside, solver = box([0.4, 0.0], [1.0, 0.4], phase="water"), {"kind": "projection", "time_step": 0.002}
+    scene = pool([1.0, 0.4], [1.0, 1.0], fluid=[beside], solid=[{**piston, **motion}], solver=solver)
     found = list(standing_sentences(scene))
     assert len(found) == len(told) and all(place in sentence for place, sentence in zip(told, found, strict=True))

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
+from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, Simulation
 from cortado.gradients import EnsembleMean, Estimate
 from cortado.losses import FinalPositions
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import BY_NAME, LBFGS, Adam, GradientDescent, LineSearch
-from cortado.problem import Problem
 from cortado.runs.run_folder import REPLAY_LOG
-from cortado.simulation import Simulation
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 from scenes import plane
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.bench.scene import dam_break
-from cortado import DivergedError, Problem, Scene, Simulation, losses
+from cortado import CortadoWarning, DivergedError, Problem, Scene, Simulation, losses
 from cortado.device import launching
-from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash
 
 FREE = {"container": {"shape": "none"}}

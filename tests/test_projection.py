@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
+from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation, gradients, losses
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.errors import SceneError
 from cortado.rollout.outcome import divergence_sentence
 from cortado.solvers.projection.coarse_levels import Levels
 from finite_differences import both_modes, central_difference

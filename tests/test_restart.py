@@ -12,7 +12,7 @@ from bad_scenes import assert_one_sentence
 from cortado import InputError, Scene, Simulation, Trajectory, load_scene
 from cortado.runs.frames import Marks
 from cortado.scene.restart import Clock
-from scenes import jet, plane, plane_of_three, pour, two_layers
+from scenes import jet, plane, plane_of_three, pool_text, pour, two_layers
 
 FIRST, REST = 17, 24
 MAKERS = {"plane": plane, "two layers": two_layers, "plane of three": plane_of_three, "jet": jet, "pour": pour}
@@ -193,19 +193,14 @@ def test_a_run_with_a_rest_density_goes_on_with_it_and_not_without(make):
     refused(simulation, simulation.run(5).last_state, controls)
 
 
-def test_fractions_of_2_are_no_reference_densities():
+def test_particles_of_a_state_that_cannot_be_are_refused():
     simulation = Simulation(plane())
-    state = simulation.run(2).last_state
+    state, other = (simulation.run(2).last_state for _ in range(2))
     state["mass_fractions"][5] = 2.0
     found = refused(simulation, state)
     assert found == "state mass_fractions of particle 5 are 2, but must be from 0 to 1 and add up to 1."
-
-
-def test_two_particles_of_a_state_at_one_place_are_refused():
-    simulation = Simulation(plane())
-    state = simulation.run(2).last_state
-    state["positions"][7] = state["positions"][3]
-    assert "particles 3 and 7 at one place" in refused(simulation, state)
+    other["positions"][7] = other["positions"][3]
+    assert "particles 3 and 7 at one place" in refused(simulation, other)
 
 
 @pytest.mark.parametrize(
@@ -264,35 +259,10 @@ def test_a_file_without_an_origin_can_still_be_read(tmp_path):
     assert first.origin.spacing == plane().discretisation.spacing
 
 
-SCENE = """
-name = "gauged dam"
-dimension = 2
-[discretisation]
-spacing = 0.1
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 0.05
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.5, 0.8]
-phase = "water"
-[container]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [1.2, 1.0]
-[[sensor]]
-name = "gauge"
-kind = "wave_gauge"
-position = [0.25, 0.0]
-[solver]
-kind = "projection"
-time_step = 0.004
-[schedule.gravity]
-times = [0.0, 0.2]
-values = [[0.0, -9.81], [3.0, -9.81]]
-"""
+SOLVER = 'kind = "projection"\ntime_step = 0.004'
+SCENE = f"""sensor = [{{ name = "gauge", kind = "wave_gauge", position = [0.25, 0.0] }}]
+schedule.gravity = {{ times = [0.0, 0.2], values = [[0.0, -9.81], [3.0, -9.81]] }}
+{pool_text([0.5, 0.8], [1.2, 1.0], SOLVER, spacing=0.1, viscosity=0.05)}"""
 
 
 @pytest.fixture(autouse=True)

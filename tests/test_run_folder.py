@@ -15,9 +15,8 @@ import pytest
 import cortado.runs.run_folder
 from bad_scenes import plane
 from bad_tasks import TINY_SCENE
-from cortado import Scene
+from cortado import InputError, Scene
 from cortado.cli import main
-from cortado.errors import InputError
 from cortado.files.output_files import unfinished
 from cortado.files.terminal import track
 from cortado.pictures.particle_view import Cloud, particle_view, thinned

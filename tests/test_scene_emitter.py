@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from bad_scenes import plane
-from cortado import Problem, Simulation, losses
+from cortado import CortadoWarning, Problem, Scene, SceneError, Simulation, losses
 from cortado.discretise.shapes import across, disc
-from cortado.errors import CortadoWarning, SceneError
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fluid_particles import fluid_particles
-from cortado.scene.scene import Scene
 from scenes import stability_limit
 
 SPACING = 0.05

@@ -7,11 +7,10 @@ import time
 import numpy as np
 import pytest
 
-from bad_scenes import GOOD_SCENE, assert_one_sentence, plane
-from cortado.errors import InputError, SceneError
+from bad_scenes import GOOD_SCENE, assert_one_sentence, one_sentence, plane
+from cortado import InputError, Scene, SceneError, load_scene
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.scene.point_files import read_points
-from cortado.scene.scene import Scene, load_scene
 from cortado.scene.toml import MOST_BYTES, read_toml
 
 
@@ -62,18 +61,16 @@ def test_positions_are_read_from_vtk(tmp_path, suffix):
 def test_bad_positions_are_a_sentence(tmp_path, array, trouble):
     np.save(tmp_path / "bad.npy", array)
     fluid = {"shape": "points", "file": str(tmp_path / "bad.npy"), "phase": "water"}
-    with pytest.raises(SceneError, match=trouble) as caught:
+    with one_sentence(trouble, error=SceneError):
         Scene(**plane(fluid=[fluid]))
-    assert_one_sentence(str(caught.value))
 
 
 @pytest.mark.parametrize("name", ["bad.npy", "bad.vtk", "bad.vtp", "bad.vtkhdf"])
 def test_files_of_rubbish_are_a_sentence(tmp_path, name, capfd):
     (tmp_path / name).write_bytes(b"rubbish\n\x00\xff")
     fluid = {"shape": "points", "file": str(tmp_path / name), "phase": "water"}
-    with pytest.raises(SceneError, match="cannot be used") as caught:
+    with one_sentence("cannot be used", error=SceneError):
         Scene(**plane(fluid=[fluid]))
-    assert_one_sentence(str(caught.value))
     assert capfd.readouterr().err == ""
 
 
@@ -111,9 +108,8 @@ def header(shape: str, kind: str = "'<f8'") -> str:
 @pytest.mark.filterwarnings("error")
 def test_an_array_whose_header_lies_is_a_sentence(tmp_path, content, words):
     (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(InputError, match=words) as caught:
+    with one_sentence(words):
         read_points(str(tmp_path / "a.npy"), 2)
-    assert_one_sentence(str(caught.value))
 
 
 def test_arrays_by_columns_and_of_other_types_are_read(tmp_path):
@@ -141,9 +137,8 @@ def test_what_ends_vtk_is_a_sentence(tmp_path, name, content, capfd):
     """Some of these take the process with them that reads them."""
     pytest.importorskip("vtkmodules")
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match="holds no points that") as caught:
+    with one_sentence("holds no points that"):
         read_points(str(tmp_path / name), 3)
-    assert_one_sentence(str(caught.value))
     assert capfd.readouterr().err == ""
 
 
@@ -252,9 +247,8 @@ def test_dots_elsewhere_are_no_parts(tmp_path, text):
 )
 def test_hostile_overrides_are_sentences(tmp_path, override, words):
     (tmp_path / "scene.toml").write_text("[[fluid]]")
-    with pytest.raises(SceneError, match=words) as caught:
+    with one_sentence(words, error=SceneError):
         read_toml(tmp_path / "scene.toml", [override])
-    assert_one_sentence(str(caught.value))
 
 
 def test_an_entry_is_called_by_its_name(tmp_path):

@@ -16,11 +16,10 @@ import cortado
 import experiments.registry  # noqa: F401  so that the tables of all experiments are there
 from bad_scenes import GOOD_SCENE, MIXTURE, RENDER
 from bad_scenes import plane as plane_tables
+from cortado import InputError, Problem, SceneError, Simulation
 from cortado.device.precision import FLOAT64
-from cortado.errors import InputError, SceneError
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.particles.state import to_device
-from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
 from cortado.scene.appearance import Render
@@ -28,7 +27,6 @@ from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.model import MixtureTable
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.tables import Table
-from cortado.simulation import Simulation
 from scenes import plane, plane_of_three, scene
 
 

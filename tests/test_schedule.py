@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import cortado
-from bad_scenes import assert_one_sentence
+from bad_scenes import one_sentence
 from bad_tasks import TINY_SCENE
-from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
-from cortado.certificate import certify
+from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, certify, losses, reference
 from cortado.cli.commands.run_report import Energy, RunSummary
 from cortado.scene.motions import Course
 from cortado.scene.parameter_values import Tilt
@@ -77,9 +76,8 @@ def test_a_course_is_linear_between_its_times_and_constant_beyond():
     ],
 )
 def test_what_is_wrong_is_a_sentence(schedule, words):
-    with pytest.raises(SceneError) as error:
+    with one_sentence(error=SceneError) as error:
         plane(schedule=schedule)
-    assert_one_sentence(str(error.value))
     assert words in str(error.value)
 
 

@@ -21,7 +21,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
 from finite_differences import both_modes, distance
-from scenes import box, jet, plane, scene
+from scenes import box, jet, plane, pool, scene
 
 IN_THE_PLANE = {
     "probe": PressureProbe([0.21, 0.13], 0.12),
@@ -556,18 +556,9 @@ def within_plates(dimension, gap):
     plates = {"left": ([0.2, 0.1], [0.25, 0.4]), "right": ([0.45, 0.1], [0.5, 0.35 - gap])}
     plates |= {"floor": ([0.2, 0.1], [0.5, 0.15]), "roof": ([0.2, 0.35], [0.5, 0.4])}
     deep = [0.2] * (dimension - 2)
-    return cortado.Scene(
-        dimension=dimension,
-        discretisation={"spacing": 0.05},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.01}],
-        fluid=[{"shape": "box", "lower": [0.0] * dimension, "upper": [0.2, 0.2, *deep], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0] * dimension, "upper": [0.7, 0.6, *deep]},
-        solid=[
-            {"name": name, "shape": "box", "lower": [*lower, *(0.0 for _ in deep)], "upper": [*upper, *deep]}
-            for name, (lower, upper) in plates.items()
-        ],
-        solver={"kind": "pcisph", "time_step": 0.002},
-    )
+    solid = [box([*lower, *(0.0 for _ in deep)], [*upper, *deep], name=name) for name, (lower, upper) in plates.items()]
+    solver = {"kind": "pcisph", "time_step": 0.002}
+    return pool([0.2, 0.2, *deep], [0.7, 0.6, *deep], viscosity=0.01, solid=solid, solver=solver)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -174,11 +174,11 @@ def test_warp_forms_against_the_formulae(name, dimension, precision):
     np.testing.assert_allclose(hu, expected, atol=20 * accuracy * size / SUPPORT**2)
 
 
-def away_from_joints(name, x, margin=0.02):
+def away_from_joints(name, x):
     """Without separations near a joint of pieces, where W'' or W''' jumps."""
     q = np.linalg.norm(x, axis=1) / SUPPORT
     joints = np.array([0.0] + [upper for _, upper, _ in PIECES[name]])
-    return (np.abs(q[:, None] - joints) > margin).all(axis=1)
+    return (np.abs(q[:, None] - joints) > 0.02).all(axis=1)
 
 
 @kernels

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from cortado import Problem, Scene, SceneError, Simulation
+from cortado import InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.solid import Mass
-from cortado.errors import InputError
 from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
 from test_free_bodies import RAFT

@@ -351,9 +351,9 @@ def test_edges_are_found_where_a_solid_is_sharp():
     assert (found >= wanted - 1e-12).all() and np.mean(found < wanted + 1e-12) > 0.8
 
 
-def images_of(points, table, spacing=0.05, **changes):
+def images_of(points, table, **changes):
     scene = scene_of(len(points[0]), {**table, **changes}, container={"shape": "none"})
-    return mirrored(np.asarray(points, dtype=float), shown_solids(scene), 0.9 * spacing, spacing)
+    return mirrored(np.asarray(points, dtype=float), shown_solids(scene), 0.9 * 0.05, 0.05)
 
 
 def test_fluid_is_mirrored_behind_sides_and_corners():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, SceneError, Simulation
+from cortado import CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
 from cortado.discretise.calibration import rest_volume
 from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
@@ -20,6 +20,7 @@ from cortado.scene.solids import (
 )
 from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
+from scenes import pool
 
 SOLIDS = {
     "rectangle": BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3),
@@ -104,20 +105,9 @@ def test_distances_and_nearest_points_are_those_of_the_faces(name):
 
 
 def scene(solids, dimension=2, kind="projection", spacing=0.05, **tables):
-    corner = [1.0, 1.0, 0.5][:dimension]
-    fluid = {"shape": "box", "lower": [0.0] * dimension, "upper": [0.4, 0.6, 0.5][:dimension], "phase": "water"}
-    return Scene(
-        **{
-            "dimension": dimension,
-            "discretisation": {"spacing": spacing},
-            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-            "fluid": [fluid],
-            "container": {"shape": "box", "lower": [0.0] * dimension, "upper": corner},
-            "solver": {"kind": kind, "time_step": 0.001},
-            "solid": [{"name": f"solid {k}", **table} for k, table in enumerate(solids)],
-            **tables,
-        }
-    )
+    solid = [{"name": f"solid {k}", **table} for k, table in enumerate(solids)]
+    own = {"solver": {"kind": kind, "time_step": 0.001}, "solid": solid}
+    return pool([0.4, 0.6, 0.5][:dimension], [1.0, 1.0, 0.5][:dimension], spacing, **{**own, **tables})
 
 
 PILLAR = {"shape": "box", "lower": [0.55, 0.0], "upper": [0.65, 0.3]}

@@ -5,8 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from cortado import Problem, SceneError, Simulation, gradients, losses
-from cortado.errors import InputError
+from cortado import InputError, Problem, SceneError, Simulation, gradients, losses
 from cortado.reference import Terms
 from experiments.comparison import compare, growth
 from experiments.scenes import varied

@@ -125,17 +125,13 @@ def test_a_cube_rounds_to_a_sphere(dimension, across, periods):
 @pytest.mark.parametrize(
     ("dimension", "across", "error"), [(2, 16, 0.2), (2, 24, 0.1), (2, 32, 0.1), (3, 10, 0.2), (3, 14, 0.1)]
 )
-def test_the_pressure_jump_of_a_drop(dimension, across, error):
+def test_the_pressure_jump_and_the_frequency_of_a_drop(dimension, across, error):
     """(d - 1) sigma / R by the solver's own pressure, in drops that have oscillated; the mean of drops, as how the
     particles of a surface lie changes it from drop to drop: single ones are between 0.94 and 1.29 of it."""
     kicks = (0.1, 0.15, 0.2) if dimension == 2 else (0.1, 0.2)
-    assert abs(np.mean([kicked(dimension, across, kick).settled_pressure() for kick in kicks]) - 1.0) < error
-
-
-@pytest.mark.parametrize(("dimension", "across"), [(2, 16), (2, 32), (3, 10), (3, 14)])
-def test_the_frequency_of_a_drop(dimension, across):
-    kicks = (0.1, 0.15, 0.2) if dimension == 2 else (0.1, 0.2)
-    assert abs(np.mean([kicked(dimension, across, kick).frequency() for kick in kicks]) - 1.0) < 0.1
+    drops = [kicked(dimension, across, kick) for kick in kicks]
+    assert abs(np.mean([one.settled_pressure() for one in drops]) - 1.0) < error
+    assert abs(np.mean([one.frequency() for one in drops]) - 1.0) < 0.1
 
 
 @pytest.mark.parametrize(("dimension", "across"), [(2, 32), (3, 14)])
@@ -146,12 +142,9 @@ def test_energy_does_not_grow(dimension, across):
     assert energy[-1] < energy[0]
 
 
-def test_a_fluid_with_hardly_any_viscosity_is_warned_of():
+def test_hardly_any_viscosity_and_a_narrow_support_are_warned_of():
     with pytest.warns(CortadoWarning, match="viscosity of phase 'water' is 0.0187083 Pa s"):
         Simulation(drop(2, 16, ohnesorge=0.01))
-
-
-def test_a_narrow_support_is_warned_of():
     with pytest.warns(CortadoWarning, match="support is 1.5"):
         Simulation(drop(2, 16, discretisation={"spacing": RADIUS / 8, "support": 1.5}))
 

@@ -16,7 +16,7 @@ from cortado.scene.restart import Clock
 from cortado.scene.solids import PolygonSolid
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.sensors import PressureProbe
-from scenes import jet, plane, two_layers
+from scenes import jet, plane, pool, pool_text, two_layers
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 STEPS = 24
@@ -258,17 +258,12 @@ def test_the_gradient_is_the_limit_of_differences_with_the_steps_held(scheduled)
             middle = np.array([time + 0.5 * size])
             course = {"gravity": chosen.scene.schedule.gravity.at(middle)[0]} if scheduled else {}
             state = fixed.step(state, {**moved, **course, "time_step": size})
-        return Spread().value(replace_fields(state))
+        return Spread().value(SimpleNamespace(**{name: state[name] for name in ("positions", "velocities")}))
 
     assert held(0.0) == loss
     reverse = sum(float((gradient[name] * along[name]).sum()) for name in along)
     assert abs((held(1e-6) - held(-1e-6)) / 2e-6 - reverse) < 1e-6 * abs(reverse)
     assert abs(problem.tangent(values, along) - reverse) < 1e-10 * abs(reverse)
-
-
-def replace_fields(state):
-    """A state as a loss sees it."""
-    return type("End", (), {"positions": state["positions"], "velocities": state["velocities"]})
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -408,27 +403,7 @@ def test_a_run_of_so_many_seconds():
     assert len(fixed.run(time=0.01, controls={"time_step": 0.002})) == 6
 
 
-SCENE = """
-name = "drop"
-dimension = 2
-[discretisation]
-spacing = 0.05
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 0.05
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.1]
-upper = [0.3, 0.4]
-phase = "water"
-[container]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.6, 0.6]
-[solver]
-time_step = "auto"
-"""
+SCENE = pool_text([0.3, 0.4], [0.6, 0.6], 'time_step = "auto"', viscosity=0.05, lower=[0.0, 0.1])
 
 
 @pytest.fixture
@@ -536,15 +511,8 @@ def test_a_time_that_is_none_is_refused(run_command, tmp_path, words, what):
 
 def wedge(gap, **solver):
     """A column in the plane that collapses and flows under a disc, so far above the floor [m]."""
-    return cortado.Scene(
-        dimension=2,
-        discretisation={"spacing": 0.03},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.6], "phase": "water"}],
-        solid=[{"name": "disc", "shape": "sphere", "centre": [0.75, 0.14 + gap], "radius": 0.14}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.1, 1.0]},
-        solver={"kind": "projection", **CHOSEN, **solver},
-    )
+    disc = {"name": "disc", "shape": "sphere", "centre": [0.75, 0.14 + gap], "radius": 0.14}
+    return pool([0.4, 0.6], [1.1, 1.0], 0.03, solid=[disc], solver={"kind": "projection", **CHOSEN, **solver})
 
 
 def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
@@ -605,16 +573,7 @@ def lowered(gap, kind="projection", **changes):
     """A plate that is lowered to so many spacings above the floor, in water."""
     path = {"motion": "path", "times": [0.0, 0.2, 0.3], "positions": [[0.3, 0.2], [0.3, 0.03 + gap * 0.03], [0.3, 0.2]]}
     plate = {"name": "plate", "shape": "box", "lower": [0.15, 0.17], "upper": [0.45, 0.23], **path}
-    return cortado.Scene(
-        dimension=2,
-        discretisation={"spacing": 0.03},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.12], "phase": "water"}],
-        solid=[plate],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.6]},
-        solver={"kind": kind, **CHOSEN},
-        **changes,
-    )
+    return pool([0.6, 0.12], [0.6, 0.6], 0.03, solid=[plate], solver={"kind": kind, **CHOSEN}, **changes)
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.3, 0.5])
@@ -715,8 +674,8 @@ def test_each_solid_bounds_the_step_by_its_own_thickness_and_its_own_foot():
     assert limits == pytest.approx([*steps, min(steps), np.inf])
 
 
-def funnel(thickness, kind, share=1.0):
-    """Two slanted sides, three spacings apart below, that water runs through; a share of the greatest step."""
+def funnel(thickness, kind):
+    """Two slanted sides, three spacings apart below, that water runs through, with the greatest step."""
     low, high = np.array([0.03, 0.0]), np.array([0.4, 0.5])
     along = (high - low) / np.linalg.norm(high - low)
     out = thickness * np.array([along[1], -along[0]])
@@ -732,7 +691,7 @@ def funnel(thickness, kind, share=1.0):
         ],
         solver={"kind": kind, "time_step": 1e-4},
     )
-    size = share * min(stability_limits(scene).values())
+    size = min(stability_limits(scene).values())
     return scene.replaced(f"solver.time_step={size}"), low, along, out / thickness
 
 

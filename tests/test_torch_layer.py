@@ -393,7 +393,8 @@ def test_other_bad_uses_are_refused_in_a_sentence(layer, simulation, problem):
     state = layer.state(simulation)
     other = layer.state(Simulation(plane(discretisation={"spacing": 0.04}), precision="float64"))
     space = layer.state(Simulation(scene(), precision="float64"))
-    viscosity = wanted_of(10.0)
+    viscosity, flat = wanted_of(10.0), Simulation(plane(), precision="float64")
+    picture, first = partial(layer.picture, flat.renderer(resolution=(9, 8))), layer.state(flat)["positions"]
     for use, words in [
         (lambda: layer.step(simulation, other), "state positions has shape"),
         (lambda: layer.step(simulation, space), "state positions has shape"),
@@ -406,7 +407,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(layer, simulation, problem):
         (lambda: layer.Steps(simulation, trained={"viscosity": "thick"}), "parameter viscosity is 'thick', but must"),
         (lambda: second(layer, problem, viscosity), "first ones only: leave out create_graph=True"),
         (lambda: torch.func.hessian(lambda m: layer.value(problem)({"viscosity": m}))(tensor(1.0)), "first ones only"),
-        (lambda: drawn_forward(layer), "reverse mode only"),
+        (lambda: torch.func.jvp(picture, (first,), (first,)), "reverse mode only"),
     ]:
         assert_refused(words, use)
     with pytest.raises(DivergedError, match="The simulation diverged in step 1"):
@@ -417,12 +418,6 @@ def second(layer, problem, viscosity):
     loss = layer.value(problem)({"viscosity": viscosity})
     (gradient,) = torch.autograd.grad(loss, viscosity, create_graph=True)
     gradient.backward()
-
-
-def drawn_forward(layer):
-    simulation = Simulation(plane(), precision="float64")
-    positions = layer.state(simulation)["positions"]
-    torch.func.jvp(partial(layer.picture, simulation.renderer(resolution=(9, 8))), (positions,), (positions,))
 
 
 def test_a_float32_simulation_takes_float32(layer):

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 import cortado.files.vtkhdf
-from cortado.errors import ComputationError, InputError
+from cortado import ComputationError, InputError, Trajectory
 from cortado.files.vtkhdf import TrajectoryWriter, read
-from cortado.runs.trajectory import Trajectory
 from full_disk import largest_file
 
 WRITER = """

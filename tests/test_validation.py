@@ -63,8 +63,6 @@ def column_at_rest(
     kernel: str = "wendland_c4",
     support: float = 3.0,
     tolerance: float = 0.001,
-    settling: float = 2.0,
-    precision: str = "float32",
 ) -> Rest:
     """p = rho g (H - y) in a box 0.8 H wide, H = 1 m, ``across`` particles high; 5 Pa s let it settle."""
     width, spacing = 0.8, 1.0 / across
@@ -84,9 +82,9 @@ def column_at_rest(
                 "density_tolerance": tolerance,
             },
         ),
-        precision=precision,
+        precision="float32",
     )
-    first, count = round(settling / time_step), round(0.5 / time_step)
+    first, count = round(2.0 / time_step), round(0.5 / time_step)
     pressures, positions = np.zeros(simulation.particles), np.zeros((simulation.particles, 2))
 
     def observe(step: int, state: Any) -> None:
@@ -265,16 +263,16 @@ class Channel:
         return -2.0 * a * KINEMATIC / PUSH, float(np.sqrt(b * b - 4.0 * a * c) / -a - CHANNEL)
 
 
-def poiseuille(times: np.ndarray, across: int, kernel: str = "cubic_spline", support: float = 2.0) -> Channel:
+def poiseuille(times: np.ndarray, across: int) -> Channel:
     """Water that starts from rest between plates without slip, pushed along; periodic along the plates."""
     spacing = CHANNEL / across
-    length = (2 * int(support) + 4) * spacing
+    length = 8 * spacing
     interval = 0.0225
     time_step = interval / np.ceil(interval / (0.12 * spacing**2 / KINEMATIC))
     simulation = Simulation(
         Scene(
             dimension=2,
-            discretisation={"spacing": spacing, "support": support, "kernel": kernel},
+            discretisation={"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
             phase=[{**WATER, "viscosity": 1000.0 * KINEMATIC}],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [length, CHANNEL], "phase": "water"}],
             container=box([0.0, 0.0], [length, CHANNEL], periodic=[True, False], slip="no"),
@@ -396,15 +394,12 @@ def taylor_green_error(times: np.ndarray, energies: np.ndarray, reynolds: float 
 
 def carried_densities(
     times: np.ndarray,
-    across: int = 20,
     reynolds: float = 10.0,
     room: float = 0.01,
-    kernel: str = "cubic_spline",
-    support: float = 2.0,
 ) -> np.ndarray:
     """Mean densities, in the rest density, of the lattice of `taylor_green` if the exact flow carries it along."""
-    spacing, smoothing = (1.0 - room) / across, smoothing_kernel(kernel)
-    radius = support * spacing
+    spacing, smoothing = (1.0 - room) / 20, smoothing_kernel("cubic_spline")
+    radius = 2.0 * spacing
     volume = rest_volume(smoothing, spacing, radius, 2)
 
     def motion(time: float, points: np.ndarray) -> np.ndarray:
@@ -415,7 +410,7 @@ def carried_densities(
         distances = np.linalg.norm(separations - np.rint(separations), axis=-1)
         return volume * float(smoothing.weight(distances, 2, radius).sum(axis=1).mean())
 
-    paths = solve_ivp(motion, (0.0, times[-1]), square_lattice(across).ravel(), t_eval=times, rtol=1e-8, atol=1e-10)
+    paths = solve_ivp(motion, (0.0, times[-1]), square_lattice(20).ravel(), t_eval=times, rtol=1e-8, atol=1e-10)
     return np.array([mean_density(points.reshape(-1, 2)) for points in paths.y.T])
 
 

@@ -43,12 +43,6 @@ def resting(
     return Simulation(scene, device=device, precision="float64")
 
 
-def longest_substep(simulation: Simulation) -> float:
-    """About the longest time step that the engine takes in one substep."""
-    long = 20.0
-    return long / simulation.run(1, {"time_step": long}).substeps
-
-
 def run(simulation: Simulation, first: np.ndarray, until: float, steps: int = 1, **controls: Any) -> Trajectory:
     """From mass fractions ``first`` (n, phases), or those of the first of two phases (n,), in so many equal steps."""
     if first.ndim == 1:
@@ -221,7 +215,7 @@ def test_the_free_energy_never_rises_and_phases_keep_their_mass(form):
     simulation = resting(24, 24, 0.65, 3.0, densities, mobility_form=form)
     positions = simulation.positions + np.random.default_rng(1).uniform(-0.2, 0.2, simulation.positions.shape)
     first, steps = noise(simulation, 0.2, seed=2), 1000
-    until = steps * longest_substep(simulation)
+    until = steps * (20.0 / simulation.run(1, {"time_step": 20.0}).substeps)  # about the longest substep
     trajectory = run(simulation, first, until, steps, initial_positions=positions)
     assert trajectory.substeps == 1
     np.testing.assert_array_equal(trajectory.positions[-1], positions)
@@ -269,14 +263,13 @@ def coarsening(
     until: float,
     seed: int,
     steps: int,
-    width: float = 0.65,
     advance: Callable[[], None] | None = None,
     device: str = "cpu",
 ) -> Coarsening:
     """From noise of 5 % in a square, until so many epsilon^2."""
-    simulation = resting(across, across, width, 3.0, device=device, mobility_form=form)
+    simulation = resting(across, across, 0.65, 3.0, device=device, mobility_form=form)
     energy = Energy(simulation, simulation.positions, np.ones(simulation.particles))
-    fractions = watched(simulation, noise(simulation, 0.05, seed), until * width**2, steps, advance)
+    fractions = watched(simulation, noise(simulation, 0.05, seed), until * 0.65**2, steps, advance)
     times, energies = np.arange(steps + 1) * until / steps, np.array([energy(c) for c in fractions])
     return Coarsening(times, energies, fractions[:, :, 0])
 

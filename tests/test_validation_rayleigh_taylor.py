@@ -274,13 +274,13 @@ def shear_response(kernel: str, support: float, strain: float = 0.05) -> tuple[f
     return tuple(2.0 * (density(way) / at_rest - 1.0) / strain**2 for way in (stretch, shear))
 
 
-def lattice_correction(kernel: str, support: float, depth: float, waves: int = 1) -> float:
+def lattice_correction(kernel: str, support: float, depth: float) -> float:
     """By which part the lattice's modulus lowers the square of the inviscid rate, to first order, in deep layers.
 
     The mode strains by 2 k a exp(-k abs(y)), as a stretch and as a shear: its elastic energy under the pressure of a
     layer of heavy fluid is compared with what gravity gives, (HEAVY - LIGHT) g a^2 / 4.
     """
-    k, ratio = 2.0 * np.pi * waves, HEAVY / (HEAVY - LIGHT)
+    k, ratio = 2.0 * np.pi, HEAVY / (HEAVY - LIGHT)
     return 4.0 * sum(shear_response(kernel, support)) * (k * depth * ratio - 0.25)
 
 

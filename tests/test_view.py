@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
+from cortado import Scene, Trajectory
 from cortado.cli import main
 from cortado.cli.viewer import window as view_window
 from cortado.cli.viewer.views import LiveView, RecordedView, TaskView, opened
@@ -16,8 +17,6 @@ from cortado.cli.viewer.window import AHEAD, LONGEST_ARROW, PULL, upwards
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
 from cortado.pictures.shown_solids import solid_outline
-from cortado.runs.trajectory import Trajectory
-from cortado.scene.scene import Scene
 from remembering_force import Memory, U
 
 viser = pytest.importorskip("viser")

@@ -244,15 +244,15 @@ def tape_gradient(program: Program) -> np.ndarray:
     return np.stack([x.grad.numpy(), t.grad.numpy()])
 
 
-def difference_gradient(program: Program, h: float = 1e-5) -> np.ndarray:
+def difference_gradient(program: Program) -> np.ndarray:
     start, gradient = np.stack(values()), np.zeros((2, N))
     for index in np.ndindex(2, N):
         ends = []
         for sign in (1, -1):
             moved = start.copy()
-            moved[index] += sign * h
+            moved[index] += sign * 1e-5
             ends.append(program(array(moved[0]), array(moved[1])).numpy() @ LOSS_WEIGHTS)
-        gradient[index] = (ends[0] - ends[1]) / (2 * h)
+        gradient[index] = (ends[0] - ends[1]) / (2 * 1e-5)
     return gradient
 
 

@@ -15,7 +15,7 @@ from cortado.runs.sensor import value_of
 from cortado.scene.discrete_scene import Lattice
 from cortado.sensors import WaveGauge
 from finite_differences import both_modes, distance
-from scenes import plane
+from scenes import plane, pool
 
 LEVEL = 0.5
 
@@ -32,15 +32,8 @@ class Basin:
     @cached_property
     def scene(self):
         d = self.dimension
-        return cortado.Scene(
-            dimension=d,
-            discretisation={"spacing": self.spacing},
-            phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.1}],
-            fluid=[{"shape": "box", "lower": [0.0] * d, "upper": [2.0, LEVEL, 2.0][:d], "phase": "water"}],
-            container={"shape": "box", "lower": [0.0] * d, "upper": [2.0, 1.2, 2.0][:d]},
-            solid=[{"name": f"solid {k}", **each} for k, each in enumerate(self.solid)],
-            solver={"kind": "projection", "time_step": 0.001},
-        )
+        solid = [{"name": f"solid {k}", **each} for k, each in enumerate(self.solid)]
+        return pool([2.0, LEVEL, 2.0][:d], [2.0, 1.2, 2.0][:d], self.spacing, 0.1, solid=solid)
 
     @cached_property
     def lattice(self):

@@ -70,10 +70,10 @@ def sensitivities(deep: int, law: dict[str, float]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def found_law(deep: int, target: np.ndarray, start: dict[str, float], iterations: int = 7) -> dict[str, float]:
+def found_law(deep: int, target: np.ndarray, start: dict[str, float]) -> dict[str, float]:
     """By Gauss and Newton from films so many particles deep; derivatives are taken in the first and the third step."""
     law = dict(start)
-    for k in range(iterations):
+    for k in range(7):
         if k in (0, 2):
             slopes = sensitivities(deep, law)
         change = np.linalg.lstsq(slopes, np.log(target / observed(deep, law)), rcond=None)[0]
