@@ -29,7 +29,7 @@ Advance = Callable[[], None]
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
-    """A glTF file for each frame, with all of it by name, y up as glTF wants it, and linear colours; returns the
+    """Write a glTF file for each frame, with all of it by name, y up as glTF wants it, and linear colours; return the
     folder."""
     import trimesh
 
@@ -48,8 +48,7 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _write_series(run: Exported, folder: Path, advance: Advance, ending: str) -> Path:
-    """The files of each frame, which trimesh writes; colours are those of sRGB, which programs expect there. Returns
-    the folder."""
+    """Write the files of each frame by trimesh, with sRGB colours as programs expect, and return the folder."""
     for number, frame in enumerate(run.frames(run.series)):
         for name, what in _files(run, number, frame, ending).values():
             if not (folder / name).exists():
@@ -59,8 +58,8 @@ def _write_series(run: Exported, folder: Path, advance: Advance, ending: str) ->
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """The files of each frame, which VTK writes, with all fields of the particles; returns ``run.pvd``, which has them
-    all at their times."""
+    """Write the files of each frame by VTK, with all fields of the particles; return ``run.pvd``, which has them all at
+    their times."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         for part, (of, (name, what)) in enumerate(_files(run, number, frame, "vtp").items()):
@@ -77,8 +76,8 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
 def _files(
     run: Exported, number: int, frame: ExportedFrame, ending: str
 ) -> dict[str, tuple[str, ExportedFrame | Mesh]]:
-    """The name and the contents of each file of a frame, by the part of the frame that is in it: the particles, the
-    surface, and each solid. A solid at rest has one file for all frames."""
+    """Return name and contents of each file of a frame, by its part of the frame: the particles, the surface, and each
+    solid. A solid at rest has one file for all frames."""
     found: dict[str, ExportedFrame | Mesh] = {"particles": frame}
     if frame.surface is not None:
         found["surface"] = frame.surface
@@ -91,12 +90,12 @@ def _files(
 
 
 def _numbered(name: str, number: int, ending: str) -> str:
-    """The name of the file of a frame."""
+    """Return the file name of a frame's number."""
     return f"{name}_{number:05d}.{ending}"
 
 
 def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
-    """A mesh, or the particles of a frame, as trimesh has them, with opaque colours."""
+    """Return a mesh, or the particles of a frame, as an object of trimesh with opaque colours."""
     import trimesh
 
     own = np.pad(colours(np.clip(what.colours, 0.0, 1.0)), ((0, 0), (0, 1)), constant_values=255)
@@ -106,18 +105,19 @@ def _trimesh(what: Mesh | ExportedFrame, colours: Callable[[Any], Any]) -> Any:
 
 
 def _srgb(colours: Any) -> Any:
-    """(p, 3) bytes of sRGB, of linear colours (p, 3) from 0 to 1."""
+    """Return linear colours (p, 3) from 0 to 1 as sRGB bytes (p, 3)."""
     return to_srgb(colours[None])[0]
 
 
 def _linear(colours: Any) -> Any:
-    """(p, 3) bytes that are proportional to linear colours (p, 3) from 0 to 1."""
+    """Return linear colours (p, 3) from 0 to 1 as proportional bytes (p, 3)."""
     return np.rint(255.0 * colours).astype(np.uint8)
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
-    """``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a
-    transform ``/run/solid_NAME`` with a mesh; returns its path.
+    """Write ``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a transform
+    ``/run/solid_NAME`` with a mesh; return its path. Frame k is at time code k, and the file has the number of time
+    codes in a second: `WholeFrames` says which states these are. Lengths are metres, colours linear.
 
     Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
     these are. Lengths are metres, colours linear.
@@ -145,7 +145,7 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 class _Writer:
-    """Adds frames to a stage."""
+    """A writer that adds frames to the stage of a USD file."""
 
     def __init__(self, pxr: Any, stage: Any, run: Exported, frames: int, rate: float):
         self._pxr, self._run, geometry = pxr, run, pxr.UsdGeom
@@ -172,7 +172,7 @@ class _Writer:
             self._set_mesh(mesh, solid.mesh, pxr.Usd.TimeCode.Default())
 
     def add(self, code: float, frame: ExportedFrame) -> None:
-        """Write a frame at a time code."""
+        """Write a frame to the USD stage at a time code."""
         if self._surface is not None:
             empty = np.zeros((0, 3))
             surface = frame.surface or Mesh(empty, empty, empty, empty, empty)
@@ -221,7 +221,7 @@ class _Writer:
         orient.Set(gf.Quatd(float(turn[3]), gf.Vec3d(*turn[:3])), code)
 
     def _floats(self, values: np.ndarray) -> Any:
-        """(n,) or (n, k) as an array of USD, in float32."""
+        """Return numbers (n,) or (n, k) as a USD array in float32."""
         vt, own = self._pxr.Vt, np.ascontiguousarray(values, dtype=np.float32)
         kind = vt.FloatArray if own.ndim == 1 else {2: vt.Vec2fArray, 3: vt.Vec3fArray}[own.shape[1]]
         return kind.FromNumpy(own)
@@ -242,8 +242,8 @@ def _pxr() -> Any:
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
-    """The text of a VTP file, with the numbers in base64: a vertex for each particle of a frame, with its velocity
-    [m/s] and all fields; or the triangles of a mesh, with normals, and of a surface with velocities [m/s]."""
+    """Return the text of a VTP file, with numbers in base64. It has a vertex for each particle of a frame, with its
+    velocity [m/s] and all fields, or a mesh's triangles with normals, and a surface's velocities [m/s]."""
     colours = {"colour": _srgb(np.clip(what.colours, 0.0, 1.0))}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
@@ -262,7 +262,7 @@ def _vtp(what: ExportedFrame | Mesh) -> str:
 
 
 def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mapping[str, np.ndarray]) -> Any:
-    """VTK's data of points (p, 3) [m] and cells with k corners each, (c, k), with fields (p, ...) by name."""
+    """Make VTK's data of points (p, 3) [m] and cells with k corners each, (c, k), with fields (p, ...) by name."""
     vtk = _vtk()
     data, places, topology = vtk.vtkPolyData(), vtk.vtkPoints(), vtk.vtkCellArray()
     places.SetData(_array("points", points))
@@ -277,7 +277,7 @@ def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mappi
 
 
 def _array(name: str, values: np.ndarray) -> Any:
-    """As an array of VTK, in float32 unless it is made of bytes."""
+    """Make a named VTK array, in float32 unless the values are bytes."""
     kept = values if values.dtype == np.uint8 else np.asarray(values, dtype=np.float32)
     found = _vtk().numpy_to_vtk(np.ascontiguousarray(kept), deep=True)
     found.SetName(name)
@@ -286,7 +286,7 @@ def _array(name: str, values: np.ndarray) -> Any:
 
 @cache
 def _vtk() -> Any:
-    """What is used of VTK, of which the whole takes seconds to import."""
+    """Import the used parts of VTK, which takes seconds to import as a whole."""
     try:
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
         from vtkmodules.util import numpy_support
@@ -312,7 +312,8 @@ def export(
     scene: Scene | str | PathLike[str],
     simulation: Callable[[], Simulation] | None = None,
 ) -> Path:
-    """See `Trajectory.export`, and `Exported`; returns the file to open, or the folder of a series."""
+    """Export a trajectory for another program, see `Trajectory.export`; return the file to open, or a series'
+    folder."""
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
     if not len(trajectory):
@@ -346,7 +347,7 @@ Variables = dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]
 
 
 def labelled(trajectory: Trajectory) -> Any:
-    """See `Trajectory.to_xarray`."""
+    """Return a trajectory as a dataset of xarray, see `Trajectory.to_xarray`."""
     try:
         import xarray
     except ImportError as error:
@@ -380,7 +381,7 @@ def labelled(trajectory: Trajectory) -> Any:
 
 
 def _of_solids(solids: Mapping[str, SolidMotion], turned: tuple[str, ...]) -> Variables:
-    """Of solids that move, one behind the other; velocities of those that are told where to go are no numbers."""
+    """Return xarray variables of moving solids, one behind the other; given paths have no velocities."""
 
     def stacked(each: list[Any], alike: list[Any]) -> Any:
         rows = [np.full_like(as_, np.nan) if one is None else one for one, as_ in zip(each, alike, strict=True)]

@@ -39,34 +39,34 @@ EVEN = 1e-6
 DIGITS = (0, 1, 2, 3)
 """Places behind the point that a number of frames in a second may have where recorded frames are not evenly spaced."""
 UNLIKE = 0.05
-"""Of the volume of the fluid: by how much that of a surface differs before it is said."""
+"""Relative difference of a surface's volume from the fluid's above which a message tells it."""
 ROUND = 0.05
-"""How wide faces of round solids are, in sizes of the solid."""
+"""Width of faces of round solids, in sizes of the solid."""
 LINKED = 1.25
 """In spacings: particles that are nearer to each other are of one body."""
 NEAR_SURFACE = 2.0
 """In spacings: particles that link to no surface are of the body of the nearest one, unless it is farther away."""
 MOST_SHIFT = 1.0
-"""In spacings, by which points are moved at most in a pass."""
+"""Greatest move of a point in a pass, in spacings."""
 PASSES = 2
-"""Of moving points out, some beyond a wall, and back to it."""
+"""Number of passes that move points out, some beyond a wall, and back to it."""
 ROUNDS = 20
-"""Of Newton's method, each by a fifth of a spacing at most."""
+"""Most rounds of Newton's method, each by a fifth of a spacing at most."""
 IN_PLACE = 1e-6
 """In spacings: points that a turn into the axes of the container and back moves by less are where they were."""
 
 
 @dataclass(frozen=True)
 class WholeFrames:
-    """Frame k of an animation is at the time start + k / rate; each is a recorded state, moved to that time."""
+    """Evenly spaced frames of an animation: frame k, at the time start + k / rate, is a recorded state moved there."""
 
     rate: float
     """[1/s] frames in a second"""
     times: NDArray[np.float64]
     """(frames,) [s]"""
     recorded: NDArray[np.intp]
-    """(frames,) the number of the recorded state that it is made of: the nearest in time, or of a run with marks the
-    first one from then on, as a step back along velocities is the way between the states of a step"""
+    """(frames,) the number of the recorded state that a frame is made of: the nearest in time, or of a run with marks
+    the first from then on. A step back along velocities is the way between the states of a step"""
     shifts: NDArray[np.float64]
     """(frames,) [s] from the time of that state to that of the frame; 0 where recorded states are evenly spaced"""
     left_out: float
@@ -74,8 +74,8 @@ class WholeFrames:
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """The frames for states recorded at ``times`` (m,) [s]: at the ``marks`` for which they were. Without marks,
-        evenly spaced states are the frames; of others the rate is a round number near that of the states."""
+        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, if they have some. Without
+        marks, evenly spaced states are the frames; of others the rate is a round number near that of the states."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -97,7 +97,7 @@ class WholeFrames:
 
     @property
     def in_words(self) -> str:
-        """How the frames differ from recorded states; empty where they do not."""
+        """Say how the frames differ from recorded states; empty where they do not."""
         found = []
         if self.shifts.any():
             most = 1e3 * float(np.abs(self.shifts).max())
@@ -108,8 +108,8 @@ class WholeFrames:
 
 
 def _round_rate(times: NDArray[np.float64]) -> float:
-    """[1/s] the roundest number of frames in a second of which each is the nearest to one of the states, recorded at
-    ``times`` (m,) [s] from 0 on, the last apart; the mean number where there is none."""
+    """Return the roundest frame rate [1/s] of which each frame is nearest to one of the states, recorded at ``times``
+    (m,) [s] from 0 on, the last apart; the mean rate where there is none."""
     usual = times[:-1]
     mean = (len(usual) - 1) / float(usual[-1])
     for digits in DIGITS:
@@ -121,7 +121,7 @@ def _round_rate(times: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in space, outside on the side from which their corners run counterclockwise."""
+    """A mesh of triangles in space; outside is the side from which corners run counterclockwise."""
 
     points: Points
     """(p, 3) [m]"""
@@ -135,7 +135,7 @@ class Mesh:
     """(p, 3) [m/s]; None of a solid, whose motion its poses tell."""
 
     def moved(self, pose: "Pose") -> "Mesh":
-        """In a pose."""
+        """Return the mesh turned and moved to a pose."""
         return Mesh(self.points @ pose.turn.T + pose.position, self.triangles, self.normals @ pose.turn.T, self.colours)
 
 
@@ -150,17 +150,17 @@ class Pose:
 
     @property
     def matrix(self) -> Points:
-        """(4, 4) for columns: turned, then moved."""
+        """Return the pose as a matrix (4, 4) for columns: turned, then moved."""
         return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 @dataclass(frozen=True)
 class ExportedSolid:
-    """One solid, at rest or in motion."""
+    """One exported solid, at rest or in motion, with its mesh."""
 
     name: str
     part: str
-    """What files and their parts call it: "solid_" and its name, of letters, digits and underscores alone."""
+    """Name in files and their parts: "solid_" and the solid's name, of letters, digits and underscores alone."""
     mesh: Mesh
     """About its middle, not turned."""
     moves: bool
@@ -168,7 +168,7 @@ class ExportedSolid:
 
 @dataclass(frozen=True)
 class ExportedFrame:
-    """One frame, in three dimensions: z is 0 in the plane."""
+    """One exported frame of a run, in three dimensions: z is 0 in the plane."""
 
     time: float
     """[s]"""
@@ -181,14 +181,14 @@ class ExportedFrame:
     fields: Mapping[str, np.ndarray]
     """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
     surface: Mesh | None
-    """Of the fluid; None in the plane, and where the particles are too far from each other to have one."""
+    """Surface of the fluid; None in the plane, and where the particles are too far from each other to have one."""
     poses: Mapping[str, Pose]
-    """Of all solids, by their names."""
+    """Poses of all solids, by their names."""
 
 
 class Exported:
-    """A run and its scene as other programs are given it; ``simulation`` computes what ``picture.colour`` names and was
-    not recorded. Raises `InputError` where nothing does."""
+    """A run and its scene in the form that exporters write; ``simulation`` computes a ``picture.colour`` that was not
+    recorded. Raises `InputError` where nothing does."""
 
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Callable[[], Simulation] | None = None):
         self.times, self.scene = trajectory.times, scene
@@ -202,31 +202,31 @@ class Exported:
         """Of the frame where they differ most: its time [s], what the surface encloses, and the fluid's volume [m³]."""
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.times)
 
     @cached_property
     def whole(self) -> WholeFrames:
-        """Those of an animation."""
+        """Return the evenly spaced frames of an animation."""
         return WholeFrames.of(self.times, self._trajectory.marks)
 
     @property
     def series(self) -> WholeFrames | None:
-        """Those of a series of files: at the marks of a run that has some, and else all recorded states, None."""
+        """Return the frames of a series of files: at the marks of a run that has some, else None for all states."""
         return None if self._trajectory.marks is None else self.whole
 
     @property
     def spacing(self) -> float:
-        """[m]"""
+        """Return the spacing of particles [m]."""
         return self.scene.discretisation.spacing
 
     @property
     def up(self) -> Points:
-        """(3, 3) the rotation that makes y the axis against gravity; in the plane there is nothing to turn."""
+        """Return the rotation (3, 3) that makes y the axis against gravity; in the plane there is nothing to turn."""
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """All recorded states, or whole frames, one after the other, as surfaces take memory."""
+        """Yield all recorded states, or whole frames, one after the other, as surfaces take memory."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -235,14 +235,14 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """How far surfaces of frames that were made are from the volume of the fluid; empty where they are near."""
+        """Say how far surfaces of frames that were made are from the volume of the fluid; empty where they are near."""
         if _unlike(self._held) <= UNLIKE:
             return ""
         time, held, whole = self._held
         return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
-        """A state near one that was recorded, with the solids where they are in a frame of their motion."""
+        """Make a frame of a state near a recorded one, with the solids where they are in a frame of their motion."""
         shown = those(is_out(self.scene, frame.others.get("emitted"), len(frame.positions)))
         within = self.scene.container.domain(self.scene.dimension).wrapped(frame.positions[shown])
         positions, velocities = in_space(within), in_space(frame.velocities[shown])
@@ -262,7 +262,7 @@ class Exported:
 
     @cached_property
     def _stage(self) -> Stage:
-        """Of a run in 3-D: whether its fluid ends at the walls of its container."""
+        """Return the stage of a run in 3-D, which tells whether its fluid ends at the walls of its container."""
         return Stage.of(self.scene, shown_places(self.scene, self._trajectory))
 
     def _surface(self, positions: Points, velocities: Points, colours: Points) -> Mesh | None:
@@ -278,22 +278,22 @@ class Exported:
 
 
 def _unlike(held: tuple[float, float, float]) -> float:
-    """By which part of the fluid's volume that of a surface is off, of a frame's time and both."""
+    """Return the relative difference between a surface's volume and the fluid's, given a frame's time and both."""
     return abs(held[1] / held[2] - 1.0)
 
 
 def in_space(vectors: Points) -> Points:
-    """Vectors (n, d) as (n, 3) in float64, with a 0 behind those of the plane."""
+    """Return vectors (n, d) as (n, 3) in float64, with a 0 behind those of the plane."""
     return np.pad(np.asarray(vectors, dtype=np.float64), ((0, 0), (0, 3 - vectors.shape[1])))
 
 
 def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
-    """The solids by name, without their images a period away, which come behind."""
+    """Return the solids by name, without their images a period away, which come behind."""
     return {one.name: one for one in reversed(shown_solids(scene))}
 
 
 def _part_names(solids: Iterable[str]) -> dict[str, str]:
-    """What files call solids, by their names: no two alike."""
+    """Return the names that files have for solids, by the solids' names: no two alike."""
     found: dict[str, str] = {}
     for number, name in enumerate(solids):
         plain = f"solid_{re.sub(r'[^A-Za-z0-9_]', '_', name)}"
@@ -315,7 +315,7 @@ def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
 
 
 def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, np.ndarray, Points]:
-    """Points, triangles and normals of an outline in the plane, a tenth of its size wide across the plane."""
+    """Make points, triangles and normals of an outline in the plane, a tenth of its size wide across the plane."""
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
     outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
@@ -327,7 +327,7 @@ def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, n
 
 
 def enclosed(points: Points, triangles: np.ndarray) -> float:
-    """The volume [m³] within triangles (t, 3) of points (p, 3) [m]."""
+    """Return the volume [m³] within triangles (t, 3) of points (p, 3) [m]."""
     a, b, c = (points[corner] - points[0] for corner in triangles.T)
     return float(_sixth(a, b, c).sum())
 
@@ -340,9 +340,9 @@ def with_volume(
     spacing: float,
     kept: Callable[[Points], Points],
 ) -> Points:
-    """The points (p, 3) [m] of a surface with triangles (t, 3), moved along ``ways`` (p, 3), unit vectors outwards or 0
-    where points stay, until each body of fluid has ``spacing``³ for each of its particles at ``places`` (n, 3) [m].
-    ``kept``: brings points back to a wall that were moved beyond it."""
+    """Move the points (p, 3) [m] of a surface with triangles (t, 3) along ``ways`` (p, 3), unit vectors outwards or 0.
+    Each body of fluid gets ``spacing``³ for each of its particles at ``places`` (n, 3) [m]. ``kept`` brings points back
+    to a wall that were moved beyond it."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -358,7 +358,8 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of the bodies of fluid that points (p,) and particles (n,) belong to; -1 of particles without one."""
+    """Number the bodies of fluid; return the numbers for points (p,) and particles (n,), -1 for particles without
+    one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -384,8 +385,8 @@ def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: floa
 def _volumes(
     points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """The function that gives the volumes (bodies,) [m³] and their slopes [m²] where points of bodies (p,) are moved
-    along their ways by distances (bodies,) [m]: a volume is a cubic polynomial of its distance."""
+    """Make the function that returns the volumes (bodies,) [m³] and their slopes [m²] for points of bodies (p,) moved
+    along their ways by distances (bodies,) [m]. A volume is a cubic polynomial of its distance."""
     (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
     own = bodies[triangles[:, 0]]
     terms = (
@@ -399,14 +400,14 @@ def _volumes(
 
 
 def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
-    """(t,) a sixth of the determinants of vectors (t, 3)."""
+    """Return a sixth (t,) of the determinants of vectors (t, 3)."""
     return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
 
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Surface:
-    """The surface of what particles at positions (n, 3) [m] with colours (n, 3) fill, see `liquid_surface`, in the axes
-    of the scene. Where fluid touches walls it is extended behind them, and its points there are then moved to the wall.
-    The others are moved until the surface encloses the volume of the particles; see `with_volume`.
+    """Make the surface of the fluid of particles at positions (n, 3) [m] with colours (n, 3), see `liquid_surface`, in
+    the axes of the scene. Where fluid touches walls it is extended behind them, and its points there are then moved to
+    the wall. The others are moved until the surface encloses the volume of the particles; see `with_volume`.
 
     Raises:
         ComputationError: there is no surface.
@@ -429,8 +430,8 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
 
 
 def _in_room(stage: Stage, points: Points) -> Points:
-    """(p, 3) the points of the container, where it cuts fluid, that are nearest to points (p, 3) [m], in the frame of
-    the picture."""
+    """Return the points (p, 3) of the container, where it cuts fluid, nearest to points (p, 3) [m], in the frame of the
+    picture."""
     if not stage.cuts:
         return points
     lower, upper = stage.room

@@ -49,45 +49,45 @@ Panel = Callable[[int, Around], Points]
 
 
 MOST_PICTURES = 9
-"""Pictures; in more of them one sees nothing."""
+"""Most pictures side by side; in more of them one sees nothing."""
 LEAST_PIXELS = 64
-"""Pixels of each picture, along either side."""
+"""Fewest pixels of each picture, along either side."""
 AIR = 1.25
-"""How much higher a picture is, at least, than what it shows would be if it were as wide as the picture."""
+"""Least height of a picture over the height of its contents at the picture's width."""
 SLOW = 0.1
 """Seconds of the run in a second of a film below which fluid at rest is not averaged: it swims slowly enough to be
 seen."""
 TELLING_FRAMES = 100
-"""Frames that tell where solids come to."""
+"""Number of frames that tell where solids come to."""
 
 
 def alone(images: list[Points]) -> Points:
-    """The one picture that there is."""
+    """Return the only picture of a list."""
     (image,) = images
     return image
 
 
 @dataclass(frozen=True)
 class Page:
-    """What is seen at each frame: the picture of one panel, or those of several put together."""
+    """The contents of each frame of a film: the picture of one panel, or those of several put together."""
 
     panels: Sequence[Panel]
     composed: Callable[[list[Points]], Points] = alone
-    """From the pictures of the panels to the page."""
+    """Puts the pictures of the panels together to the page."""
     fingerprint: str = ""
-    """A checksum of all that its pictures are made of; nothing where that is not known."""
+    """A checksum of all that its pictures are made of; empty where that is not known."""
     notes: str = ""
-    """What somebody who sees it should know, in a sentence; nothing if there is nothing to say."""
+    """A sentence for those who see it; empty if there is nothing to say."""
 
     def image(self, frame: int) -> Points:
-        """(rows, columns, 3), linear from 0 to 1."""
+        """Return the picture (rows, columns, 3) of a frame, linear from 0 to 1."""
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(
         self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0, window: int = WINDOW
     ) -> Iterator[Points]:
-        """Those of a film of so many frames in their order, from one of them on, each given so many before and after
-        it; ``ahead``: from the pictures that they are made of to the same."""
+        """Yield the pictures of a film's frames in their order, from one of them on, each given ``window`` frames
+        before and after it; ``ahead`` may draw panels' pictures before they are needed."""
         shown = range(begin, len(frames))
         drawn = ahead(panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels)
         return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)
@@ -98,14 +98,14 @@ def _around(frames: Sequence[int], n: int, window: int) -> Around:
 
 
 class FilmedRun:
-    """A `Panel`: pictures of the states of one run, of which fluid at rest does not flicker in 3-D."""
+    """A `Panel` that draws the states of one run, in which fluid at rest does not flicker in 3-D."""
 
     def __init__(self, artist: PlanePainter | SpacePainter, state: Callable[[int], State]):
-        """``state``: that of a frame, by its number."""
+        """Take a painter, and a function from the number of a frame to its ``state``."""
         self._artist, self._state, self._stills = artist, state, dict[int, Any]()
 
     def __call__(self, frame: int, around: Around) -> Points:
-        """The picture of a frame."""
+        """Return the picture of a frame."""
         artist, state = self._artist, self._state(frame)
         if not any(around) or isinstance(artist, PlanePainter):
             return artist.image(*state)
@@ -119,9 +119,9 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Stages of one dimension, each in its part of a page as wide as the first one's picture but for some ``spare``
-    columns and no higher, all in the same scale, seen by a camera that sees all that any of them shows; and how many go
-    into a row. Raises `InputError` where parts are too small."""
+    """Frame stages of one dimension in parts of a page as wide as the first one's picture but for some ``spare``
+    columns and no higher, in one scale. Each camera sees all that any of them shows; the number in a row is returned
+    too. Raises `InputError` where parts are too small."""
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -138,8 +138,8 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """How many of ``count`` pictures go into a row of a page, so that something as wide and high as ``size`` (2,) is
-    large in them, and few places are empty."""
+    """Return how many of ``count`` pictures go into a row of a page, for contents as wide and high as ``size`` (2,) to
+    be large, and few places empty."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -150,7 +150,7 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
 
 
 def lacking(scene: Scene) -> str | None:
-    """A sentence about the package that shaded pictures of a scene need and that is not there; None where nothing is
+    """Return a sentence about the missing package that shaded pictures of a scene need; None where nothing is
     missing."""
     picture = scene.picture or Picture()
     needed = {"av": "PyAV"} if picture.film_frames != 0 else {}
@@ -162,8 +162,8 @@ def lacking(scene: Scene) -> str | None:
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film of those of the frames that a pace chooses. Where it is interrupted, what is drawn is kept, and the
-    next call of the same film goes on after it."""
+    """Write a film of the frames that a pace chooses. Where it is interrupted, what is drawn is kept, and the next call
+    of the same film goes on after it."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -178,7 +178,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
-    """The same images, of which so many are drawn while those before are used."""
+    """Yield images in order, of which ``count`` are drawn while those before are used."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
         coming = deque(painter.submit(next, images, None) for _ in range(count))
@@ -196,16 +196,16 @@ def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
 
 @dataclass(frozen=True)
 class ShownRun:
-    """A run, and what its particles are coloured by."""
+    """A run with its scene and the values by which its particles are coloured, as pictures and films show it."""
 
     scene: Scene
     trajectory: Trajectory
     values: NDArray | None = None
-    """(frames, n) what a scale colours particles by; None for the colours of phases."""
+    """(frames, n) values by which a scale colours particles; None for the colours of phases."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
-        """What is around its fluid, with a camera that sees all of it in every frame."""
+        """Return the stage around its fluid, with a camera that sees all of it in every frame."""
         stride = max(len(self.trajectory) // TELLING_FRAMES, 1)
         poses = [self._pose(k) for k in range(0, len(self.trajectory), stride)] if self._motions else []
         return stage_of(
@@ -215,17 +215,17 @@ class ShownRun:
         )
 
     def panel(self, stage: PlaneStage | Stage, device: object, scale: Scale | None) -> Panel:
-        """Its pictures by the number of the frame, on a stage that is its own but for the camera."""
+        """Return the run's pictures by the number of the frame, on a stage that is its own but for the camera."""
         return FilmedRun(painter_on(stage, device), lambda k: self._state(k, stage, scale))
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """(frames,) [s] of the states that are shown; see `Trajectory.due`."""
+        """Return the times (frames,) [s] of the states that are shown; see `Trajectory.due`."""
         return self.trajectory.due
 
     @property
     def fingerprint(self) -> str:
-        """A checksum of what its pictures are made of."""
+        """Return a checksum of all that its pictures are made of."""
         trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
         for array in (trajectory.due, trajectory.positions[:1], trajectory.positions[-1:]):
             found.update(np.ascontiguousarray(array).tobytes())
@@ -249,7 +249,7 @@ class ShownRun:
 
     @cached_property
     def _out(self) -> list[NDArray[np.bool_]]:
-        """(frames, n) which particles have left the emitter."""
+        """Return masks (frames, n) of the particles that have left the emitter."""
         emitted = (frame.others.get("emitted") for frame in self.trajectory)
         return [is_out(self.scene, one, self.trajectory.particles) for one in emitted]
 
@@ -257,7 +257,7 @@ class ShownRun:
         return posed(self.scene, self._motions, k) if self._motions else None
 
     def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
-        """Where a camera is that moves."""
+        """Return the view of a moving camera in a frame; None for a camera at rest."""
         path = (self.scene.picture or Picture()).camera_path
         if path is None or isinstance(stage, PlaneStage):
             return None
@@ -273,9 +273,9 @@ class ShownRun:
 
 
 def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.bool_]:
-    """(n,) whether each of the particles of a scene has left the emitter, of which so much came out: `Frame.others`
-    has ``emitted`` (1,) [m]; all have where there is none. Where there is no other fluid, the layer that comes first is
-    out from the start."""
+    """Return a mask (n,) of the particles that have left the emitter, given the length ``emitted`` (1,) [m] of
+    `Frame.others`; all of them without an emitter. Where there is no other fluid, the layer that comes first is out
+    from the start."""
     found = np.ones(particles, dtype=bool)
     if scene.emitter is not None and emitted is not None:
         upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
@@ -285,7 +285,7 @@ def is_out(scene: Scene, emitted: NDArray | None, particles: int) -> NDArray[np.
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """(frames, n, d) [m] where particles are that are shown; those that wait in an emitter count at its opening."""
+    """Return places (frames, n, d) [m] of particles in pictures; those that wait in an emitter are at its opening."""
     out = np.array([is_out(scene, frame.others.get("emitted"), trajectory.particles) for frame in trajectory])
     return (
         trajectory.positions
@@ -295,13 +295,13 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """What takes from arrays (n, ...) the particles that are out (n,): all of them without a copy, where all are."""
+    """Return an index that takes the particles that are out (n,) from arrays (n, ...); without a copy where all are."""
     return slice(None) if out.all() else out
 
 
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """(frames, n) [s] how long particles are out of the emitter, between frames as if its speed were even; of others
-    the time since the run began, and 0 of what still waits."""
+    """Return the times (frames, n) [s] since particles left the emitter, between frames as if its speed were even; of
+    others the time since the run began, and 0 of those that wait."""
     since = np.tile(trajectory.times[0], trajectory.particles).astype(np.float64)
     if scene.emitter is not None and "emitted" in trajectory.others:
         upstream = scene.emitter.sample(scene.discretisation.spacing).upstream
@@ -313,8 +313,8 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 def coloured_by(
     scene: Scene, trajectory: Trajectory, simulation: Callable[[], Simulation] | None = None
 ) -> NDArray | None:
-    """(frames, n) what the pictures of a scene colour particles by: recorded, computed from what was recorded, or else
-    by a simulation of it. None where they have the colours of phases.
+    """Return the values (frames, n) by which pictures of a scene colour particles: recorded, computed from records, or
+    else by a simulation. None for the colours of phases.
 
     Raises:
         InputError: it was not recorded and cannot be computed.
@@ -336,8 +336,8 @@ def coloured_by(
 
 
 def vorticity(scene: Scene, positions: NDArray, velocities: NDArray) -> NDArray:
-    """(n,) in the plane and (n, 3) in space [1/s]: V / mu sum_j (v_i - v_j) x grad W_ij (Monaghan 1992) of particles of
-    a scene at positions (n, d) [m] with velocities (n, d) [m/s].
+    """Return the vorticity, (n,) in the plane and (n, 3) in space [1/s]: V / mu sum_j (v_i - v_j) x grad W_ij (Monaghan
+    1992) of particles of a scene at positions (n, d) [m] with velocities (n, d) [m/s].
 
     It is `Simulation.quantity("vorticity")` without the division by the sum of W, which is 1 at the rest density.
     """
@@ -361,5 +361,5 @@ def vorticity(scene: Scene, positions: NDArray, velocities: NDArray) -> NDArray:
 
 
 def _summed(of: NDArray, terms: NDArray, count: int) -> NDArray:
-    """(count, k) terms (m, k) added up by the number of the particle that each is of, (m,)."""
+    """Add up terms (m, k) by the number of the particle of each, (m,), to sums (count, k)."""
     return np.stack([np.bincount(of, terms[:, k], minlength=count) for k in range(terms.shape[1])], axis=1)

@@ -32,20 +32,20 @@ MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
 DRAWN = 100.0
-"""Bytes for each pixel of a picture that is drawn, about."""
+"""About how many bytes a drawn picture takes for each pixel."""
 SAMPLES = 6
 """Points along either side of a pixel that tell how much of it a shape covers."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
-"""Of the files that are read."""
+"""Formats of the files that are read."""
 MOST_BYTES = 2**28
-"""Of a file."""
+"""Most bytes of a picture's file."""
 MOST_PIXELS = 2**26
-"""Of a picture that is resampled."""
+"""Most pixels of a picture that is resampled."""
 MOST_PIXELS_KEPT = 2**24
-"""Of one that is not."""
+"""Most pixels of a picture that is not resampled."""
 PIXELS_AT_ONCE = 2**20
 ROUNDING = 0.01
-"""Of a picture: where more of it is left out than by rounding its sides, a warning says so."""
+"""Part of a picture: where more is left out than by rounding its sides, a warning says so."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
 """Linear light of every value in a file."""
 
@@ -60,7 +60,7 @@ def heart(
     coffee: Colour = COFFEE,
     background: Colour = WHITE,
 ) -> Picture:
-    """A heart, its tip down.
+    """Draw a heart, its tip down.
 
     Args:
         resolution: columns and rows of pixels, or one number for both.
@@ -82,7 +82,7 @@ def rosetta(
     coffee: Colour = COFFEE,
     background: Colour = WHITE,
 ) -> Picture:
-    """A rosetta: layers of milk like the leaves of a fern, drawn together by a stem, a small heart on top.
+    """Draw a rosetta: layers of milk like the leaves of a fern, drawn together by a stem, a small heart on top.
 
     The arguments are those of `heart`.
     """
@@ -91,7 +91,7 @@ def rosetta(
 
 @public
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
-    """The picture of a file of one of `FORMATS`, transparent parts on white.
+    """Read the picture of a file of one of `FORMATS`, transparent parts on white.
 
     Args:
         resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled,
@@ -109,12 +109,12 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """The largest part in the middle of a picture of Pillow's that has these proportions, resampled in linear light."""
+    """Return the largest middle part of a Pillow picture that has these proportions, resampled in linear light."""
     return _whole(picture) if resolution == picture.size else _resampled(picture, *resolution)
 
 
 def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
-    """The picture of a file as Pillow has it, of ``most`` pixels; raises `InputError` as `read_picture`."""
+    """Open a picture's file with Pillow, of ``most`` pixels; raise `InputError` as `read_picture` does."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
@@ -137,8 +137,8 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``; the sentence
-    begins with what was ``found``."""
+    """Warn where a picture of a ``size`` in pixels loses parts to get the proportions of ``shape``; the sentence begins
+    with ``found``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < 1.0 - ROUNDING:
@@ -147,7 +147,7 @@ def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) 
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of the largest part in the middle of a picture that has these proportions."""
+    """Return left, top, right and bottom of the largest middle part of a picture that has these proportions."""
     (width, height), (columns, rows) = size, shape
     scale = min(width / columns, height / rows)
     left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
@@ -155,7 +155,7 @@ def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float
 
 
 def _check_header(path: str | Path, file: Any, most: int) -> None:
-    """Before anything is decoded."""
+    """Raise `InputError` for a picture of too many pixels or bits, before anything is decoded."""
     if file.width * file.height > most:
         raise _too_many(path, f"{file.width} x {file.height} pixels", most)
     if file.mode.startswith(("I", "F")):
@@ -168,7 +168,7 @@ def _too_many(path: str | Path, found: str, most: int) -> InputError:
 
 @public
 def write_picture(path: str | Path, image: ArrayLike) -> Path:
-    """Writes a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and returns its path.
+    """Write a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and return its path.
 
     Raises:
         InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
@@ -200,7 +200,8 @@ def _mixed(share: Picture, inside: Picture, outside: Picture) -> Picture:
 
 
 def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
-    """(rows, columns, 1) share of every pixel that is inside; the shorter side goes from -1 to 1, y upwards."""
+    """Return the share (rows, columns, 1) of pixels inside of a shape; the shorter side goes from -1 to 1, y
+    upwards."""
     half = 0.5 * min(columns, rows)
     covered = np.zeros((rows, columns, 1))
     offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -213,13 +214,13 @@ def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
 
 
 def _in_heart(x: Any, y: Any) -> Any:
-    """The sextic (x^2 + y^2 - 1)^3 = x^2 y^3, which goes from y = -1 to 1.2367, moved and shrunk."""
+    """Test points against the sextic (x^2 + y^2 - 1)^3 = x^2 y^3, from y = -1 to 1.2367, moved and shrunk."""
     x, y = 1.1183 * x, 1.1183 * y + 0.1183
     return (x**2 + y**2 - 1.0) ** 3 < x**2 * y**3
 
 
 def _in_rosetta(x: Any, y: Any) -> Any:
-    """Six layers, all bent in the same way so that coffee of the same width stays between them, a stem and a heart."""
+    """Test points against six layers, bent alike so that coffee of one width stays between them, a stem and a heart."""
     x = np.abs(x)
     inside = _in_heart(x / 0.31, (y - 0.69) / 0.31) | ((x < 0.02) & (np.abs(y + 0.2) < 0.8))
     height = y - (x**0.75 - 0.55 * x**2)  # of the point of the stem where the layer through x, y leaves it
@@ -237,7 +238,7 @@ def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
 
 
 def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
-    """A few rows after the other, opaque, each with the number of its first row: what is made of all rows at once would
+    """Yield a few opaque rows after the other, each with the number of its first row: arrays of all rows at once would
     take many times the room of the picture."""
     from PIL import Image
 
@@ -258,7 +259,7 @@ def _whole(picture: Any) -> Picture:
 
 
 def _resampled(picture: Any, columns: int, rows: int) -> Picture:
-    """(rows, columns, 3) from the largest part in the middle that has these proportions."""
+    """Return the largest middle part with the proportions of columns and rows, resampled to (rows, columns, 3)."""
     from PIL import Image
 
     box = _middle(picture.size, (columns, rows))
@@ -272,9 +273,9 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
 
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-"""Of the pictures in a folder."""
+"""Endings of the pictures in a folder that are read."""
 MOST_BYTES_OF_VIDEO = 2**33
-"""Of a video."""
+"""Most bytes of a video's file."""
 
 
 def read_frames(
@@ -284,7 +285,7 @@ def read_frames(
     frame_rate: float | None = None,
     every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (frames,) [s] after the first frame, and frames (frames, rows, columns, 3), linear, from 0 to 1.
+    """Read times (frames,) [s] after the first frame, and frames (frames, rows, columns, 3), linear, from 0 to 1.
 
     Args:
         path: a video, or a folder of pictures, which are taken in the order of their names.
@@ -332,8 +333,8 @@ def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
 
 
 def _upright(frame: Any) -> Any:
-    """The picture of a frame as players show it: telephones note how they were held as a matrix (ISO/IEC 14496-12,
-    8.3.2), which turns or mirrors what is stored; the nearest right angle counts."""
+    """Return the picture of a frame as players show it: telephones note how they were held as a matrix (ISO/IEC
+    14496-12, 8.3.2), which turns or mirrors what is stored; the nearest right angle counts."""
     from PIL.Image import Transpose
 
     picture = frame.to_image()

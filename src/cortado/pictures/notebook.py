@@ -24,16 +24,16 @@ from cortado.scene.parameter_values import UNITS
 from cortado.simulation import Simulation
 
 IN_MOTION = 1_000_000
-"""Bytes of the view of a trajectory."""
+"""Most bytes of the view of a trajectory."""
 MANY = 2000
-"""Particles of which the nearest others are looked for."""
+"""Number of particles whose nearest others are looked for."""
 MOST_NUMBERS = 6
-"""Of a parameter that the table shows; of more the smallest and the greatest."""
+"""Most numbers of a parameter that the table shows; of more the smallest and the greatest."""
 HEAD = ("parameter", "unit", "first guess", "found")
 
 
 def simulation_page(simulation: Simulation) -> str:
-    """HTML of a simulation: its repr, and a picture of its first particles."""
+    """Return HTML of a simulation: its repr, and a picture of its first particles."""
     first, held = simulation.positions[: simulation.free_particles or None], simulation.scene.container.extent()
     solids = [solid_outline(simulation.scene)]
     drawn = picture(simulation, lambda path: particles([first], ["t = 0 s"], path, container=held, lines=solids))
@@ -41,8 +41,8 @@ def simulation_page(simulation: Simulation) -> str:
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """HTML of a trajectory: its repr, a `particle_view` in a frame of its own, where scripts run, with y up, and below
-    it a picture of the first, the middle and the last frame, coloured by speed."""
+    """Return HTML of a trajectory: its repr, a `particle_view` in a frame of its own, where scripts run, with y up, and
+    below it a picture of the first, the middle and the last frame, coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
@@ -61,7 +61,7 @@ def trajectory_page(run: Trajectory) -> str:
 
 
 def film_page(film: Film) -> str:
-    """HTML of a film: its repr, and the video, or the animation, which is part of the page."""
+    """Return HTML of a film: its repr, and the video, or the animation, which is part of the page."""
     content, words = b64encode(film.path.read_bytes()).decode(), as_words(film)
     if film.path.suffix.lower() == ".webp":
         return f'{words}<img src="data:image/webp;base64,{content}" style="width: 100%">'
@@ -72,7 +72,7 @@ def film_page(film: Film) -> str:
 def result_page(
     found: object, message: str, problem: Any, start: Mapping[str, Any], best: Mapping[str, Any], losses: Any
 ) -> str:
-    """HTML of the result of a search from a start to the best parameters, with how it ended and all its losses. Of a
+    """Return HTML of the result of a search from a start to the best parameters, with its end and all its losses. Of a
     `Problem`, or of one in other coordinates, two runs are made to see their ends; there is no picture of runs that
     diverge."""
     if hasattr(problem, "coordinates"):
@@ -87,7 +87,7 @@ def result_page(
 
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Where runs with the first guess and with what was found end, or how they look, and the target if it is known."""
+    """Draw the ends of runs with the first guess and the found parameters, or their pictures, and a known target."""
     own = Problem(
         problem.simulation, problem.steps, problem.loss, state=problem.state
     )  # the user's keeps its last evaluation
@@ -109,7 +109,7 @@ def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:
 
 
 def _written(value: Any) -> str:
-    """A number, a few of them, or how many there are and how large."""
+    """Write a number, a few numbers, or the count and the range of many."""
     numbers = np.ravel(value)
     if len(numbers) > MOST_NUMBERS:
         return f"{np.shape(value)} numbers, {numbers.min():.4g} to {numbers.max():.4g}"
@@ -117,12 +117,12 @@ def _written(value: Any) -> str:
 
 
 def as_words(found: object) -> str:
-    """HTML of the repr of an object."""
+    """Return HTML of the repr of an object."""
     return f"<p>{escape(repr(found))}</p>"
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """HTML of the PNG that ``draw`` writes to a path; nothing where a package is missing that draws."""
+    """Return HTML of the PNG that ``draw`` writes to a path; empty where a package is missing that draws."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         try:
@@ -134,7 +134,7 @@ def picture(found: object, draw: Callable[[Path], Any]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """HTML of a table of texts."""
+    """Return HTML of a table of texts."""
 
     def line(kind: str, cells: Sequence[str]) -> str:
         written = (f'<{kind} style="text-align: left; padding: 0 1em .2em 0">{escape(cell)}</{kind}>' for cell in cells)
@@ -144,7 +144,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _spacing(positions: NDArray[Any]) -> float:
-    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
+    """Return the usual distance [m] from particles (n, d) to the nearest other; 1 for a single one."""
     from scipy.spatial import KDTree
 
     if len(positions) < 2:

@@ -26,7 +26,7 @@ from cortado.scene.scene import Scene
 FINER = 3
 """How many times finer than pixels lines are drawn, for smooth edges."""
 Text = tuple[tuple[int, int], str, str]
-"""Where words are, (column, row), the words, and which point of them is there, by Pillow's two letters."""
+"""A text on a picture: its place (column, row), its words, and by Pillow's two letters the point of them there."""
 SMALL, SMALLEST = 11, 7
 """Pixels of the letters of a word on a small picture, and of one that is too long for it."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
@@ -34,44 +34,43 @@ PALETTE = "cividis"
 OUTERMOST = (0.5, 99.5)
 """Percentiles at the ends of the scale, so that a few particles do not darken all the others."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
-"""Of what all scenes have, by its name."""
+"""Units of the quantities that all scenes have, by name."""
 MOVING = np.array([0.75, 0.20, 0.02])
-"""Linear colour of paths and of what comes out of an emitter."""
+"""Linear colour of paths and of an emitter's jet."""
 ARROW = 0.18
-"""How long an arrow is, in sizes of what is shown, and its head, in lengths of it."""
+"""Length of an arrow, in sizes of the contents, and of its head, in lengths of the arrow."""
 HEAD = 0.22
 
 
 def painter(
     scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
-    """The painter of a scene; arguments as of `stage_of`, and the ``device`` of the rays."""
+    """Return the painter of a scene; arguments as of `stage_of`, and the ``device`` of the rays."""
     return painter_on(stage_of(scene, positions, poses), device)
 
 
 def painter_on(stage: PlaneStage | Stage, device: Any = "cpu") -> PlanePainter | SpacePainter:
-    """The painter of what is on a stage; ``device``: that of the rays."""
+    """Return the painter of a stage, in the plane or in space; ``device`` is that of the rays."""
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """What is around the fluid of a scene, which will be at positions (n, d) or (frames, n, d)
-    [m]; ``poses``: the same scene
-    with its solids where they will be, for them to be in the picture, too."""
+    """Return the stage around the fluid of a scene, which will be at positions (n, d) or (frames, n, d) [m]; ``poses``
+    are scenes with the solids where they will be, so that the picture has these, too."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """(n, 3) the colour of each particle: of what it is made of, in the scene's colours or in others (phases, 3)."""
+    """Return the colour (n, 3) of each particle by its phases, in the scene's colours or in others (phases, 3)."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
 
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
-    """A picture (rows, columns, 3), linear: particles at positions (n, d) [m] with colours (n, 3) as spheres, the
-    opening of an emitter with an arrow, paths of solids and of the opening, and along each axis a line that is as long
-    as the whole, and says how long."""
+    """Draw a picture (rows, columns, 3), linear, of a scene before it is run. It has particles at positions (n, d) [m]
+    as spheres with colours (n, 3), and paths of solids and of an emitter's opening, with an arrow. Along each axis a
+    line is as long as the whole, and says how long."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
@@ -93,14 +92,14 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 
 def _paths(scene: Scene) -> list[Points]:
-    """(k, d) [m] those of solids' middles, and that of an emitter's opening."""
+    """Return the paths (k, d) [m] of solids' middles, and that of an emitter's opening."""
     found = [np.array(table.positions) for table in scene.solid if table.positions is not None]
     course = scene.schedule.courses.get("nozzle_path")
     return found if course is None else [*found, np.array(course.values, dtype=np.float64)]
 
 
 def _poses(scene: Scene) -> list[Scene]:
-    """The scene with each of its solids along its path."""
+    """Return scenes with one of the solids at each place of its path."""
     found = []
     for k, table in enumerate(scene.solid):
         for place in table.positions or ():
@@ -110,8 +109,8 @@ def _poses(scene: Scene) -> list[Scene]:
 
 
 def _arrow(scene: Scene, positions: Points) -> Points:
-    """(5, d) [m] a line and its head, in one stroke, out of the opening of an emitter; at least as long as the opening
-    is wide. Without a container what is shown is at positions (n, d) [m]."""
+    """Return an arrow (5, d) [m], line and head in one stroke, out of the opening of an emitter and at least as long as
+    the opening is wide. Without a container its size comes from positions (n, d) [m]."""
     assert scene.emitter is not None
     start, direction = np.array(scene.emitter.outlet), np.array(scene.emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
@@ -124,7 +123,7 @@ def _arrow(scene: Scene, positions: Points) -> Points:
 
 
 def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
-    """(2, 2) on the screen, along each axis: the ends of that edge of the box which is outermost on the screen."""
+    """Return the ends (2, 2) on the screen, along each axis, of the box's outermost edge on the screen."""
     box, found = corners(lower, upper), list[Points]()
     for axis in range(len(lower)):
         pairs = [np.array([a, b]) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
@@ -135,7 +134,7 @@ def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
 
 
 def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> list[Text]:
-    """How long the box is along each axis, beside its edges."""
+    """Return texts that tell the length of the box along each axis, beside its edges."""
     found, middle = list[Text](), stage.on_screen(0.5 * (lower + upper)[None])[0]
     for axis, edge in enumerate(edges):
         away = edge.mean(axis=0) - middle
@@ -147,8 +146,8 @@ def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> lis
 
 
 def labelled(image: Points, text: str, below: str = "") -> Points:
-    """A picture (rows, columns, 3), linear, on which a word is then written on the left, at its top, and another one at
-    its bottom, in smaller letters where the first would be too long."""
+    """Write a word on a picture (rows, columns, 3), linear, on the left, at its top, and another one at its bottom, in
+    smaller letters where the first would be too long."""
     rows, columns = image.shape[:2]
     size = max(round(0.042 * rows), SMALL)
     left, top = round(0.9 * size), round(0.7 * size)
@@ -157,22 +156,22 @@ def labelled(image: Points, text: str, below: str = "") -> Points:
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """A picture (rows, columns, 3), linear, on which texts are then written, in letters that are so many pixels high;
-    it is not copied, which takes longer than to write."""
+    """Write texts on a picture (rows, columns, 3), linear, in letters of a ``size`` in pixels; it is not copied, which
+    takes longer than to write."""
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
 
 
 def length_of(text: str, size: int) -> float:
-    """How many pixels a text is wide, in letters that are so many pixels high."""
+    """Return the width of a text in pixels, in letters of a ``size`` in pixels."""
     return float(_font(size).getlength(text))
 
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """The part of a picture of a shape that texts are on, and how much of each of its pixels they cover: the same in
-    all frames of a film."""
+    """Return the part of a picture of a shape that texts are on, and how much of each of its pixels they cover, which
+    is kept for all frames of a film."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -184,8 +183,8 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
-    """A picture (rows, columns, 3), linear, with lines of a linear colour (3,) on it, through points (k, 2), columns
-    and rows; ``width`` in pixels."""
+    """Draw lines of a linear colour (3,) on a picture (rows, columns, 3), linear, through points (k, 2), columns and
+    rows; ``width`` in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]
@@ -198,8 +197,8 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
 
 
 def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
-    """Pictures of one size in rows of so many, a thin light line between them, each with its name on it if it has one;
-    the end of the last row may be empty."""
+    """Put pictures of one size together in rows of ``across``, a thin light line between them, each with its name on it
+    if it has one; the end of the last row may be empty."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
@@ -224,7 +223,7 @@ def _font(size: int) -> Any:
 
 @dataclass(frozen=True)
 class Scale:
-    """The numbers of a quantity from one end of the colours to the other."""
+    """A colour scale: the numbers of a quantity from one end of the colours to the other."""
 
     name: str
     unit: str
@@ -233,30 +232,30 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """That of numbers, such as those of all frames of a film; ``unit`` of what is no quantity that all scenes
-        have."""
+        """Make the scale of numbers, such as those of all frames of a film; ``unit`` is for a quantity that not all
+        scenes have."""
         least, greatest = np.percentile(values, OUTERMOST)
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
-        """(n, 3) linear, of numbers (n,)."""
+        """Return linear colours (n, 3) of numbers (n,)."""
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def columns(self, rows: int) -> int:
-        """How many pixels of the width of a picture that is so many rows high it takes."""
+        """Return how many pixels of the width of a picture with ``rows`` rows the scale takes."""
         size = _size_of_letters(rows)
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
     def beside(self, image: Points) -> Points:
-        """A picture (rows, columns, 3), with the scale in columns of its own at its right edge."""
+        """Return a picture (rows, columns, 3) with the scale in columns of its own at its right edge."""
         rows = image.shape[0]
         edge = np.pad(image[:, -1], ((reach := rows // 16, reach), (0, 0)), mode="edge")
         smooth = np.lib.stride_tricks.sliding_window_view(edge, 2 * reach + 1, axis=0).mean(axis=-1)
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """A picture (rows, columns, 3) with the scale on its right edge: its colours with numbers beside them, the
-        greatest on top, and its name and unit above."""
+        """Return a picture (rows, columns, 3) with the scale on its right edge: its colours with numbers beside them,
+        the greatest on top, and its name and unit above."""
         rows, columns = image.shape[:2]
         size = _size_of_letters(rows)
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
@@ -272,15 +271,15 @@ class Scale:
 
     @property
     def _heads(self) -> tuple[str, str]:
-        """What stands above it."""
+        """Return the lines above the scale: its name and its unit."""
         return self.name.replace("_", " "), f"[{self.unit}]"
 
     def _wide(self, size: int) -> float:
-        """Pixels of its colours with the numbers beside them."""
+        """Return the width in pixels of its colours with the numbers beside them."""
         return size + max((length_of(f"{number:.4g}", size) for number in self._ticks()), default=0.0)
 
     def _ticks(self) -> list[float]:
-        """Round numbers that are told."""
+        """Return round numbers that the scale shows."""
         from matplotlib.ticker import MaxNLocator
 
         if not self.greatest > self.least:
@@ -290,19 +289,19 @@ class Scale:
 
 
 def _colours(shares: NDArray) -> Points:
-    """(n, 3) linear, of numbers from 0 to 1."""
+    """Return linear colours (n, 3) of numbers from 0 to 1."""
     found: Points = _palette()[np.minimum((len(_palette()) * shares).astype(int), len(_palette()) - 1)]
     return found
 
 
 def _size_of_letters(rows: int) -> int:
-    """Pixels of the letters on a picture that is so many rows high."""
+    """Return the size in pixels of letters on a picture with ``rows`` rows."""
     return max(round(0.026 * rows), 9)
 
 
 @cache
 def _palette() -> Points:
-    """(256, 3) the colours, linear."""
+    """Return the colours (256, 3) of the scale, linear."""
     from matplotlib import colormaps
 
     palette = colormaps[PALETTE]

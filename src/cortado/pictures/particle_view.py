@@ -23,20 +23,20 @@ from cortado.scene.containers import CylinderContainer
 from cortado.scene.scene import Scene
 
 MOST_BYTES = 2_200_000
-"""Of the positions, speeds and colours in one view; base64 makes them a third larger."""
+"""Most bytes of the positions, speeds and colours in one view; base64 makes them a third larger."""
 LEAST_FRAMES, MOST_FRAMES = 24, 120
 """A view of many particles leaves out particles rather than show fewer frames than the least, if there are as many."""
 SHORTEST, LONGEST = 3.0, 12.0
 """[s] that playing takes."""
 LARGEST = 32767
-"""Of a position, as a 16-bit number; the smallest is its negative."""
+"""Largest position as a 16-bit number; the smallest is its negative."""
 _PLAIN = (0.1, 0.3, 0.8)
 """The linear colour of particles that have none."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Particles in motion."""
+    """The particles of a run in motion: positions, speeds and colours over frames."""
 
     name: str
     positions: NDArray[Any]
@@ -48,18 +48,18 @@ class Cloud:
 
 
 def style() -> str:
-    """How all the views of a page look, in CSS."""
+    """Return the CSS of all views of a page."""
     return Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
 def script() -> str:
-    """What brings all the views of a page to life; it stands once in the page, after them."""
+    """Return the script that brings all the views of a page to life; it stands once in the page, after them."""
     source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
     return f"<script>\n{source}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
-    """Which frames to show, and that of every so many particles one is, until a view has no more than so many bytes.
+    """Choose the frames to show, and the stride that leaves out particles, for a view of at most ``most_bytes`` bytes.
 
     ``numbers``: bytes of one particle in one frame, two for each component of a position, one for the speed, three for
     a colour that changes, of all clouds together.
@@ -72,7 +72,8 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BY
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `style` be there.
+    """Return HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `style` be
+    there.
 
     Args:
         clouds: of the same frames and as many particles each.
@@ -110,7 +111,7 @@ def particle_view(
 
 
 def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride: int) -> str:
-    """The element with its controls."""
+    """Return the HTML element of a view with its controls."""
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     several = len(clouds) > 1
     names = "".join(f'<span class="name">{escape(cloud.name)}</span>' for cloud in clouds) if several else ""
@@ -138,21 +139,21 @@ def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride:
 
 
 def _extent(clouds: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Lower and upper ends (d,) [m] of points (..., d)."""
+    """Return lower and upper ends (d,) [m] of points (..., d)."""
     points = [cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds if cloud.size]
     lower = np.min([np.nanmin(cloud, axis=0) for cloud in points], axis=0).astype(float)
     return lower, np.max([np.nanmax(cloud, axis=0) for cloud in points], axis=0).astype(float)
 
 
 def _space(vectors: NDArray[Any]) -> NDArray[Any]:
-    """(..., 3) of vectors (..., d), with few digits."""
+    """Return vectors (..., d) as (..., 3), with few digits."""
     missing = 3 - vectors.shape[-1]
     padded = np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
 def _colours(cloud: Cloud) -> NDArray[Any]:
-    """(n, 3) or (frames, n, 3), sRGB."""
+    """Return the sRGB colours of a cloud as bytes, (n, 3) or (frames, n, 3)."""
     particles = cloud.positions.shape[1]
     colours = np.tile(_PLAIN, (particles, 1)) if cloud.colours is None else np.asarray(cloud.colours)
     return to_srgb(colours.reshape(1, -1, 3)).reshape(colours.shape)
@@ -163,28 +164,28 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 ROUND = 48
-"""Sides of the polygon that stands for a circle."""
+"""Number of sides of the polygon that stands for a circle."""
 
 
 class MovingState(Protocol):
-    """A state of a run; n particles in d dimensions."""
+    """A state of a run with velocities; n particles in d dimensions."""
 
     @property
     def positions(self) -> Points:
-        """(n, d) [m]"""
+        """Return the positions (n, d) [m]."""
 
     @property
     def velocities(self) -> Points:
-        """(n, d) [m/s]"""
+        """Return the velocities (n, d) [m/s]."""
 
     @property
     def mass_fractions(self) -> Points | None:
-        """(n, phases) [-]; None with one phase"""
+        """Return the mass fractions (n, phases) [-]; None with one phase."""
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: ArrayLike) -> str:
-    """HTML that shows runs of a scene side by side, each by its name with a state for each of the times (frames,) [s];
-    see `particle_view`. Solids that move are not shown."""
+    """Return HTML that shows runs of a scene side by side, each by its name with a state for each of the times
+    (frames,) [s]; see `particle_view`. Solids that move are not shown."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -197,12 +198,12 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: A
 
 
 def outline(scene: Scene) -> Points:
-    """(k, 2, d) ends of the lines that draw the container and the solids of a scene [m]; none without both."""
+    """Return ends (k, 2, d) [m] of the lines that draw the container and the solids of a scene; none without both."""
     return np.concatenate([container_outline(scene), solid_outline(scene)])
 
 
 def container_outline(scene: Scene) -> Points:
-    """(k, 2, d) ends of the lines that draw the container of a scene [m]; none without a container."""
+    """Return ends (k, 2, d) [m] of the lines that draw the container of a scene; none without a container."""
     container, ends = scene.container, scene.container.extent()
     if ends is None:
         return np.zeros((0, 2, scene.dimension))
@@ -214,7 +215,7 @@ def container_outline(scene: Scene) -> Points:
 
 
 def _cup(container: CylinderContainer) -> Points:
-    """Two circles, and four lines between them."""
+    """Return the lines of a cylinder: two circles, and four lines between them."""
     angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
     axis = INDEX_OF_AXIS[container.axis]
     circle = np.insert(container.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), axis, 0.0, axis=1)
@@ -226,7 +227,7 @@ def _cup(container: CylinderContainer) -> Points:
 
 
 def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points, stride: int) -> Cloud:
-    """Of every so many particles one."""
+    """Make the cloud of a run of states, with one of every ``stride`` particles."""
     domain = scene.container.domain(scene.dimension)
     positions = domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
     speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])

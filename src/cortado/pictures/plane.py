@@ -19,11 +19,11 @@ from cortado.scene.containers import BoxContainer
 from cortado.scene.scene import Scene
 
 LIGHT = (-0.45, 0.70, 0.55)
-"""Towards the lamp: to the right, up, towards the viewer."""
+"""Direction of the lamp: to the right, up, towards the viewer."""
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """(rows, columns, 3) the light of a body that covers a part of each pixel (rows, columns).
+    """Return the light (rows, columns, 3) of a body that covers a part of each pixel (rows, columns).
 
     The body looks as if it were thicker in the middle than at its edge.
 
@@ -53,36 +53,36 @@ def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) 
 FILLED = 0.80
 """The part of the picture's width or height that the container takes."""
 GLASS = (0.40, 0.50, 0.55)
-"""Linear, of the walls of a container."""
+"""Linear colour of the walls of a container."""
 GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
 """Of the lamp in solids, in those that are dull and in mirrors."""
 SOLID_SHADOW = 0.25
-"""How much darker paper is behind a solid."""
+"""Part by which paper is darker behind a solid."""
 BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
 """Of shadows: how soft and how far down they are, and beyond which distance from a body there is none; in sizes."""
 Layer = tuple[Points, Points]
-"""How much something hides of what is behind it (rows, columns, 1), and what light it adds (rows, columns, 3)."""
+"""A layer of a picture: how much it hides of the layers behind (rows, columns, 1), and its light (rows, columns, 3)."""
 
 
 @dataclass(frozen=True)
 class PlaneStage:
-    """What is around the fluid, on the pixels of a picture; what is there at rest is drawn once."""
+    """The surroundings of fluid in the plane, on the pixels of a picture; what is at rest is drawn once."""
 
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """(2,) of what is shown [m]"""
+    """(2,) lower ends of the contents [m]"""
     upper: Points
     """(2,) [m]"""
     spacing: float
     """[m]"""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper ends (2,) [m] of what the picture has in its middle; those of what is shown if left out."""
+    """Lower and upper ends (2,) [m] of the picture's middle; those of the contents if left out."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
-        """The stage of a scene in 2-D, the fluid of which is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` as of
+        """Make the stage of a scene in 2-D, whose fluid is at positions (n, 2) or (frames, n, 2) [m]; ``poses`` as of
         `painter`."""
         container = scene.container if isinstance(scene.container, BoxContainer) else None
         spacing, solids = scene.discretisation.spacing, shown_solids(scene)
@@ -96,62 +96,62 @@ class PlaneStage:
 
     @property
     def ends(self) -> tuple[Points, Points]:
-        """Lower and upper ends (2,) [m] of what is shown, in the scene's axes."""
+        """Return lower and upper ends (2,) [m] of the contents, in the scene's axes."""
         return self.lower, self.upper
 
     @property
     def seen_size(self) -> Points:
-        """(2,) how wide and high what the picture has in its middle is [m]."""
+        """Return width and height (2,) [m] of the part that the picture has in its middle."""
         lower, upper = self.seen or self.ends
         return upper - lower
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "PlaneStage":
-        """The same in a picture of another size, with all that is between ``ends`` in its middle."""
+        """Return the stage in a picture of another size, with all that is between ``ends`` in its middle."""
         return replace(self, picture=picture, seen=ends)
 
     @cached_property
     def pixel(self) -> float:
-        """The width of a pixel [m]."""
+        """Return the width of a pixel [m]."""
         size = np.array([self.picture.width, self.picture.height])
         return float((self.seen_size / (FILLED * size)).max())
 
     @property
     def _middle(self) -> Points:
-        """(2,) of the picture [m]."""
+        """Return the middle (2,) of the picture [m]."""
         lower, upper = self.seen or self.ends
         return 0.5 * (lower + upper)
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
-        """(rows, columns) where the middle of each pixel is [m]: x, and y."""
+        """Return x and y (rows, columns) of the middle of each pixel [m]."""
         columns, rows, middle = self.picture.width, self.picture.height, self._middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
     def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
-        """(n,) which points (n, 2) [m] are in the picture, or no further from it than a margin [m]."""
+        """Return a mask (n,) of the points (n, 2) [m] in the picture, or no further from it than a margin [m]."""
         half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
         return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
 
     def on_screen(self, points: Points) -> Points:
-        """As `Stage.on_screen`, of points (n, 2) [m]."""
+        """Return column and row (n, 2) in the picture of points (n, 2) [m], as `Stage.on_screen` does."""
         off = (points - self._middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
     @property
     def up_axis(self) -> int:
-        """Which axis of the scene is upright in the picture."""
+        """Return the axis of the scene that is upright in the picture."""
         return 1
 
     @property
     def gloss_width(self) -> float:
-        """How wide the edges of bodies are drawn, in pixels."""
+        """Return the width of the edges of bodies, in pixels."""
         return max(0.55 * self.spacing / self.pixel, 1.5)
 
     @cached_property
     def behind(self) -> Points:
-        """(rows, columns, 3) what is behind the fluid: the paper, the shadows on it, and the inside of a container."""
+        """Draw the background (rows, columns, 3) of the fluid: paper, its shadows, and the inside of a container."""
         paper = self._paper()
         if self.container is not None or self._tanks:
             outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
@@ -163,7 +163,7 @@ class PlaneStage:
 
     @cached_property
     def before(self) -> list[Layer]:
-        """What is drawn over the fluid, one over the other: solids, then the walls of a container and of tanks."""
+        """Return the layers over the fluid, in order: solids, then the walls of a container and of tanks."""
         layers = [self._body(shown, distance) for shown, distance in self._bodies]
         if self.container is not None:
             layers.append(self._container_walls(self.container))
@@ -171,7 +171,7 @@ class PlaneStage:
 
     @cached_property
     def free(self) -> Points:
-        """(rows, columns) the part of each pixel that is within the container and in no solid."""
+        """Return the part (rows, columns) of each pixel that is within the container and in no solid."""
         free = self._room
         for _, distance in self._bodies:
             free = free * (1.0 - self._covered(distance))
@@ -179,23 +179,23 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """(rows, columns) the part of each pixel in which fluid is drawn, if it is there: in opaque solids, too, which
-        are drawn over it."""
+        """Return the part (rows, columns) of each pixel in which fluid is drawn, if it is there: in opaque solids, too,
+        which are drawn over it."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
     def _bodies(self) -> list[tuple[ShownSolid, Points]]:
-        """Solids that fluid flows around, and how far pixels are from each."""
+        """Return the solids that fluid flows around, and the distance of pixels from each."""
         return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
 
     @cached_property
     def _tanks(self) -> list[tuple[ShownSolid, Points]]:
-        """Solids that fluid is inside of, and how far pixels are outside of the cavity of each."""
+        """Return the solids that fluid is inside of, and the distance of pixels from the cavity of each."""
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """(rows, columns) how far a place ``drop`` [m] above each pixel is outside of a body, negative inside [m];
-        infinite where it is far."""
+        """Return the distance (rows, columns) [m] from a body of a place ``drop`` [m] above each pixel, negative
+        inside; infinite where it is far."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
@@ -205,11 +205,11 @@ class PlaneStage:
         return found
 
     def _covered(self, distance: Points) -> Points:
-        """(rows, columns) the part of each pixel that a body covers."""
+        """Return the part (rows, columns) of each pixel that a body covers."""
         return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
 
     def _paper(self) -> Points:
-        """The background, a little brighter in the middle and darker in the corners."""
+        """Draw the paper, a little brighter in the middle and darker in the corners."""
         x, y = self.pixels
         middle, half = self._middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
@@ -217,7 +217,7 @@ class PlaneStage:
 
     @cached_property
     def _room(self) -> Points:
-        """(rows, columns) the part of each pixel that is within the container and tanks."""
+        """Return the part (rows, columns) of each pixel that is within the container and tanks."""
         room = np.ones(self.pixels[0].shape)
         if self.container is not None:
             x, y = self.pixels
@@ -229,16 +229,16 @@ class PlaneStage:
 
     @property
     def _size(self) -> float:
-        """The longer side of what is shown [m]."""
+        """Return the longer side of the contents [m]."""
         return float((self.upper - self.lower).max())
 
     @property
     def _wall(self) -> float:
-        """How thick the walls are drawn [m]."""
+        """Return the thickness of drawn walls [m]."""
         return 0.010 * self._size
 
     def _shadow(self) -> Points:
-        """(rows, columns) how much darker the paper is behind the container and tanks."""
+        """Return how much darker (rows, columns) the paper is behind the container and tanks."""
         tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
         if self.container is None:
             return np.max(tanks, axis=0)
@@ -252,12 +252,12 @@ class PlaneStage:
         return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
 
     def _below(self, shown: ShownSolid) -> Points:
-        """(rows, columns) the part of the light that a body keeps off the paper."""
+        """Return the part (rows, columns) of the light that a body keeps off the paper."""
         distance = self._distance(shown, DROPPED * self._size)
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
     def _body(self, shown: ShownSolid, distance: Points) -> Layer:
-        """A solid that fluid flows around, where it is within the container."""
+        """Return the layer of a solid that fluid flows around, where it is within the container."""
         cover = self._covered(distance)
         gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
         light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
@@ -278,7 +278,7 @@ class PlaneStage:
         return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
-        """Walls, by the distance [m] of pixels from their inner side, outwards; ``part``: of them that is there."""
+        """Return the layer of walls, by the distance [m] of pixels from their inner side; ``part`` of them is there."""
         wall = self._wall
         band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
@@ -287,9 +287,9 @@ class PlaneStage:
 
 
 SUPPORT = 1.3
-"""In spacings: how far a particle is felt."""
+"""In spacings: the support of a particle's field."""
 DROP = 0.8
-"""How strongly a particle is felt that is alone: a drop about as large as a spacing."""
+"""Strength of the field of a particle that is alone: a drop about as large as a spacing."""
 GRID = 4
 """Nodes of the field for each spacing, along an axis."""
 TOUCHING = 0.9
@@ -298,18 +298,18 @@ TOUCHING = 0.9
 
 @dataclass(frozen=True)
 class PlanePainter:
-    """Draws states of one scene."""
+    """A painter that draws states of one scene in the plane."""
 
     stage: PlaneStage
 
     def image(self, *state: Any) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
+        """Draw the picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
         positions, colours, pose = State(*state)[:3]
         own = self if pose is None else PlanePainter(replace(self.stage, solids=shown_solids(pose)))
         return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
 
     def _drawn(self, positions: Points, colours: Points) -> Points:
-        """The picture with the solids where the stage has them."""
+        """Draw the picture with the solids where the stage has them."""
         stage, (cover, colour) = self.stage, self._fluid(positions, colours)
         body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
         fluid = glossy(body, colour, width) if stage.picture.shaded else colour
@@ -320,7 +320,7 @@ class PlanePainter:
         return np.clip(image, 0.0, 1.0)
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
-        """(rows, columns) the part of each pixel that fluid covers, and its colour (rows, columns, 3)."""
+        """Return the part (rows, columns) of each pixel that fluid covers, and its colour (rows, columns, 3)."""
         from scipy.ndimage import map_coordinates
         from scipy.spatial import cKDTree
 
@@ -350,8 +350,8 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Positions (n, 2), their mirror images behind walls that they touch and images a period away, and which
-        particle each shows."""
+        """Return positions (n, 2) with mirror images behind walls that they touch and images a period away, and the
+        particle of each."""
         stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
@@ -368,13 +368,13 @@ class PlanePainter:
 
 
 def _distances(tree: object, points: Points, reach: float) -> Points:
-    """(p, k) [m] to the nearest particles; infinite where there are fewer within reach."""
+    """Return distances (p, k) [m] to the nearest particles; infinite where there are fewer within reach."""
     distances, _ = tree.query(points, k=24, distance_upper_bound=reach, workers=usable_cores())  # type: ignore[attr-defined]
     return distances
 
 
 def _weight(distances: Points, reach: float) -> Points:
-    """Wendland's C2 function, 1 at 0."""
+    """Return Wendland's C2 function of distances over the reach, 1 at 0."""
     q = np.minimum(distances / reach, 1.0)
     return (1.0 - q) ** 4 * (1.0 + 4.0 * q)
 
@@ -382,8 +382,8 @@ def _weight(distances: Points, reach: float) -> Points:
 def _splat(
     positions: Points, strength: Points, colours: Points, corner: Points, cell: float, counts: np.ndarray, reach: float
 ) -> tuple[Points, Points]:
-    """At nodes (nx, ny): the sum of what is felt of all particles, and the mean of their colours (3, nx, ny), of which
-    near ones count most."""
+    """Return at nodes (nx, ny) the sum of the particles' fields, and the mean of their colours (3, nx, ny), weighted by
+    nearness."""
     patch = np.arange(-int(reach / cell) - 1, int(reach / cell) + 2)
     nearest = np.rint((positions - corner) / cell).astype(int)
     size = int(np.prod(counts))

@@ -42,7 +42,7 @@ STYLE = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """A figure of so many inches, saved under `path` in one go when the block ends well."""
+    """Yield a figure of a width and height in inches, saved under `path` in one go when the block ends well."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -59,15 +59,15 @@ def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterat
 
 
 def whole_numbers(axis: Any) -> None:
-    """Ticks of an axis at whole numbers only."""
+    """Put ticks of an axis at whole numbers only."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Losses (evaluations,) over the evaluations, on a logarithmic scale where any is positive. What is not finite, and
-    on that scale what is not positive, is left out."""
+    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale where any is positive. Losses that are
+    not finite, and on that scale not positive, are left out."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -101,7 +101,7 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Each component of what was found in a panel of its own, over whole numbers.
+    """Plot each component of found numbers in a panel of its own, over whole numbers.
 
     Args:
         x: (k,) evaluations or steps.
@@ -134,7 +134,7 @@ _MOST_IN_A_ROW = 4
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
-    """Images in a row, such as start, target and result; more than 4 in a grid, such as moments on the way.
+    """Plot images in a row, such as start, target and result; more than 4 in a grid, such as moments on the way.
 
     Args:
         images: one (rows, columns, 3) linear image for each panel, from 0 to 1; the first row is at the top.
@@ -178,7 +178,7 @@ def particles(
     lines: Sequence[ArrayLike] | None = None,
     dimension: int | None = None,
 ) -> Path:
-    """Particle sets side by side, such as before, after and target.
+    """Plot particle sets side by side, such as before, after and target.
 
     In 3-D one looks along the third axis: x to the right, y upwards, larger z nearer, nearer particles over
     farther ones. All panels share their scale. Above 150 000 particles, only every k-th is drawn.
@@ -224,7 +224,7 @@ def particles(
 def _bounds(
     sets: list[NDArray[Any]], container: tuple[ArrayLike, ArrayLike] | None
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Lower and upper corner (2,) [m] of what is to be seen, with a margin."""
+    """Return lower and upper corner (2,) [m] of the particles and the container, with a margin."""
     corners = [points[np.isfinite(points).all(axis=1), :2] for points in sets]
     if container is not None:
         corners.append(np.asarray(container, dtype=float)[:, :2])
@@ -237,7 +237,7 @@ def _bounds(
 
 
 class _ColourScale:
-    """Turns what the caller gave for colours into red, green, blue, with one scale for all panels."""
+    """A map from the caller's colours to red, green, blue, with one scale for all panels."""
 
     def __init__(self, sets: list[NDArray[Any]], colours: Sequence[NDArray[Any] | None]) -> None:
         from matplotlib.cm import ScalarMappable
@@ -255,19 +255,19 @@ class _ColourScale:
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
-        """(n, 3) in [0, 1]"""
+        """Return colours (n, 3) in [0, 1] of points, by given colours or by depth."""
         if colours is not None and colours.ndim == 2:
             return to_srgb(colours[None])[0] / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 
 def _depth(points: NDArray[Any]) -> NDArray[Any]:
-    """(n,) [m] the third component, zero in 2-D"""
+    """Return the depth (n,) [m] of points, their third component, zero in 2-D."""
     return points[:, 2] if points.shape[1] == 3 else np.zeros(len(points))
 
 
 def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str) -> None:
-    """Discs as large as the particles are apart, the nearer over the farther."""
+    """Draw discs as large as the particles are apart, the nearer over the farther."""
     from matplotlib.collections import EllipseCollection
 
     kept = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -285,7 +285,7 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
 
 
 def _spacing(points: NDArray[Any]) -> float:
-    """Median distance to the nearest neighbour [m], of at most a thousand particles."""
+    """Return the median distance to the nearest neighbour [m], of at most a thousand particles."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

@@ -24,12 +24,12 @@ Figures = list[tuple[str, str | Path]]
 _KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"}
 _VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm"}
 MOST_NUMBERS = 12
-"""That are written out one by one."""
+"""Most numbers that are written out one by one."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report; what is empty is left out, and with nothing in it all of it."""
+    """A part of a report with words, figures and a table; empty ones are left out."""
 
     title: str
     words: Sequence[object] = ()
@@ -41,13 +41,13 @@ class Section:
     view: str = ""
     """HTML of `particle_view`."""
     head: Sequence[str] = ()
-    """Of the columns of the table."""
+    """Heads of the columns of the table."""
     rows: Sequence[Sequence[object]] = ()
-    """Of the table; the first entry of each says what the others are."""
+    """Rows of the table; the first entry of each names the others."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
-    """Writes the report of a run and returns its path.
+    """Write the report of a run and return its path.
 
     Args:
         folder: the run; the command that made it, its scene and its environment end the page.
@@ -85,7 +85,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 
 
 def written(value: Any) -> str:
-    """A number, or a few of them, written out; of more, how many there are and from where to where they go."""
+    """Write out a number, or a few of them; of more, their count and range."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         return str(value)
@@ -141,7 +141,7 @@ def _figure(caption: str, path: Path) -> str:
 
 
 def _again(folder: RunFolder) -> str:
-    """The command of the run, and those that went on with it."""
+    """Return HTML of the command of the run, and of those that went on with it."""
     try:
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
         commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
@@ -155,7 +155,7 @@ def _again(folder: RunFolder) -> str:
 
 
 def _details(label: str, path: Path) -> str:
-    """A JSON file of the run, folded away."""
+    """Return HTML of a JSON file of the run, folded away."""
     if not path.exists():
         return ""
     text = path.read_text(encoding="utf-8")

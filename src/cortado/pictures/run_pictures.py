@@ -64,8 +64,8 @@ def run_pictures(
 def run_page(
     scene: Scene, trajectory: Trajectory, device: Any, values: NDArray | None = None, unit: str | None = None
 ) -> Page:
-    """The frames of a run by their number. ``values`` (frames, n): what the scene colours its particles by; ``unit``
-    of what all scenes do not have."""
+    """Return the frames of a run as pictures, by their number. ``values`` (frames, n) colour its particles; ``unit`` is
+    for a quantity that not all scenes have."""
     run, picture = ShownRun(scene, trajectory, values), scene.picture or Picture()
     if values is None:
         return Page([run.panel(run.stage, device, None)], fingerprint=run.fingerprint)
@@ -75,8 +75,8 @@ def run_page(
 
 
 def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
-    """Where a picture has a scale at its right edge: on it, or beside a narrower one if it would cover what is
-    shown."""
+    """Return the stage and the place of a scale at its right edge: on the picture, or beside a narrower one if the
+    scale would cover contents."""
     free = stage.picture.width - scale.columns(stage.picture.height)
     is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
     if not is_covered or free < LEAST_PIXELS:
@@ -85,12 +85,12 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 
 
 def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:
-    """HTML that shows a run; see `scene_view`."""
+    """Return HTML that shows a run in motion; see `scene_view`."""
     return scene_view(scene, {scene.name: list(trajectory)}, trajectory.times)
 
 
 Units = Mapping[str, str]
-"""Those of fields that not all scenes have, by their names."""
+"""Units of fields that not all scenes have, by their names."""
 
 
 def page_of(
@@ -101,8 +101,8 @@ def page_of(
     units: Units | None = None,
     simulation: Callable[[], Simulation] | None = None,
 ) -> Page:
-    """The frames of a run as pictures, with keys of [picture] replaced; ``simulation`` computes what was not
-    recorded."""
+    """Return the frames of a run as pictures, with keys of [picture] replaced; ``simulation`` computes unrecorded
+    colours."""
     known = dict.fromkeys(trajectory.others, "") if units is None else units
     pictured = shown_as(scene, settings, known)
     colour = (pictured.picture or Picture()).colour
@@ -118,7 +118,7 @@ def film_of(
     units: Units | None = None,
     simulation: Callable[[], Simulation] | None = None,
 ) -> Film:
-    """Write a film of a run; as `page_of`."""
+    """Write a film of a run, with the settings of `page_of`."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     pictured = shown_as(scene, settings, trajectory.others if units is None else units)
@@ -131,7 +131,7 @@ def film_of(
 
 
 def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[str, Any]) -> ShadedPicture:
-    """See `Simulation.picture`."""
+    """Draw a shaded picture of a frame, see `Simulation.picture`."""
     if not isinstance(frame, Frame):
         raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
     units = _units_of_fields(simulation)
@@ -143,7 +143,7 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Mapping[s
 def simulation_film(
     simulation: Simulation, trajectory: Trajectory, path: str | Path, settings: Mapping[str, Any]
 ) -> Film:
-    """See `Simulation.film`."""
+    """Write a film of a trajectory of a simulation, see `Simulation.film`."""
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
     units = _units_of_fields(simulation)
@@ -153,7 +153,7 @@ def simulation_film(
 def trajectory_picture(
     trajectory: Trajectory, k: int, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> ShadedPicture:
-    """See `Trajectory.picture`."""
+    """Draw a shaded picture of frame k of a trajectory, see `Trajectory.picture`."""
     count = len(trajectory)
     if k not in range(-count, count):
         raise InputError(f"k is {shown(k)}, but must be the number of one of {count} frames, such as 0 or -1.")
@@ -164,12 +164,12 @@ def trajectory_picture(
 def trajectory_film(
     trajectory: Trajectory, path: str | Path, scene: Scene | str | Path | None, device: str, settings: Mapping[str, Any]
 ) -> Film:
-    """See `Trajectory.film`."""
+    """Write a film of a trajectory, see `Trajectory.film`."""
     return film_of(trajectory, _scene_of(trajectory, scene), path, device_of(device), settings)
 
 
 def device_of(name: str) -> Any:
-    """Warp's device of that name; raises `InputError` where there is none."""
+    """Return Warp's device of a name; raise `InputError` where there is none."""
     start_warp()
     return device_named(name)
 
@@ -182,14 +182,14 @@ def _scene_of(trajectory: Trajectory, given: Scene | str | Path | None) -> Scene
 
 
 def _units_of_fields(simulation: Simulation) -> dict[str, str]:
-    """The units of the fields of particles that a part of one's own keeps, by their names."""
+    """Return the units of the particles' fields that a user's own part keeps, by their names."""
     drawn = (Entry.NUMBER, Entry.VECTOR)
     known = (field for field in simulation.initial.fields if field.entry in drawn and field.axis is Axis.PARTICLE)
     return {field.name: field.unit for field in known if field.name not in NAMES}
 
 
 def _alone(frame: Frame) -> Trajectory:
-    """The trajectory of one frame."""
+    """Return the trajectory of one frame."""
     arrays = {"positions": frame.positions, "velocities": frame.velocities, "mass_fractions": frame.mass_fractions}
     return Trajectory(
         times=np.array([frame.time]),
@@ -202,12 +202,12 @@ def _alone(frame: Frame) -> Trajectory:
 
 
 WIDE = 16.0 / 9.0
-"""Columns over rows of pictures of so many lines."""
+"""Ratio of columns to rows of pictures of which only the number of lines is given."""
 
 
 def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] = ()) -> Scene:
-    """The scene with keys of [picture] replaced. ``lines`` sets width and height, and ``camera`` takes a path too, such
-    as `pictures.Orbit`; ``colour`` may name one of ``fields``, which not all scenes have.
+    """Return the scene with keys of [picture] replaced. ``lines`` sets width and height, and ``camera`` takes a path
+    too, such as `pictures.Orbit`; ``colour`` may name one of ``fields``, which not all scenes have.
 
     Raises:
         SceneError: settings that do not fit.
@@ -233,7 +233,7 @@ def shown_as(scene: Scene, settings: Mapping[str, Any], fields: Collection[str] 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
+    """Plot density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
     marked.
 
     Args:
@@ -267,7 +267,7 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """A curve for each number of each sensor, those of one unit in one panel."""
+    """Plot a curve for each number of each sensor, those of one unit in one panel."""
     each = [(name, own, column, unit) for name, own in found.items() for column, unit in own.units.items()]
     lines = [(f"{name} {column}", unit, own, column) for name, own, column, unit in each]
     units = list(dict.fromkeys(unit for _, unit, _, _ in lines))
@@ -285,7 +285,7 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """A panel for each number that was measured: its points, the curve of the sensor, and the error in the title."""
+    """Plot a panel for each measured number: its points, the curve of the sensor, and the error in the title."""
     with drawing(path, height=1.5 + 2.5 * len(measured)) as figure:
         panels = figure.subplots(len(measured), 1, sharex=True, squeeze=False)[:, 0]
         for panel, one in zip(panels, measured, strict=True):
@@ -306,7 +306,8 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Four panels: central differences against forward mode, the adjoint's growth, the horizon, and the estimators.
+    """Plot four panels: central differences against forward mode, the adjoint's growth, the horizon, and the
+    estimators.
 
     The horizon is that of the parameter with the shortest one. Where the adjoint is wrong, the last two panels are
     empty.

@@ -15,13 +15,13 @@ from cortado.scene.scene import Scene
 
 Numbers = NDArray[np.int64]
 SAME = 1e-9
-"""Of the size of all: how near vertices are that are one."""
+"""Distance below which vertices are one, relative to the size of all."""
 SHARP = 0.8
 """Cosine of the angle between the normals of two triangles below which the edge between them is sharp."""
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """The same triangles with one vertex where there were several, and which are kept: those that have an area."""
+    """Return triangles with one vertex where there were several, and a mask of the kept ones, which have an area."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -30,29 +30,29 @@ def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray
 
 
 def sides_of(corners: Numbers) -> Numbers:
-    """(3 t, 2) the sides of triangles (t, 3), those across each corner in turn."""
+    """Return the sides (3 t, 2) of triangles (t, 3), those across each corner in turn."""
     return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
 
 
 def lengths_of(vertices: Points, sides: Numbers) -> Points:
-    """(s,) how long sides (s, 2) are [m]."""
+    """Return the lengths (s,) of sides (s, 2) [m]."""
     return np.asarray(np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1))
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
-    """(t, 3) normals of triangles, outwards, as long as twice the area of each [m2]."""
+    """Return normals (t, 3) of triangles, outwards, as long as twice the area of each [m2]."""
     a, b, c = vertices[corners].transpose(1, 0, 2)
     return np.asarray(np.cross(b - a, c - a))
 
 
 def unit(vectors: NDArray[Any]) -> Points:
-    """Vectors (..., 3), each 1 long, but for those of no length."""
+    """Scale vectors (..., 3) to a length of 1, but for those of no length."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """(t, 3) of the angle between the normals of each triangle and the one beyond the side across each corner; -1 where
-    there is not one beyond it."""
+    """Return cosines (t, 3) of the angle between the normals of each triangle and the one beyond the side across each
+    corner; -1 without exactly one triangle beyond it."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -62,7 +62,7 @@ def cosines_of(vertices: Points, corners: Numbers) -> Points:
 
 @dataclass(frozen=True)
 class ShownSolid:
-    """A solid in a pose."""
+    """A solid in a pose, as pictures show it."""
 
     name: str
     shape: Solid
@@ -73,40 +73,40 @@ class ShownSolid:
     """(d, d) rotation matrix"""
     finish: Finish
     is_tank: bool
-    """Whether fluid is inside of it."""
+    """True where fluid is inside of it."""
 
     @property
     def colour(self) -> Points:
-        """(3,) linear"""
+        """Return the linear colour (3,) of the solid."""
         return np.array(self.finish.colour)
 
     @property
     def transparency(self) -> float:
-        """From 0 to 1."""
+        """Return the transparency of the solid, from 0 to 1."""
         return self.finish.transparency
 
     @property
     def body(self) -> Solid:
-        """The shape in its place."""
+        """Return the shape in its place."""
         return Placed(self.shape, self.position, self.turn)
 
     @property
     def solid(self) -> Solid:
-        """Where fluid cannot be."""
+        """Return the solid where fluid cannot be: outside of the cavity for a tank."""
         return Hollow(self.body) if self.is_tank else self.body
 
     def moved(self, position: Points, turn: Points) -> "ShownSolid":
-        """In another pose: its middle at a position (d,) [m], turned by a matrix (d, d)."""
+        """Return the solid in another pose: its middle at a position (d,) [m], turned by a matrix (d, d)."""
         return replace(self, position=position, turn=turn)
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """In other axes: those of a frame (d, d), from an origin (d,) [m]."""
+        """Return the solid in other axes: those of a frame (d, d), from an origin (d,) [m]."""
         return self.moved(frame @ (self.position - origin), frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Those of a scene, where its tables have them, of those that went on beyond the end of a period the images within
-    it; and behind them the images that are a period away and reach into the container."""
+    """Return the solids of a scene where its tables have them, or as images within a period that they went beyond;
+    behind them the images a period away that reach into the container."""
     found, domain = [], scene.container.domain(scene.dimension)
     for table in scene.solid:
         shape, middle = table.shape_about()
@@ -122,46 +122,46 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
 
 
 def extents_of_solids(scenes: Iterable[Scene]) -> list[tuple[Points, Points]]:
-    """Lower and upper ends (d,) [m] of each solid in scenes."""
+    """Return lower and upper ends (d,) [m] of each solid in scenes."""
     return [one.body.extent() for scene in scenes for one in shown_solids(scene)]
 
 
 def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:
-    """Lower and upper ends (d,) [m] of all that is between such, and of the solids of scenes."""
+    """Return lower and upper ends (d,) [m] of a box and of the solids of scenes together."""
     return union([ends, *extents_of_solids(scenes)])
 
 
 def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Lower and upper ends (d,) [m] of all that is in boxes, which are pairs of such ends."""
+    """Return lower and upper ends (d,) [m] of boxes, which are pairs of such ends."""
     both = np.array(boxes)
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 
 def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:
-    """Whether two boxes do."""
+    """Test whether two boxes overlap."""
     return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())
 
 
 SIDES = 48
-"""Of the polygon that stands for a circle."""
+"""Number of sides of the polygon that stands for a circle."""
 FLAT = 1.0 - 1e-9
 """Cosine of the angle between triangles below which they are not of one plane."""
 
 
 def solid_outline(scene: Scene) -> Points:
-    """(k, 2, d) ends of the lines that draw the solids of a scene at rest [m]; none without solids."""
+    """Return ends (k, 2, d) [m] of the lines that draw the solids of a scene at rest; none without solids."""
     lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
     return np.concatenate([np.zeros((0, 2, scene.dimension)), *lines])
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """Faces of a solid about its middle, not turned, few enough for lines and for viewers."""
+    """Return faces of a solid about its middle, not turned, few enough for lines and for viewers."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
-    """(k, 2, d) ends of the lines that draw a solid about its middle, not turned [m]."""
+    """Return ends (k, 2, d) [m] of the lines that draw a solid about its middle, not turned."""
     faces = own_faces(shown)
     if len(shown.turn) == 2:
         return faces.vertices[faces.corners]
@@ -173,7 +173,7 @@ def own_lines(shown: ShownSolid) -> Points:
 
 
 def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
-    """(k, 2, 3) [m] lines where triangles cross the plane through the origin across an axis."""
+    """Return lines (k, 2, 3) [m] where triangles cross the plane through the origin across an axis."""
     above = points[:, axis] >= 0.0
     crossing = corners[(above[corners] != above[corners[:, :1]]).any(axis=1)]
     start, end = points[sides_of(crossing)].transpose(1, 0, 2)
@@ -184,7 +184,7 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Triangles (t, 3) of vertices (v, 3) [m] cut into smaller ones, and of which triangle each is a part, (p,).
+    """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller ones, and return the parent (p,) of each.
 
     Every side has a power of two of equal parts, as many as it needs to have none longer than ``longest`` [m], so that
     triangles beside each other fit; other sides of the parts are at most the square root of 2 longer.
@@ -205,12 +205,12 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
 
 
 def _parts(lengths: Points, longest: float) -> Numbers:
-    """Into how many parts a side is cut."""
+    """Return into how many parts a side is cut."""
     return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
 
 
 def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Triangles, each of whose long sides is cut in two again and again."""
+    """Cut each long side of triangles in two again and again."""
     while len(corners):
         sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)
         is_long = _parts(lengths_of(vertices, sides), longest) > 1
@@ -224,7 +224,7 @@ def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float
 
 
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """Triangles (t, 3) in parts: ``middles`` (t, 3) is the new vertex of the side across each corner, or -1."""
+    """Cut triangles (t, 3) into parts: ``middles`` (t, 3) is the new vertex of the side across each corner, or -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -243,8 +243,8 @@ def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers,
 
 
 def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> tuple[Points, Numbers, Numbers]:
-    """Thin triangles (t, 3, 3) [m], cut across their long sides: that from the first corner to the second into
-    ``first`` parts, that to the third into ``second`` parts."""
+    """Cut thin triangles (t, 3, 3) [m] across their long sides: that from the first corner to the second into ``first``
+    parts, that to the third into ``second`` parts."""
     tip, *ends = triangles.transpose(1, 0, 2)
     rows = [tip + (k / n) * (end - tip) for n, end in zip((first, second), ends, strict=True) for k in range(1, n + 1)]
     vertices = np.stack([tip, *rows], axis=1)
@@ -263,14 +263,14 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
 
 
 ROUNDS = 8
-"""Of smoothing, which takes away the steps that light from few directions has on what is round."""
+"""Rounds of smoothing, which removes the steps that light from few directions leaves on round solids."""
 FAR = 1e9
-"""How far from a sharp edge a triangle is that has none [m]."""
+"""Distance [m] from a sharp edge of a triangle that has none."""
 
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """Triangles in space, outside on the side from which their corners run counterclockwise."""
+    """A mesh of triangles of solids in space; outside is the side from which corners run counterclockwise."""
 
     points: Points
     """(p, 3) [m]"""
@@ -279,12 +279,12 @@ class SolidMesh:
     triangles: Numbers
     """(t, 3) numbers of points"""
     from_edges: Points
-    """(t, 3, 3) how far each corner (a column) is from each side (a row) of the face that its triangle is part of [m];
+    """(t, 3, 3) distance of each corner (a column) from each side (a row) of the face that its triangle is part of [m];
     `FAR` where the side is no sharp edge"""
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
-        """Of the surface of a solid in 3-D, with sides no longer than about ``longest`` [m]."""
+        """Make the mesh of the surface of a solid in 3-D, with sides no longer than about ``longest`` [m]."""
         flat_points, flat_corners, _ = merged(faces.vertices, faces.corners)
         points, corners, parents = refined(flat_points, flat_corners, longest)
         across = across_of(points, corners)
@@ -295,7 +295,7 @@ class SolidMesh:
         return cls(points[corners.ravel()[chosen]], normals.reshape(-1, 3)[chosen], number.reshape(-1, 3), from_edges)
 
     def smoothed(self, values: Points) -> Points:
-        """Values (p, c) at points, smoothed along the surface but not across sharp edges."""
+        """Smooth values (p, c) at points along the surface but not across sharp edges."""
         from scipy.sparse import csr_matrix
 
         ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -308,12 +308,12 @@ class SolidMesh:
         return values
 
     def moved(self, turn: Points, position: Points) -> "SolidMesh":
-        """Turned by a matrix (3, 3) and then moved (3,) [m]."""
+        """Return the mesh turned by a matrix (3, 3) and then moved (3,) [m]."""
         return SolidMesh(self.points @ turn.T + position, self.normals @ turn.T, self.triangles, self.from_edges)
 
     @classmethod
     def joined(cls, parts: Sequence["SolidMesh"]) -> "SolidMesh":
-        """Several as one."""
+        """Join several meshes to one."""
         starts = np.cumsum([0, *(len(part.points) for part in parts)])
         return cls(
             points=np.concatenate([part.points for part in parts]),
@@ -324,7 +324,7 @@ class SolidMesh:
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """(t, 3, 3) at each corner the mean of the normals of triangles there, but for those beyond sharp edges."""
+    """Return at each corner (t, 3, 3) the mean of the normals of triangles there, without those beyond sharp edges."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)
@@ -340,7 +340,8 @@ def _normals(corners: Numbers, across: Points) -> Points:
 
 
 def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Numbers) -> Points:
-    """As `SolidMesh.from_edges`: triangles (p, 3, 3) [m] that are parts of triangles (t, 3), the parents (p,)."""
+    """Compute `SolidMesh.from_edges` of triangles (p, 3, 3) [m] that are parts of parents (p,) among triangles (t,
+    3)."""
     sides = points[sides_of(corners).reshape(-1, 3, 2)]
     across = unit(across_of(points, corners))
     inwards = unit(np.cross(across[:, None], sides[:, :, 1] - sides[:, :, 0]))
@@ -350,7 +351,7 @@ def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Number
 
 
 def turn_in_space(turn: Points) -> Points:
-    """A rotation (d, d) as one of space, about z in the plane."""
+    """Return a rotation (d, d) as one of space, about z in the plane."""
     found = np.eye(3)
     found[: len(turn), : len(turn)] = turn
     return found

@@ -84,7 +84,7 @@ def film_side_by_side(
 
 
 def _trajectories(runs: Any) -> list[Trajectory]:
-    """Those that were given, with labels or without; raises `InputError` for anything else."""
+    """Return the given trajectories, with labels or without; raise `InputError` for anything else."""
     each = runs.values() if isinstance(runs, Mapping) else runs
     if not isinstance(each, Iterable) or isinstance(runs, Trajectory):
         raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
@@ -98,7 +98,7 @@ def _trajectories(runs: Any) -> list[Trajectory]:
 def shown_alike(
     scenes: Sequence[Scene], trajectories: Sequence[Trajectory], settings: Mapping[str, Any]
 ) -> list[Scene]:
-    """The scenes of runs with the table [picture] of the first one, of which keys are replaced as by `shown_as`. Raises
+    """Return the scenes of runs with the table [picture] of the first one, whose keys `shown_as` replaces. Raises
     `InputError` for runs that cannot be side by side, and where a package is missing."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but from 1 to {MOST_PICTURES} can be side by side.")
@@ -119,7 +119,7 @@ def shown_alike(
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Runs of scenes that are `shown_alike`, each with its name and its time; and the times of its frames [s]."""
+    """Return a page with runs of scenes that are `shown_alike`, each with name and time, and its frames' times [s]."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -141,7 +141,7 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
 
 
 def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
-    """The pictures of a panel of the frames that are shown, with a name and a time on them."""
+    """Return the pictures of a panel for shown frames, with a name and a time on them."""
 
     def drawn(k: int, around: Around) -> Points:
         before, after = (tuple(int(shown.nearest[n]) for n in side) for side in around)
@@ -151,18 +151,18 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def _composed(across: int, scale: Scale | None, images: list[Points]) -> Points:
-    """The page, with the scale beside it."""
+    """Put pictures together to the page, with the scale beside it."""
     page = side_by_side(images, across)
     return page if scale is None else scale.beside(page)
 
 
 SAME = 0.01
-"""Of the time between two frames: those that are apart by less are at the same time."""
+"""Part of the time between two frames below which they count as simultaneous."""
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """(frames,) [s] of a film of runs whose frames are at times (own frames,): those of the run with most frames in a
-    second, and before and after it those of others."""
+    """Return the times (frames,) [s] of a film of runs with frames at times (own frames,): those of the run with most
+    frames in a second, and before and after it those of others."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -175,13 +175,13 @@ def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def interval_of(times: NDArray[Any]) -> float:
-    """The usual time between two frames [s]; infinite with a single one."""
+    """Return the usual time between two frames [s]; infinite with a single one."""
     return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class ShownFrames:
-    """Which frames of one run a film shows: at each of its times the nearest one that was recorded."""
+    """The frames of one run that a film shows: at each of its times the nearest one that was recorded."""
 
     own: NDArray[Any]
     """(own frames,) when they were recorded [s]"""
@@ -190,29 +190,29 @@ class ShownFrames:
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
-        """(frames,) the number of the run's frame."""
+        """Return the numbers (frames,) of the run's frames."""
         return np.rint(np.interp(self.times, self.own, np.arange(len(self.own)))).astype(np.int64)
 
     @cached_property
     def during(self) -> NDArray[np.bool_]:
-        """(frames,) whether the run has begun, and has not ended yet."""
+        """Return a mask (frames,) of the times when the run has begun, and has not ended yet."""
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     @property
     def off(self) -> float:
-        """How far a frame is from the time at which it is shown, at most, while the run goes on [s]."""
+        """Return the greatest time [s] between a frame and its showing, while the run goes on."""
         return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
 
     def time_in_words(self, k: int) -> str:
-        """When the frame was recorded that is shown as frame k, with as many digits as tell frames apart."""
+        """Write the recording time of the frame that is shown as frame k, with enough digits to tell frames apart."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"
         return time if self.during[k] else f"stands still at {time}"
 
     def notes(self, name: str) -> list[str]:
-        """What is to be said of a run of that name."""
+        """Return notes for the viewer about a run of that name: a late begin, an early end."""
         ends = f'"{name}" ends at {self.own[-1]:.4g} s and stands still from then on'
         begins = f'"{name}" begins at {self.own[0]:.4g} s'
         return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
@@ -224,7 +224,7 @@ MOST_KEYS, LONGEST = 3, 64
 
 
 def differences(one: Any, other: Any, name: str = "") -> dict[str, list[Any]]:
-    """Both values of whatever differs, by dotted names."""
+    """Return both values of whatever differs in two objects, by dotted names."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, _MISSING), other.get(key, _MISSING)) for key in {**one, **other}}
     elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _has_tables(one):
@@ -242,9 +242,9 @@ def _has_tables(values: list[Any]) -> bool:
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """What each of several scenes is called beside the others: its name if all names differ, or else the values in
-    which the scenes differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values
-    differ, or too many."""
+    """Return a label for each of several scenes: its name if all names differ, or else the values in which the scenes
+    differ, such as ``viscosity = 0.1 Pa s``. ``otherwise``: what they are called where no values differ, or too
+    many."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table)))
     short = [key.rpartition(".")[2] for key in keys]
@@ -261,7 +261,7 @@ def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
 
 
 def _value(table: Any, key: str) -> str:
-    """What a table of a scene has under a dotted name, in words."""
+    """Write the value of a table of a scene under a dotted name."""
     for part in key.split("."):
         try:
             table = table[int(part)] if isinstance(table, list) else table[part]

@@ -22,19 +22,19 @@ than all others a picture is, in their widths."""
 NEAR = 0.25
 """How far from the first state, solids and container fluid is near enough for every drop to count, in their size."""
 ENOUGH = 1_000_000
-"""Positions, of all particles in all frames, that tell where the fluid comes to."""
+"""Number of positions, of all particles in all frames, that tell where the fluid comes to."""
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """The states (m, d) [m] that say where the fluid comes to, of positions (n, d) or (frames, n, d) [m]: all of them,
-    with `ENOUGH` positions together if there are more, as their images within the period of a domain."""
+    """Return states (m, d) [m] of positions (n, d) or (frames, n, d) [m] that tell where the fluid comes to: all, or
+    `ENOUGH` positions together if there are more. They are images within the period of a domain."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
+    """Return lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
 
     ``around`` are the ends of everything else in the picture. All of the first state counts. Of a later state the bulk
     counts, and drops that are near the first state and near everything else: drops that fall far away do not make the
@@ -58,22 +58,22 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Lower and upper ends (d,) [m] of positions (n, d) [m] without a share of them at either end of each axis."""
+    """Return lower and upper ends (d,) [m] of positions (n, d) [m], without a share of them at both ends of an axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
 
 TINT = 2.6
-"""How much sooner light takes the colour of a fluid without a material than it is scattered."""
+"""Ratio of the depth at which light is scattered to that at which it takes the colour of a fluid without a material."""
 SPAN = 0.1
-"""How thick fluid is that transparency is said of, in sizes of what is shown."""
+"""Thickness of fluid for which transparency is told, in sizes of the contents."""
 LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
 """How often light is scattered within a spacing of what is opaque."""
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """(phases, 2) scattering and absorption [1/m] where what is shown has a size [m], and the part of the light that
-    goes through `SPAN` of it, the mean of all phases.
+    """Return scattering and absorption (phases, 2) [1/m] for contents of a size [m], and the part of light that goes
+    through `SPAN` of it, the mean of all phases.
 
     They are those of materials, unless the picture has a transparency of its own or particles have other colours than
     those of phases. A layer of particles hides what is behind it where fluid without a material is opaque.
@@ -100,15 +100,15 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 
 
 MARGIN = 1.10
-"""How much wider a picture is than what it shows."""
+"""Ratio of a picture's width to that of its contents."""
 AROUND = 1.08
-"""How much further off a camera is that goes around, as what is shown is not in its middle from all sides."""
+"""Factor by which a camera that goes around is further off, as the contents are not in its middle from all sides."""
 AIR = 0.1
-"""Beside fluid that no container holds, in its widths."""
+"""Space beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
 AZIMUTH = 24.0
-"""Of the camera, to the right of the direction towards the viewer [degrees]."""
+"""Azimuth of the camera, to the right of the direction towards the viewer [degrees]."""
 
 
 @dataclass(frozen=True)
@@ -120,35 +120,35 @@ class Stage:
     origin: Points
     """(3,) [m], in the scene's axes"""
     lower: Points
-    """(3,) of what is shown [m], in the frame of the picture"""
+    """(3,) lower ends of the contents [m], in the frame of the picture"""
     upper: Points
     """(3,) [m]"""
     seen: tuple[Points, Points]
     """Lower and upper ends (3,) [m] of what the camera sees, in the frame of the picture."""
     elevation: float
-    """Of the camera, where nobody said where it is [degrees]."""
+    """Elevation of the camera, where the picture does not place it [degrees]."""
     eye: Points
     """(3,) where the camera is [m]"""
     look_at: Points
     """(3,) [m]"""
     azimuth: float
-    """From which the camera looks at home: the lamps stay where they are when it moves [degrees]."""
+    """Azimuth from which the camera looks at home: the lamps stay where they are when it moves [degrees]."""
     picture: Picture
     container: Any
     spacing: float
     """[m]"""
     transparency: float
-    """Of a tenth of what is shown, filled with fluid: from 0 to 1."""
+    """Transparency of a tenth of the contents, filled with fluid: from 0 to 1."""
     media: Points
     """(phases, 2) scattering and absorption [1/m], as `media_of`"""
     cuts: bool
-    """Whether fluid is shown within the container only."""
+    """True where fluid is shown within the container only."""
     solids: tuple[ShownSolid, ...]
-    """In the frame of the picture."""
+    """The solids in the frame of the picture."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
-        """The stage of a scene in 3-D, the fluid of which is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` as of
+        """Make the stage of a scene in 3-D, whose fluid is at positions (n, 3) or (frames, n, 3) [m]; ``poses`` as of
         `painter`."""
         states, picture = thinned(positions, scene.container.domain(3)), scene.picture or Picture()
         ends = scene.container.extent()
@@ -178,7 +178,7 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """The same in a picture of another size, with a camera that sees all that is between ``ends`` (3,) [m], in the
+        """Return the stage in a picture of another size, with a camera that sees all between ``ends`` (3,) [m], in the
         scene's axes, or is where the picture says."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
@@ -193,22 +193,22 @@ class Stage:
 
     @property
     def ends(self) -> tuple[Points, Points]:
-        """Lower and upper ends (3,) [m] of what is shown, in the scene's axes."""
+        """Return lower and upper ends (3,) [m] of the contents, in the scene's axes."""
         return _box(corners(self.lower, self.upper) @ self.frame + self.origin)
 
     @property
     def seen_size(self) -> Points:
-        """(2,) how wide and high what the camera sees is [m], across its direction."""
+        """Return width and height (2,) [m] of the camera's view of the contents, across its direction."""
         return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
     def home(self) -> View:
-        """Where the camera is, in the scene's axes."""
+        """Return the view of the camera at its own place, in the scene's axes."""
         return View(*(self.frame.T @ place + self.origin for place in (self.eye, self.look_at)))
 
     @property
     def home_around(self) -> View:
-        """The same, but as far off, if nobody said where, as it has to be to see everything from all sides."""
+        """Return the home view, but far enough to see all from all sides, if the picture does not place the camera."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -219,7 +219,7 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """The same with solids where a scene has them, and with the camera at a view, each if it is given."""
+        """Return the stage with solids where a scene has them, and with the camera at a view, each if it is given."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -231,26 +231,26 @@ class Stage:
 
     @property
     def cuts_solids(self) -> bool:
-        """Whether solids are shown within the container only: not beside a cup without a lid."""
+        """Return True where solids are shown within the container only: not beside a cup without a lid."""
         return bool(getattr(self.container, "lid", self.container.extent() is not None))
 
     @property
     def size(self) -> float:
-        """The longest side of what is shown [m]."""
+        """Return the longest side of the contents [m]."""
         return float((self.upper - self.lower).max())
 
     @property
     def clearness(self) -> float:
-        """The part of the light that fluid lets through onto other fluid."""
+        """Return the part of the light that fluid lets through onto other fluid."""
         return 0.85 * self.transparency
 
     def placed(self, positions: Points) -> Points:
-        """Positions (n, 3) [m] of the scene in the frame of the picture."""
+        """Return positions (n, 3) [m] of the scene in the frame of the picture."""
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """(n, 2) the column and the row, counted in pixels from the upper left corner, where points (n, 3) [m] of the
-        scene are in the picture."""
+        """Return column and row (n, 2), in pixels from the upper left corner, where points (n, 3) [m] of the scene are
+        in the picture."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -260,12 +260,12 @@ class Stage:
 
     @property
     def up_axis(self) -> int:
-        """Which axis of the scene is upright."""
+        """Return the axis of the scene that is upright."""
         return int(np.abs(self.frame[1]).argmax())
 
     @property
     def glass_frame(self) -> Points:
-        """(3, 3) from the frame of the picture to one in which the axis of a cylinder is the second."""
+        """Return the rotation (3, 3) from the picture's frame to one in which a cylinder's axis is the second."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
         axis = INDEX_OF_AXIS[self.container.axis]
@@ -274,13 +274,13 @@ class Stage:
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:
-        """Lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
+        """Return lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
         return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Where fluid is shown, (3,) each [m], in the frame of the glass; infinite upwards, where an emitter may be,
-        and along an axis that is periodic."""
+        """Return the ends, (3,) each [m], of the space where fluid is shown, in the frame of the glass; infinite
+        upwards, where an emitter may be, and along an axis that is periodic."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -293,7 +293,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """(2, 3) 1 where a box has a pane of glass at its lower and at its upper ends; it is open on top."""
+        """Return (2, 3) 1 where a box has a pane of glass at its lower and at its upper ends; it is open on top."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -302,27 +302,27 @@ class Stage:
 
     @property
     def sun(self) -> Points:
-        """(3,) unit vector towards the lamp: behind the camera, on its left."""
+        """Return the unit vector (3,) towards the lamp: behind the camera, on its left."""
         light = self.picture.sun_and_sky
         return self._direction(light.azimuth, light.elevation)
 
     @property
     def fill(self) -> Points:
-        """(3,) unit vector towards the weak lamp: on the right, low."""
+        """Return the unit vector (3,) towards the weak lamp: on the right, low."""
         return self._direction(70.0, 28.0)
 
     def _direction(self, azimuth: float, elevation: float) -> Points:
-        """(3,) unit vector; the azimuth [degrees] counts from the camera at home, to the right."""
+        """Return a unit vector (3,); the azimuth [degrees] counts from the camera at home, to the right."""
         return _towards(self.azimuth + azimuth, elevation)
 
 
 def _box(points: Points) -> tuple[Points, Points]:
-    """Lower and upper ends (3,) of points (n, 3)."""
+    """Return lower and upper ends (3,) of points (n, 3)."""
     return points.min(axis=0), points.max(axis=0)
 
 
 def spilled(container: Container, positions: Points, spacing: float) -> bool:
-    """Whether fluid at positions (n, 3) [m] came over the rim of a cup."""
+    """Test whether fluid at positions (n, 3) [m] came over the rim of a cup."""
     if not isinstance(container, CylinderContainer) or container.lid:
         return False
     off = np.delete(positions - np.asarray(container.base), INDEX_OF_AXIS[container.axis], axis=1)
@@ -330,8 +330,8 @@ def spilled(container: Container, positions: Points, spacing: float) -> bool:
 
 
 def upright(gravity: Points) -> Points:
-    """(3, 3) rotation from the scene's axes to right, up, towards the viewer: up is the axis against gravity (3,), y
-    where there is none."""
+    """Return the rotation (3, 3) from the scene's axes to right, up, towards the viewer: up is the axis against gravity
+    (3,), y where there is none."""
     axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
     up, towards = np.zeros(3), np.zeros(3)
     up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
@@ -347,7 +347,7 @@ def _towards(azimuth: float, elevation: float) -> Points:
 def fitted(
     lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH
 ) -> tuple[Points, Points]:
-    """A place for the camera and one to look at, (3,) each [m], for a box to fill the picture."""
+    """Return a place for the camera and one to look at, (3,) each [m], for a box to fill the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
     halves = half, half * picture.height / picture.width
@@ -364,7 +364,7 @@ def fitted(
 
 
 def screen_axes(forward: Points) -> tuple[Points, Points]:
-    """Unit vectors (3,) to the right and upwards on the screen of a camera that looks along ``forward`` (3,)."""
+    """Return unit vectors (3,) to the right and upwards on the screen of a camera that looks along ``forward`` (3,)."""
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right)

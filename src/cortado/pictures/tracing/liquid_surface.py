@@ -25,15 +25,15 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_of, smoothed, triangles_of
 
 NEIGHBOURS = 24
-"""Particles that a point of the surface has its colour from."""
+"""Number of particles from which a point of the surface has its colour."""
 
 ROUND = 10_000
-"""Spheres up to which each has 128 triangles, and 32 beyond."""
+"""Most spheres that have 128 triangles each; beyond they have 32."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles in space, outside on the side from which their corners run counter-clockwise."""
+    """A surface of triangles in space; outside is the side from which their corners run counter-clockwise."""
 
     points: Points
     """(p, 3) [m]"""
@@ -46,8 +46,8 @@ class Surface:
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:
-    """(p, 3) at points (p, d) [m]: the mean over particles at positions (n, d) [m] with colours (n, 3), of which those
-    nearest by count most."""
+    """Return colours (p, 3) at points (p, d) [m]: the mean over particles at positions (n, d) [m] with colours (n, 3),
+    of which the nearest count most."""
     from scipy.spatial import cKDTree
 
     distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=usable_cores())
@@ -57,7 +57,7 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
 
 
 def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
-    """A sphere around each of the particles (n, 3) [m], in its colour (n, 3), that touches those next to it."""
+    """Make a sphere around each of the particles (n, 3) [m], in its colour (n, 3), that touches those next to it."""
     corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
     return Surface(
@@ -70,7 +70,7 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Corners (k, 3) of a unit sphere and its triangles: an octahedron, each triangle cut into four again and again."""
+    """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four repeatedly."""
     corners = [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]
     triangles = [(a, b, c) if s > 0 else (a, c, b) for a, b, c, s in _octants()]
     for _ in range(levels):
@@ -94,14 +94,14 @@ def _sphere(levels: int) -> tuple[Points, np.ndarray]:
 
 
 def _octants() -> list[tuple[int, int, int, int]]:
-    """The three corners of each face of an octahedron, and the sign of the way round."""
+    """Return the three corners of each face of an octahedron, and the sign of the way round."""
     return [(i, 2 + j, 4 + k, (-1) ** (i + j + k)) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
 
 REACH = 3.0
-"""Of the bumps of particles, in spacings."""
+"""Reach of the particles' bumps, in spacings."""
 REACH_OF_COLOURS = 2.25
-"""Of what colours come from."""
+"""Reach within which particles give colours, in spacings."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 """Of smoothing: of the surface, and of the light on it, which comes from few directions."""
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
@@ -109,9 +109,9 @@ CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
 WeightedLook = wp.types.vector(6, wp.float32)
 """A `Look` times a weight, and the weight."""
 MOST_CELLS = 1 << 26
-"""One spacing wide, in which particles are looked for."""
+"""Most cells, one spacing wide, in which particles are looked for."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
-"""[1/m] of scattering and of absorption, which cannot be seen."""
+"""Scattering and absorption [1/m] that cannot be seen."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
 """Sum of the bumps of all particles around one within a lattice; on a side, an edge or a corner of the lattice it is
 less by exp(-1.93 a²), where the mean place of these particles is a spacings aside."""
@@ -127,7 +127,7 @@ FULL = wp.constant(wp.float32(2.84))
 
 @dataclass(frozen=True)
 class LiquidSurface:
-    """Triangles on a device, outside on the side from which their corners run counter-clockwise."""
+    """A fluid's surface of triangles on a device; outside is the side from which corners run counter-clockwise."""
 
     points: wp.array
     """(p,) of vec3 [m]"""
@@ -143,21 +143,21 @@ class LiquidSurface:
     """(p,) the points beside each, as `smoothed` takes them"""
 
     def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
-        """The light at its points (p,) of vec3 without the steps that few directions leave."""
+        """Return the light at its points (p,) of vec3 without the steps that few directions leave."""
         everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
         return smoothed(light, self.neighbours, everywhere, ROUNDS_OF_LIGHT, launch)
 
 
 @wp.func
 def crowd(s: NearParticles, j: wp.int32):
-    """How many others are near a particle, by its volume, times that, and the volume itself."""
+    """Return the number of other particles near a particle, by its volume, times that, and the volume itself."""
     return s.volumes[j] * wp.vec2(1.0 / s.volumes[j] - 1.0, 1.0)
 
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
-    """Colours count by themselves, media by their logarithms: milk across a wall, that is far and scatters ten thousand
-    times as much, makes no milk of water."""
+    """Return a particle's look for averages: colours count by themselves, media by their logarithms. Milk across a
+    wall, which is far and scatters ten thousand times more, makes no milk of water."""
     x = s.looks[j]
     return WeightedLook(x[0], x[1], x[2], wp.log(x[3] + CLEAREST), wp.log(x[4] + CLEAREST), 1.0)
 
@@ -167,7 +167,7 @@ crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_weights(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, weights: Floats):
-    """How much each corner is smoothed: little where few particles are (Löschner et al. 2023)."""
+    """Compute how much each corner is smoothed: little where few particles are (Löschner et al. 2023)."""
     v = first + wp.tid()
     near = crowd_near(s, points[v], reach)
     x = wp.min(near[0] / wp.max(near[1], 1.0e-9) / FULL, 1.0)
@@ -187,7 +187,7 @@ def find_looks(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec
 
 @wp.func
 def place(s: NearParticles, j: wp.int32):
-    """Places add up to their mean, and how many they are."""
+    """Return a particle's place and 1: sums of them give the mean place and the number of particles."""
     x = s.places[j] - s.lower
     return wp.vec4(x[0], x[1], x[2], 1.0)
 
@@ -197,7 +197,7 @@ place_near = sum_near(place, wp.vec4)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
-    """Less volume where space is not filled, such as in drops and sheets: their level is around what they fill."""
+    """Reduce particles' volumes where space is not filled, such as in drops and sheets, as their level is wide."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)
     off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing
@@ -208,18 +208,18 @@ def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Fl
 
 
 Level = tuple[Any, wp.array]
-"""Of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
+"""The level of a fluid: its `Blocks`, and the numbers of those that its surface may pass."""
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Level, Any]:
-    """That of what particles fill, and the `NearParticles` that it is made of."""
+    """Return the level of particles' fluid, and the `NearParticles` that it is made of."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     s = near_particles(particles, ends, spacing, reach, launch)
     return level_blocks(s, ends, _cube(particles) * spacing, reach, launch), s
 
 
 def sized_level(particles: Particles, spacing: float, launch: BandLauncher) -> Level:
-    """As `liquid_level`, but that drops, sheets and spray have about the volume of their particles."""
+    """Return the level of `liquid_level` where drops, sheets and spray have about the volume of their particles."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     s = near_particles(particles, ends, spacing, reach, launch)
     volumes = wp.empty_like(s.volumes)
@@ -231,8 +231,8 @@ def sized_level(particles: Particles, spacing: float, launch: BandLauncher) -> L
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, level: Level | None = None
 ) -> LiquidSurface:
-    """The surface of what particles fill: a level of their density, smoothed by weights that keep thin sheets (Löschner
-    et al. 2023), that looks like the nearest particles. ``level``: theirs if left out, or one that differs little.
+    """Make the surface of particles' fluid: a level of their density, smoothed by weights that keep thin sheets
+    (Löschner et al. 2023), with the looks of the nearest particles. ``level``: theirs if left out, or a similar one.
 
     Raises:
         ComputationError: there is none.
@@ -253,12 +253,12 @@ def liquid_surface(
 
 
 def _cube(particles: Particles) -> float:
-    """The width of a cube, in spacings."""
+    """Return the width of a cube of the surface's lattice, in spacings."""
     return next(width for most, width in CUBE_WIDTHS if len(particles) <= most)
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:
-    """The ends of all particles, or of those around the middle one, where some are very far away."""
+    """Return the ends of all particles, or of those around the middle one, where some are very far away."""
     lower, upper = particles.ends(launch)
     if np.prod((upper - lower) / spacing + 1.0) <= MOST_CELLS:
         return lower, upper

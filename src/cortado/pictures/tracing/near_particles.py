@@ -28,15 +28,15 @@ MODULE.options["max_unroll"] = 2  # compiles in half the time
 Look = wp.types.vector(5, wp.float32)
 """Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
 OPAQUE = (1e6, 0.0)
-"""The medium of what nothing is seen through."""
+"""The medium of opaque fluid: scattering and absorption [1/m]."""
 PARTS = 4096
-"""Of particles, of each of which the ends are found."""
+"""Number of parts of the particles, whose ends are found one by one."""
 AT_ONCE = 8000
 """Particles whose values are mixed at a time: of more, BLAS waits longer for its threads than they save."""
 
 
 def mixed(fractions: Points, values: Points) -> Points:
-    """(n, c) what particles of mass fractions (n, phases) have of the values (phases, c) of phases."""
+    """Mix the values (phases, c) of phases to those (n, c) of particles by mass fractions (n, phases)."""
     found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
     for first in range(0, len(shares), AT_ONCE):
         np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
@@ -45,7 +45,7 @@ def mixed(fractions: Points, values: Points) -> Points:
 
 @dataclass(frozen=True)
 class Particles:
-    """Where they are, and what they look like."""
+    """Particles on a device, with their places and looks."""
 
     places: wp.array
     """(n,) of vec3 [m]"""
@@ -56,8 +56,8 @@ class Particles:
     def on(
         cls, device: Any, places: Points, colours: Points, media: Points | tuple[float, float] = OPAQUE
     ) -> "Particles":
-        """Those of arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and absorption
-        [1/m]. Raises `ComputationError` for places that are not finite."""
+        """Copy particles from arrays of NumPy, (n, 3) each, with ``media`` (n, 2), or (2,) for all: scattering and
+        absorption [1/m]. Raises `ComputationError` for places that are not finite."""
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())
@@ -73,13 +73,13 @@ class Particles:
         return len(self.places)
 
     def and_images(self, places: Points, of: np.ndarray) -> "Particles":
-        """With others behind them, at places (m, 3) [m], each looking like one, (m,)."""
+        """Return the particles with others behind them, at places (m, 3) [m], each looking like one, (m,)."""
         looks = np.concatenate([self.looks.numpy(), self.looks.numpy()[of]])
         both = np.concatenate([self.places.numpy(), places])
         return Particles.on(self.places.device, both, looks[:, :3], looks[:, 3:])
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
-        """Lower and upper ends, (3,) each [m]."""
+        """Return lower and upper ends of the particles, (3,) each [m]."""
         count, device = min(PARTS, len(self)), self.places.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         launch(find_ends, count, places=self.places, lower=lower, upper=upper)
@@ -88,7 +88,7 @@ class Particles:
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_ends(first: wp.int32, places: Vec3s, lower: Vec3s, upper: Vec3s):
-    """Those of every so many."""
+    """Find the ends of every part of the particles."""
     part = first + wp.tid()
     low = places[part]
     high = places[part]
@@ -109,7 +109,7 @@ def list_marked(first: wp.int32, marks: Ints, counts: Ints, numbers: Ints):
 
 
 def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
-    """The numbers of those of (n,) marks that are 1 and not 0, and how many of them there are up to each, (n,)."""
+    """Return the numbers of the marks (n,) that are 1 and not 0, and how many of them there are up to each, (n,)."""
     counts = wp.empty_like(marks)
     wp.utils.array_scan(marks, counts)
     numbers = wp.empty(last_of(counts), dtype=wp.int32, device=marks.device)
@@ -118,18 +118,18 @@ def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
 
 
 def last_of(numbers: wp.array) -> int:
-    """The last of whole numbers (n,) on a device."""
+    """Read the last of whole numbers (n,) on a device."""
     return int(numbers[len(numbers) - 1 :].numpy()[0])
 
 
 @wp.struct
 class NearParticles:
-    """Particles sorted by cells."""
+    """Particles sorted by cells, for sums over those near a place."""
 
     lower: wp.vec3
     """Corner of the first cell [m]."""
     spacing: wp.float32
-    """[m] which is the width of a cell, too."""
+    """Spacing [m], which is the width of a cell, too."""
     shape: wp.vec3i
     """Cells along each axis."""
     starts: Ints
@@ -144,7 +144,7 @@ class NearParticles:
 
 @wp.func
 def bump(q: wp.float32):
-    """The cubic spline, 1 in the middle, 0 from q = 1 on."""
+    """Return the cubic spline of q, 1 in the middle, 0 from q = 1 on."""
     if q < 0.5:
         return 1.0 - 6.0 * q * q * (1.0 - q)
     r = 1.0 - q
@@ -152,14 +152,14 @@ def bump(q: wp.float32):
 
 
 def bump_at(q: float) -> float:
-    """`bump` of a Python number."""
+    """Return the cubic spline `bump` of a Python number."""
     return 1.0 - 6.0 * q * q * (1.0 - q) if q < 0.5 else 2.0 * max(1.0 - q, 0.0) ** 3
 
 
 @cache
 def sum_near(term: Callable[..., Any], number: Any) -> Any:
-    """The Warp function ``(s, p, reach)`` that adds up ``term(s, j)``, a ``number`` of Warp's, over the particles j
-    around p, each times the bump of that reach [m]."""
+    """Make the Warp function ``(s, p, reach)`` that adds up ``term(s, j)``, a ``number`` of Warp's, over the particles
+    j around p, each times the bump of that reach [m]."""
 
     @wp.func
     def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):
@@ -218,8 +218,7 @@ def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: 
 def near_particles(
     given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
 ) -> Any:
-    """`NearParticles` of particles, those of them that are between ``ends``, (3,) each [m]; bumps have a ``reach``
-    [m]."""
+    """Sort the particles between ``ends``, (3,) each [m], to `NearParticles`; bumps have a ``reach`` [m]."""
     device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
     x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
     sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)

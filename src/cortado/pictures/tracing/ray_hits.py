@@ -32,17 +32,17 @@ from cortado.pictures.tracing.surroundings import (
 )
 
 LAYERS = 8
-"""Surfaces of transparent solids that a ray passes at most."""
+"""Most surfaces of transparent solids that a ray passes."""
 
 
 @wp.struct
 class SolidHit:
-    """Where a ray meets an opaque solid."""
+    """The hit of a ray on an opaque solid."""
 
     t: wp.float32
-    """FAR where it does not."""
+    """Distance along the ray; FAR where it hits none."""
     is_cut: wp.bool
-    """Whether that is a wall of the container, through which the solid reaches."""
+    """True for a hit on a wall of the container, through which the solid reaches."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -50,7 +50,7 @@ class SolidHit:
 
 @wp.func
 def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Where a ray meets an opaque solid."""
+    """Find where a ray meets an opaque solid."""
     met = SolidHit()
     met.t = FAR
     part = wp.vec2(-FAR, FAR)
@@ -75,7 +75,7 @@ def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
-    """The same with what is known of the surface there."""
+    """Find where a ray meets an opaque solid, with the data of the surface there."""
     reached = reach_solid(s, o, d)
     met = SurfaceHit()
     met.found = False
@@ -94,7 +94,7 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32):
-    """The light of a solid; ``glossy``: 0 where it is in fluid."""
+    """Return the light of a solid where a ray meets it; ``glossy`` is 0 where it is in fluid."""
     r = mirrored(d, met.normal)
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
@@ -108,7 +108,7 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """The surfaces of transparent solids that a ray passes up to the distance ``most`` [m].
+    """Add surfaces of transparent solids up to ``most`` [m] on a ray's way, but not those on the floor, seen there.
 
     Those on the floor are left out, as the floor is seen there.
     """
@@ -136,7 +136,7 @@ def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, sprea
 
 @wp.func
 def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
-    """Where a ray meets a wall with a normal, inwards."""
+    """Return the hit of a ray at t on a wall with a normal, inwards."""
     met = SurfaceHit()
     met.found = True
     met.is_solid = True
@@ -150,7 +150,7 @@ def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
 
 @wp.func
 def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before: Passed):
-    """The wall that a ray meets where it leaves the container, if that is no further than ``most`` [m]."""
+    """Add the wall that a ray meets where it leaves the container, if that is no further than ``most`` [m]."""
     part = within_walls(s, o, d)
     t = part[1]
     if t <= wp.max(part[0], s.nearest) or t >= most:
@@ -168,7 +168,7 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 @wp.func
 def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """The side of the box where a ray, o and d in its own frame, passes at t."""
+    """Add the side of the box where a ray, o and d in its own frame, passes at t."""
     q = o + t * d
     axis = wp.int32(0)
     best = FAR
@@ -222,7 +222,7 @@ def box_glass(
 
 @wp.func
 def tube(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
-    """The side of the cylinder where a ray passes at t; nothing above and below it."""
+    """Add the side of the cylinder where a ray passes at t; there is nothing above and below it."""
     q = o + t * d
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
@@ -265,11 +265,11 @@ def cylinder_glass(
 
 @cache
 def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
-    """`glass` and `background`, where there are opaque or transparent solids."""
+    """Make the Warp functions `glass` and `background` for scenes with opaque or transparent solids or none."""
 
     @wp.func
     def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
-        """The glass that a ray passes up to the distance ``most`` [m]."""
+        """Return the glass that a ray passes up to the distance ``most`` [m]."""
         passed = Passed()
         passed.light = wp.vec3(0.0)
         passed.through = 1.0
@@ -287,7 +287,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """What a ray sees that meets no fluid."""
+        """Return the light that a ray sees which meets no fluid."""
         most = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
             most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
@@ -304,7 +304,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
 @wp.func
 def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Where a ray hits, at a point p, the wall that fluid touches, beyond which its triangles go on: they are near."""
+    """Find where a ray hits, at a point p, the wall that fluid touches, beyond which its triangles go on."""
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
     if not near.result:  # deep within fluid that has just reached the wall
         near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
@@ -315,8 +315,8 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 @wp.func
 def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """The same, quicker, with the triangle that is straight behind the wall, along its normal, outwards; not found
-    where that is not near, and where p is not within fluid."""
+    """Find the hit of `at_wall` more quickly, by the triangle straight behind the wall, along its normal, outwards. It
+    is not found where that is not near, and where p is not within fluid."""
     met = SurfaceHit()
     met.found = False
     hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)
@@ -328,7 +328,7 @@ def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, norm
 
 @wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Where a ray comes into the fluid on a part of its way, on which no transparent solid is."""
+    """Find where a ray enters the fluid on a part of its way, on which no transparent solid is."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -355,7 +355,7 @@ def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part
 
 @wp.func
 def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """The same where transparent solids are, within which there is no fluid."""
+    """Find where a ray enters the fluid among transparent solids, within which there is no fluid."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -395,11 +395,11 @@ def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: w
 
 @cache
 def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
-    """`meet` and `leave`, where there are opaque or transparent solids."""
+    """Make the Warp functions `meet` and `leave` for scenes with opaque or transparent solids or none."""
 
     @wp.func
     def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-        """Where a ray from outside of the fluid comes into it, unless it meets an opaque solid before."""
+        """Find where a ray from outside enters the fluid, unless it meets an opaque solid before."""
         met = SurfaceHit()
         met.found = False
         met.t = FAR
@@ -416,8 +416,8 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, most: wp.float32):
-        """Where a ray within the fluid comes out of it, or meets an opaque solid, after a way of ``most`` [m] at
-        most, beyond which it is not followed."""
+        """Find where a ray within the fluid leaves it, or meets an opaque solid, within a way of ``most`` [m], beyond
+        which it is not followed."""
         part = room(s, o, d)
         wall_at = wp.where(part[1] > 0.0, part[1], FAR)
         hit = wp.mesh_query_ray(surface.mesh, o, d, wp.min(wall_at, most))

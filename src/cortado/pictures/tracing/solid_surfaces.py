@@ -20,15 +20,15 @@ from cortado.pictures.tracing.near_particles import Floats, Look, Particles, Vec
 from cortado.pictures.tracing.surroundings import LitSurface, Solids
 
 NODES = 320
-"""Along either side of the floor that may lie in shadow."""
+"""Number of nodes along either side of the floor that may lie in shadow."""
 ABOVE = 1e-3
-"""In sizes of what is shown: a side of a solid that is no higher lies on the floor."""
+"""In sizes of the contents: a side of a solid that is no higher lies on the floor."""
 REACH = 1.5
-"""Half the width of that part of the floor, in sizes of what is shown."""
+"""Half the width of the floor that may lie in shadow, in sizes of the contents."""
 KEY, AROUND = 0.022, 0.05
 """How soft the shadows of the lamp and of the sky are, in sizes of what is shown."""
 CLOSE = 0.15
-"""How far above the floor the sky's shadow ends, about, in sizes of what is shown."""
+"""About how far above the floor the sky's shadow ends, in sizes of the contents."""
 SKY = 0.32
 """The part of the light that comes from the sky."""
 
@@ -38,19 +38,19 @@ Soften = Callable[[wp.array], wp.array]
 
 @dataclass(frozen=True)
 class DeviceSurface:
-    """Triangles, which exist as long as this does, with no light on them yet."""
+    """A surface of triangles on a device, which exist as long as this object, with no light on them yet."""
 
     mesh: wp.Mesh
     lit: Any
-    """`LitSurface`"""
+    """The surface as `LitSurface`."""
     softened: Soften | None = None
-    """Takes from the light at points (p,) of vec3 the steps that it has where it comes from few directions."""
+    """Removes steps from the light at points (p,) of vec3, which comes from few directions."""
 
     @classmethod
     def of(
         cls, points: wp.array, triangles: wp.array, normals: wp.array, colours: wp.array, softened: Soften | None = None
     ) -> "DeviceSurface":
-        """Triangles, (3 t,) numbers of points (p,) of vec3 [m] with normals (p,), outwards, and linear colours (p,)."""
+        """Make a surface of triangles (3 t,), points (p,) of vec3 [m], normals and linear colours (p,)."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
         found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
@@ -66,7 +66,7 @@ class DeviceSurface:
         colours: Points,
         softened: Soften | None = None,
     ) -> "DeviceSurface":
-        """The same of arrays of NumPy, (t, 3) and (p, 3)."""
+        """Make a surface from NumPy's arrays of triangles (t, 3), points, normals and colours (p, 3)."""
         corners = wp.array(triangles.ravel(), dtype=wp.int32, device=device)
         own = [wp.array(one, dtype=wp.vec3, device=device) for one in (points, normals, colours)]
         return cls.of(own[0], corners, own[1], own[2], softened)
@@ -96,8 +96,8 @@ def cast(
     begin: wp.vec2i,
     thickness: Vec4s2d,
 ):
-    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness,
-    and its thickness; the less the higher it is, by ``fading`` [1/m]. ``begin``: the first node that is there."""
+    """Add to the four nodes of the floor around each part, seen along a slope, its colour times its thickness, and its
+    thickness; the less the higher it is, by ``fading`` [1/m]. ``begin`` is the first node that is there."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -117,7 +117,7 @@ def cast(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, found: Vec4s2d):
-    """Along one axis, or ``across``, along the other."""
+    """Blur thicknesses at nodes along one axis, or ``across``, along the other."""
     n = first + wp.tid()
     i = n / sharp.shape[1]
     j = n % sharp.shape[1]
@@ -132,7 +132,7 @@ def blur(first: wp.int32, across: wp.int32, weights: Floats, sharp: Vec4s2d, fou
 
 @wp.func
 def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
-    """The part of the light that something of a thickness keeps off, of its own colour less than of others."""
+    """Return the part of the light that a thickness keeps off, less of its own colour than of others."""
     reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
     colour = wp.vec3(above[0], above[1], above[2])
     hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
@@ -151,7 +151,7 @@ def darken(
     begin: wp.vec2i,
     light: Vec3s2d,
 ):
-    """What the lamp's light and the sky's leave, of so much ``strength`` each, of the nodes from ``begin`` on."""
+    """Darken the nodes from ``begin`` on by the shadows of the lamp and of the sky, of a ``strength`` each."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -164,21 +164,21 @@ def darken(
 
 @dataclass(frozen=True)
 class Caster:
-    """What casts a shadow, in many small parts."""
+    """An object that casts a shadow, in many small parts."""
 
     parts: Particles
-    """In the frame of the picture."""
+    """The parts, in the frame of the picture."""
     to_lamp: wp.array
     """(n,) the volumes of the parts [m3], as the lamp sees them"""
     to_sky: wp.array
-    """(n,) as the sky does"""
+    """(n,) the volumes as the sky sees them"""
     opacity: float = 1.0
     tinted: float = 0.0
     """How much more light of its own colour comes through, from 0 to 1."""
 
 
 class FloorShadow:
-    """The part of the light that reaches the floor."""
+    """The shadow on the floor: the part of the light that reaches each of its nodes."""
 
     def __init__(self, stage: Stage, launch: BandLauncher):
         middle = 0.5 * (stage.lower + stage.upper)
@@ -191,14 +191,14 @@ class FloorShadow:
         """(nodes, nodes) by x and z"""
 
     def of_fluid(self, particles: Particles) -> None:
-        """Add that of particles, in the frame of the picture."""
+        """Add the shadow of particles, in the frame of the picture."""
         stage = self._stage
         volumes = wp.full(len(particles), stage.spacing**3, dtype=wp.float32, device=self._device)
         caster = Caster(particles, volumes, volumes, tinted=0.4 * stage.transparency)
         self._add(caster, 0.8 * stage.spacing, stage.spacing)
 
     def of_solid(self, shown: ShownSolid, mesh: SolidMesh) -> None:
-        """Add that of a solid."""
+        """Add the shadow of a solid."""
         stage = self._stage
         a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
         middle = (a + b + c) / 3.0
@@ -229,8 +229,8 @@ class FloorShadow:
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
-        """The first of the nodes that the shadow of parts may reach, with so many ``around`` it, and how many there are
-        along each side: those elsewhere stay light, and take no time."""
+        """Return the first node that the shadow of parts may reach, with ``around`` nodes more, and the number along
+        each side. Nodes elsewhere stay light, and take no time."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
@@ -240,7 +240,7 @@ class FloorShadow:
         return first.tolist(), (rows, columns)
 
     def _thickness(self, caster: Caster, volumes: wp.array, bell: Points, shape: tuple[int, int], **where: Any) -> Any:
-        """Of vec4, as `cast` adds it up at nodes of this shape, blurred by a bell."""
+        """Return thicknesses as vec4, which `cast` adds up at nodes of this shape, blurred by a bell."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": caster.parts.places, "looks": caster.parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **where, thickness=sharp)
@@ -254,14 +254,14 @@ class FloorShadow:
 
 
 def _bell(sigma: float) -> Points:
-    """The weights of a place and of those so many nodes beside it, by a Gaussian that is ``sigma`` nodes wide."""
+    """Return the weights of a node and of those beside it, by a Gaussian that is ``sigma`` nodes wide."""
     bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
     found: Points = bell / (2.0 * bell.sum() - 1.0)
     return found
 
 
 class SolidSurfaces:
-    """Those of the solids of a stage, whose triangles are found once; in poses, for each picture."""
+    """The surfaces of a stage's solids, whose triangles are found once, and which are posed for each picture."""
 
     def __init__(self, stage: Stage, device: Any):
         self._stage, self._device = stage, device
@@ -269,18 +269,18 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """Whether there are opaque, and transparent ones."""
+        """Return whether there are opaque, and transparent solids."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
     def cast(self, shadow: FloorShadow, solids: Sequence[ShownSolid]) -> None:
-        """Add their shadows; ``solids``: those of the stage, in poses."""
+        """Add the shadows of ``solids``, which are those of the stage, in poses."""
         for one, mesh in self._placed(solids):
             if not one.is_tank:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """`Solids`, and their surfaces, which must be kept and lit; ``solids``: those of the stage, in poses."""
+        """Return `Solids` and their surfaces, which must be kept and lit, for ``solids`` of the stage, in poses."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         opaque, clear = ([pair for pair in placed if _is_clear(pair[0]) == kind] for kind in (False, True))
@@ -306,7 +306,7 @@ class SolidSurfaces:
         return [(one, self._own[one.name].moved(one.turn, one.position)) for one in solids]
 
     def _surface(self, mesh: SolidMesh, solids: Sequence[Placed]) -> DeviceSurface:
-        """That of several, whose mesh it is."""
+        """Make the surface of the mesh of several solids."""
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
 
         def softened(light: wp.array) -> wp.array:
@@ -320,7 +320,7 @@ def _joined(solids: Sequence[Placed]) -> SolidMesh:
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
-    """That of a solid about its middle; of a tank its outside is within the cavity."""
+    """Make the mesh of a solid about its middle; the outside of a tank is within the cavity."""
     own = float(np.ptp(shown.shape.extent(), axis=0).max())
     faces = shown.shape.shown_faces(min(FINE * size, FINE_OWN * own))
     longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
@@ -328,11 +328,11 @@ def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
 
 
 def _is_clear(shown: ShownSolid) -> bool:
-    """Whether fluid is seen through it, or in it."""
+    """Test whether fluid is seen through a solid, or in it."""
     return shown.is_tank or shown.transparency > 0.0
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:
-    """The part of the light that comes through one surface, seen from within a solid and from outside: one looks into a
-    tank whatever its walls are."""
+    """Return the part of the light that comes through one surface, seen from within a solid and from outside: one looks
+    into a tank whatever its walls are."""
     return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

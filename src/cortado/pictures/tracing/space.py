@@ -27,7 +27,7 @@ from cortado.scene.scene import Scene
 
 
 def environment_of(stage: Stage) -> Any:
-    """`Environment`; what it knows of solids is added by others."""
+    """Return the `Environment` of a stage, without its solids, which are added elsewhere."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
     s.size, s.nearest = stage.size, 1e-4 * stage.size
@@ -56,32 +56,32 @@ def environment_of(stage: Stage) -> Any:
 
 
 def _round_length(length: float) -> float:
-    """The next of 1, 2 and 5 times a power of ten below a length."""
+    """Return the next of 1, 2 and 5 times a power of ten below a length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
 
 
 class State(NamedTuple):
-    """What a picture shows."""
+    """A state of a run as a picture shows it."""
 
     positions: Points
     """(n, d) of particles [m], in the scene's axes"""
     colours: Points
     """(n, 3) of particles, linear from 0 to 1"""
     pose: Scene | None = None
-    """The scene with its solids where they are; where it has them if left out."""
+    """The scene with its solids in poses; where it has them if left out."""
     view: View | None = None
-    """Where the camera is; home if left out."""
+    """View of the camera; home if left out."""
     fractions: Points | None = None
-    """(n, phases) by mass, what particles are made of; with one phase left out"""
+    """(n, phases) mass fractions of particles; left out with one phase"""
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """The fluid of one state, in the frame of the picture."""
+    """The fluid of one state with its surroundings, in the frame of the picture."""
 
     stage: Stage
-    """With solids and the camera where they are."""
+    """Stage with solids and camera of the state."""
     environment: Any
     """`Environment`"""
     surface: DeviceSurface
@@ -89,7 +89,7 @@ class Scenery:
 
 
 def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None) -> Scenery:
-    """That of a state in 3-D; ``steady``: `Still` of the state that is drawn in the place of its own."""
+    """Make the scenery of a state in 3-D; ``steady`` is a `Still` that is drawn in the place of the state's own."""
     stage, s, particles, shadow = _placed(home, state, launch)
     if steady is None:
         shadow.of_fluid(particles)
@@ -99,7 +99,7 @@ def scenery(home: Stage, state: State, launch: BandLauncher, steady: Any = None)
 
 
 def still(home: Stage, state: State, launch: BandLauncher) -> Any:
-    """`Still` of a state in 3-D; None where its fluid is not drawn with a surface around it."""
+    """Return the `Still` of a state in 3-D; None where its fluid is not drawn with a surface around it."""
     stage, s, particles, shadow = _placed(home, state, launch)
     if stage.picture.surface != "liquid" or not len(particles):
         return None
@@ -109,7 +109,7 @@ def still(home: Stage, state: State, launch: BandLauncher) -> Any:
 
 
 def _placed(home: Stage, state: State, launch: BandLauncher) -> tuple[Stage, Any, Particles, FloorShadow]:
-    """The stage of a state, its `Environment`, its particles, and a floor without a shadow."""
+    """Return the stage of a state, its `Environment`, its particles, and a floor without a shadow."""
     stage = home.at(state.pose, state.view)
     s, shadow = environment_of(stage), FloorShadow(stage, launch)
     s.shadow_corner, s.shadow_cell = wp.vec3(*shadow.corner), shadow.cell
@@ -134,16 +134,16 @@ def _surface(
 
 
 def _nothing(stage: Stage, device: Any) -> DeviceSurface:
-    """A triangle that is too small and too far below the floor to be seen: meshes need one."""
+    """Make a triangle that is too small and too far below the floor to be seen: meshes need one."""
     places = stage.lower - 1e3 * stage.size + 1e-6 * stage.size * np.eye(3)
     return DeviceSurface.on(device, places, np.arange(3), np.eye(3), np.eye(3))
 
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
-"""Where in a pixel four more rays go, in pixels from its middle."""
+"""Places in a pixel of four more rays, in pixels from its middle."""
 MIDDLE = ((0.0, 0.0),)
 CONTRAST = 0.03
-"""Between neighbouring pixels, in linear light: above, four more rays go through both."""
+"""Contrast of neighbouring pixels, in linear light, above which four more rays go through both."""
 TILE = 8, 4
 """Pixels that rays are sent through together."""
 LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
@@ -151,11 +151,11 @@ LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 
 
 SOLID_RAYS = 40, 6
-"""The same for solids, which have fewer points and even sides."""
+"""Numbers of such rays for solids, which have fewer points and even sides."""
 
 
 class SpacePainter:
-    """Draws states of one scene of so many particles."""
+    """A painter that draws states of one scene with a fixed number of particles in space."""
 
     def __init__(self, stage: Stage, device: Any = "cpu"):
         self.stage, self.device = stage, wp.get_device(device)
@@ -179,19 +179,19 @@ class SpacePainter:
         self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in (MIDDLE, ROTATED_GRID)]
 
     def image(self, *state: Any) -> Points:
-        """A picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
+        """Draw the picture (rows, columns, 3), linear from 0 to 1, of a `State`."""
         with WARP:
             compile_ahead(self, self.device)
             return self._rays(scenery(self.stage, State(*state), self._launch))
 
     def still(self, state: State) -> Any:
-        """What other frames of a film need of a `State`; None where nothing is steadied. See `still`."""
+        """Return the data of a `State` that other frames of a film need; None where none is steadied."""
         with WARP:
             compile_ahead(self, self.device)
             return still(self.stage, state, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
-        """The picture of a state as one frame of a film, in which fluid at rest is drawn at rest; see `steadied`."""
+        """Draw a state as one frame of a film, in which fluid at rest is drawn at rest; see `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
             return self._rays(scenery(self.stage, state, self._launch, steady))
@@ -230,7 +230,7 @@ class SpacePainter:
             wp.copy(surface.lit.light, surface.softened(surface.lit.light))
 
     def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
-        """Directions to all around, and to so many points of the lamp."""
+        """Return directions to all around, and to ``lamp`` points of the lamp."""
         in_lamp = self.stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
         in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
         found = [wp.array(one, dtype=wp.vec3, device=self.device) for one in (_directions(around), in_lamp)]
@@ -238,7 +238,7 @@ class SpacePainter:
 
 
 def _in_tiles(columns: int, rows: int) -> np.ndarray:
-    """(pixels,) the numbers of all pixels, those of small tiles together, whose rays go nearly the same way."""
+    """Return the numbers (pixels,) of all pixels in small tiles, whose rays go nearly the same way."""
     wide, high = TILE
     row, column = np.divmod(np.arange(columns * rows), columns)
     tile = (row // high) * -(-columns // wide) + column // wide
@@ -246,7 +246,7 @@ def _in_tiles(columns: int, rows: int) -> np.ndarray:
 
 
 def _directions(count: int) -> Points:
-    """(count, 3) unit vectors, evenly all around: the spiral of Fibonacci."""
+    """Return unit vectors (count, 3), evenly all around: the spiral of Fibonacci."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     away = np.sqrt(1.0 - height**2)

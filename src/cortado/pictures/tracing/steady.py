@@ -34,12 +34,12 @@ BODY_REACH, BODY = 6.0, (7.0, 12.0)
 """How far around a block fluid is looked for, in spacings, and how much of it makes a drop and a body of fluid: as many
 particles, those that are farther away counted less, of the 85 that there are within fluid."""
 TOUCHING = wp.constant(27)
-"""Blocks: one, and those that touch it."""
+"""Number of blocks that touch one, itself included."""
 
 
 @wp.struct
 class Still:
-    """The fluid in one frame of a film, as the others need it."""
+    """The fluid in one frame of a film, in the form that other frames need to average with it."""
 
     b: Blocks
     blocks: Ints
@@ -47,23 +47,23 @@ class Still:
     first: wp.vec3i
     """The first block, counted from the origin."""
     means: Floats
-    """(blocks that the surface may pass,) of the level"""
+    """(blocks that the surface may pass,) mean of the level"""
     bodies: Floats
-    """(blocks that the surface may pass,) 1 where much fluid is around, and 0 in drops"""
+    """(blocks that the surface may pass,) 1 in a body of fluid, and 0 in drops"""
     light: Vec3s2d
-    """(nodes, nodes) that the fluid leaves on the floor"""
+    """(nodes, nodes) light that the fluid leaves on the floor"""
 
 
 @wp.func
 def share(way: wp.float32, limits: wp.vec2):
-    """1 for ways up to the first limit, 0 from the second on."""
+    """Return 1 for ways up to the first limit, 0 from the second on, and a smooth share between."""
     x = wp.clamp((limits[1] - way) / (limits[1] - limits[0]), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """Of one of the others, of which so many are ``before``, each nearest first: it falls evenly from 1 to 0."""
+    """Return the weight of another frame, of which ``before`` come first, nearest first: it falls from 1 to 0."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 
@@ -90,8 +90,8 @@ def find_ways(
     indices: Ints2d,
     ways: Floats2d,
 ):
-    """How far the fluid in each block, of a width in spacings, is from where it is in the others, in spacings; which
-    block of theirs it is; and which blocks touch it."""
+    """Find how far the fluid in each block, of a width in spacings, is from where it is in other frames, in spacings;
+    which block of theirs it is; and which blocks touch it."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
@@ -120,7 +120,7 @@ def find_shares(
     limits: wp.vec2,
     shares: Floats2d,
 ):
-    """Of the others in each block, by the root mean square of the ways in it and in those that touch it."""
+    """Find the shares of other frames in each block, by the root mean square of ways there and in blocks beside it."""
     n = first + wp.tid()
     left = bodies[n]
     for j in range(ways.shape[1]):
@@ -197,8 +197,8 @@ def average_light(
 
 
 def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandLauncher) -> Any:
-    """`Still` of a level, `Blocks` and the numbers of those that the surface may pass, with the `NearParticles` that it
-    is made of, and of the light on the floor."""
+    """Make the `Still` of a level, its `Blocks` and numbers of those that the surface may pass, with the
+    `NearParticles` that it is made of, and of the light on the floor."""
     found = Still()
     found.b, found.blocks = level
     wide = found.b.cube * float(WIDTH)
@@ -210,8 +210,8 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """`Still` of one frame, averaged with those of the frames before and after it, nearest first, as far as their
-    lattices have the same cubes; ``spacing``: of the particles [m]."""
+    """Return the `Still` of one frame, averaged with those of the frames before and after it, nearest first, as far as
+    their lattices have equal cubes; ``spacing`` is that of the particles [m]."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -29,20 +29,21 @@ from cortado.pictures.tracing.near_particles import (
 WIDTH = wp.constant(4)
 """Cubes along each axis of a block."""
 CUBES = wp.constant(64)
-"""Cubes of a block."""
+"""Number of cubes of a block."""
 LEVEL = wp.constant(wp.float32(0.6))
-"""Where the surface is: within fluid the level is about 1."""
+"""Level of the surface: within fluid the level is about 1."""
 
 
 ROUNDS_OF_NORMALS = 15
-"""Of smoothing."""
+"""Rounds of smoothing of normals."""
 Neighbours = wp.types.vector(6, wp.int32)
-"""Those in the cubes below and above along each axis; -1 where there is none."""
+"""Corners in the cubes below and above along each axis; -1 where there is none."""
 
 
 @wp.struct
 class Blocks:
-    """Nodes have whole numbers (i, j, k) from the corner of the first block on; a cube has that of its lowest node."""
+    """A lattice in blocks of cubes. Nodes have whole numbers (i, j, k) from the corner of the first block on; a cube
+    has that of its lowest node."""
 
     lower: wp.vec3
     """Corner of the first block [m]."""
@@ -53,7 +54,7 @@ class Blocks:
     corners: wp.array3d(dtype=wp.float32)
     """(blocks + 1 along each axis) the level at the lower corner of each block"""
     places: Ints
-    """(blocks,) how many up to each are in ``levels``, itself among them if it is"""
+    """(blocks,) number of blocks up to each that are in ``levels``, itself among them if it is"""
     levels: Floats2d
     """(blocks that the surface may pass, CUBES) the level at the nodes of each"""
 
@@ -65,7 +66,7 @@ def number_of(b: Blocks, i: wp.int32, j: wp.int32, k: wp.int32):
 
 @wp.func
 def block_at(b: Blocks, number: wp.int32):
-    """Its place along each axis."""
+    """Return the place of a block along each axis, by its number."""
     i = number % b.shape[0]
     j = (number / b.shape[0]) % b.shape[1]
     return wp.vec3i(i, j, number / (b.shape[0] * b.shape[1]))
@@ -73,7 +74,7 @@ def block_at(b: Blocks, number: wp.int32):
 
 @wp.func
 def index_of(b: Blocks, at: wp.vec3i):
-    """That of a block in ``levels``; -1 where it has none, and -2 outside the lattice."""
+    """Return the index of a block in ``levels``; -1 where it has none, and -2 outside the lattice."""
     if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
         return -2
     block = number_of(b, at[0], at[1], at[2])
@@ -85,7 +86,7 @@ def index_of(b: Blocks, at: wp.vec3i):
 
 @wp.func
 def entry_of(b: Blocks, node: wp.vec3i):
-    """Of a node in ``levels``, as one number; -1 where it has none."""
+    """Return the entry of a node in ``levels``, as one number; -1 where it has none."""
     index = index_of(b, node / WIDTH)
     if index < 0:
         return -1
@@ -95,7 +96,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """At a node; where it is not known, that of the corner of its block, which is on the same side of the surface."""
+    """Return the level at a node; where it is unknown, that of its block's corner, on the same side of the surface."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -119,7 +120,7 @@ def volume(s: NearParticles, j: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
-    """Give those that a particle may reach a level that is not 0."""
+    """Mark the blocks' corners that a particle may reach by a level that is not 0."""
     p = s.places[first + wp.tid()] - b.lower
     wide = b.cube * float(WIDTH)
     low = (p - wp.vec3(reach)) / wide
@@ -145,7 +146,7 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
-    """Which blocks the surface may pass; ``left``: of a bump in the middle of a block, at its corners."""
+    """Find the blocks that the surface may pass; ``left`` is the rest of a block's middle bump at its corners."""
     n = first + wp.tid()
     at = block_at(b, n)
     least = wp.float32(1.0e9)
@@ -168,7 +169,7 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """`Blocks` around particles s between ``ends``, (3,) each [m], and the numbers of those that the surface may
+    """Make `Blocks` around particles s between ``ends``, (3,) each [m], and the numbers of those that the surface may
     pass."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
@@ -187,7 +188,7 @@ def level_blocks(
 
 @wp.struct
 class Cubes:
-    """Those of the blocks that the surface may pass, and which corners of the net are in them."""
+    """The cubes of the blocks that the surface may pass, with the numbers of the net's corners in them."""
 
     b: Blocks
     blocks: Ints
@@ -200,7 +201,7 @@ class Cubes:
 
 @wp.func
 def signs_of(b: Blocks, node: wp.vec3i):
-    """Of which of its eight nodes of a cube are within the fluid: bit ``x + 2 y + 4 z``."""
+    """Return which of a cube's eight nodes are within the fluid, as bits ``x + 2 y + 4 z``."""
     signs = wp.int32(0)
     for n in range(8):
         if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:
@@ -220,7 +221,7 @@ def count_corners(first: wp.int32, b: Blocks, blocks: Ints, signs: Ints, corners
 
 @wp.func
 def corner_in(cubes: Cubes, node: wp.vec3i):
-    """The number of the corner in a cube; -1 where there is none."""
+    """Return the number of the net's corner in a cube; -1 where there is none."""
     entry = entry_of(cubes.b, node)
     if entry < 0:
         return -1
@@ -235,7 +236,7 @@ def along(axis: wp.int32):
 
 @wp.func
 def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
-    """Whether the surface passes between two nodes of a cube."""
+    """Test whether the surface passes between two nodes of a cube."""
     return ((signs >> m) ^ (signs >> n)) & 1 == 1
 
 
@@ -243,7 +244,7 @@ def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
 def place_corners(
     first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, own_signs: Ints, neighbours: wp.array(dtype=Neighbours)
 ):
-    """In the middle of where the surface passes the sides of each cube."""
+    """Place each cube's corner of the net in the middle of the points where the surface passes its sides."""
     n = first + wp.tid()
     v = cubes.corners[n]
     if cubes.corners[n + 1] == v:
@@ -283,7 +284,7 @@ def place_corners(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def list_triangles(first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, triangles: Ints):
-    """Two for each quadrilateral, cut along its shorter diagonal."""
+    """List two triangles for each quadrilateral, cut along its shorter diagonal."""
     n = first + wp.tid()
     side = cubes.sides[n]
     if cubes.sides[n + 1] == side:
@@ -313,7 +314,7 @@ def list_triangles(first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, tr
 
 @wp.func
 def sum_beside(beside: Neighbours, values: Vec3s):
-    """The sum of values of the neighbours of a corner, and how many it has."""
+    """Return the sum of values of the neighbours of a corner, and their number."""
     total = wp.vec3(0.0)
     count = wp.float32(0.0)
     for k in range(6):
@@ -325,7 +326,7 @@ def sum_beside(beside: Neighbours, values: Vec3s):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Floats, values: Vec3s, found: Vec3s):
-    """Towards the mean of neighbours."""
+    """Move values towards the mean of neighbours, by weights."""
     v = first + wp.tid()
     total, count = sum_beside(neighbours[v], values)
     found[v] = wp.lerp(values[v], total / wp.max(count, 1.0), wp.where(count > 0.0, weights[v], 0.0))
@@ -333,7 +334,7 @@ def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Flo
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
-    """The mean of those of the quadrilaterals around each corner, by their areas."""
+    """Compute at each corner the mean of the normals of the quadrilaterals around it, by their areas."""
     v = first + wp.tid()
     beside = neighbours[v]
     total = wp.vec3(0.0)
@@ -366,24 +367,24 @@ def smooth_normals(first: wp.int32, neighbours: wp.array(dtype=Neighbours), valu
 
 @dataclass(frozen=True)
 class SurfaceNet:
-    """A net on the device."""
+    """A net of the surface on the device, with one corner in each cube that it passes."""
 
     cubes: Any
     """`Cubes`"""
     cube_signs: wp.array
-    """(cubes,) of which nodes are within the fluid"""
+    """(cubes,) bits of the nodes within the fluid"""
     points: wp.array
     """(corners,) of vec3 [m]"""
     signs: wp.array
-    """(corners,) those of their cubes"""
+    """(corners,) the bits of their cubes"""
     neighbours: wp.array
     """(corners,)"""
     sides: int
-    """How many quadrilaterals there are."""
+    """Number of quadrilaterals."""
 
 
 def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
-    """That of the level on `Blocks`; ``blocks``: which of them the surface may pass."""
+    """Make the net of the level on `Blocks`; ``blocks`` are the numbers of those that the surface may pass."""
     device, count, cubes = launch.device, len(blocks) * CUBES, Cubes()
     signs = wp.empty(count, dtype=wp.int32, device=device)
     cubes.b, cubes.blocks = b, blocks
@@ -398,13 +399,13 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
 
 
 def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
-    """Values (p,) of vec3, moved towards the means of their neighbours so many times, by weights (p,) from 0 to 1."""
+    """Move values (p,) of vec3 towards the means of neighbours, in ``rounds`` rounds, by weights (p,) from 0 to 1."""
     own = {"neighbours": neighbours, "weights": weights}
     return launch.to_and_fro(smooth, rounds, wp.clone(values), wp.empty_like(values), **own)
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """(p,) of vec3, unit vectors outwards, of a net whose corners were moved to points (p,)."""
+    """Return the normals (p,) of vec3, unit vectors outwards, of a net whose corners were moved to points (p,)."""
     normals, other = wp.empty_like(points), wp.empty_like(points)
     own = {"signs": net.signs, "neighbours": net.neighbours}
     launch(find_normals, len(points), **own, points=points, normals=normals)
@@ -412,7 +413,7 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """(3 t,) numbers of the corners of triangles, of a net whose corners were moved to points (p,)."""
+    """Return the numbers (3 t,) of the corners of triangles, of a net whose corners were moved to points (p,)."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
     given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
     launch(list_triangles, len(net.cube_signs), **given, triangles=found)

@@ -13,7 +13,7 @@ from cortado.pictures.tracing.near_particles import Floats, Ints, Vec2s, Vec3s, 
 
 @wp.struct
 class LitSurface:
-    """Triangles with what is known at their corners."""
+    """A surface of triangles with the data of their corners."""
 
     mesh: wp.uint64
     corners: Ints
@@ -27,7 +27,7 @@ class LitSurface:
     media: Vec2s
     """(points,) of a fluid: scattering and absorption [1/m]"""
     is_flat: wp.int32
-    """Whether its colours are shown as they are, without light and shadow."""
+    """True where its colours are shown as they are, without light and shadow."""
     reach: wp.float32
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
     left: Vec2s
@@ -40,7 +40,7 @@ class LitSurface:
 
 @wp.func
 def at_corners(surface: LitSurface, values: Vec3s, face: wp.int32, u: wp.float32, v: wp.float32):
-    """Interpolated on a triangle."""
+    """Interpolate values at the corners of a triangle to a point in it."""
     return (
         u * values[surface.corners[3 * face]]
         + v * values[surface.corners[3 * face + 1]]
@@ -50,7 +50,7 @@ def at_corners(surface: LitSurface, values: Vec3s, face: wp.int32, u: wp.float32
 
 @wp.func
 def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
-    """An interpolated normal on the side of the triangle that the ray comes from."""
+    """Turn an interpolated normal to the side of the triangle that the ray comes from."""
     outside = face_normal
     n = normal
     if wp.dot(outside, d) > 0.0:
@@ -64,18 +64,18 @@ def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
 
 @wp.struct
 class SurfaceHit:
-    """Where a ray hits a surface."""
+    """The hit of a ray on a surface."""
 
     found: wp.bool
     is_solid: wp.bool
-    """Whether it is that of an opaque solid."""
+    """True for the surface of an opaque solid."""
     t: wp.float32
     normal: wp.vec3
-    """On the side that the ray comes from."""
+    """Normal on the side that the ray comes from."""
     colour: wp.vec3
     light: wp.vec3
     reflectivity: wp.float32
-    """Of a solid."""
+    """Reflectivity of a solid."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -83,7 +83,7 @@ class SurfaceHit:
 
 @wp.func
 def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32):
-    """Where a ray hits a triangle."""
+    """Return the hit of a ray on a triangle, with normal and colour there."""
     i = surface.corners[3 * face]
     j = surface.corners[3 * face + 1]
     k = surface.corners[3 * face + 2]
@@ -103,7 +103,7 @@ def at_surface(surface: LitSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u
 
 @wp.func
 def medium_at(surface: LitSurface, met: SurfaceHit):
-    """Scattering and absorption [1/m] of the fluid that a ray comes into."""
+    """Return scattering and absorption [1/m] of the fluid that a ray enters."""
     return (
         met.u * surface.media[surface.corners[3 * met.face]]
         + met.v * surface.media[surface.corners[3 * met.face + 1]]
@@ -118,20 +118,20 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 
 def shading_module(has_opaque: bool, has_clear: bool) -> Any:
-    """The Warp module of kernels for scenes with opaque or transparent solids, or with none."""
+    """Return the Warp module of kernels for scenes with opaque or transparent solids, or with none."""
     return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
 
 
 @wp.struct
 class Solids:
-    """What fluid flows around, or is inside of."""
+    """The solids that fluid flows around, or is inside of, as meshes on the device."""
 
     opaque: wp.uint64
-    """The mesh of opaque ones."""
+    """The mesh of opaque solids."""
     are_cut: wp.int32
-    """Whether opaque ones are shown within the container only."""
+    """True where opaque solids are shown within the container only."""
     clear: wp.uint64
-    """The mesh of those that are transparent and of tanks, which all of space outside of a cavity is within."""
+    """The mesh of transparent solids and of tanks, which all of space outside of a cavity is within."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
     """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
@@ -139,22 +139,22 @@ class Solids:
 
 @wp.struct
 class Environment:
-    """Everything around the fluid."""
+    """Everything around the fluid, as kernels of the ray tracer take it."""
 
     size: wp.float32
-    """Of what is shown [m]: floor, grid and rims go by it."""
+    """Size of the contents [m]: floor, grid and rims go by it."""
     nearest: wp.float32
-    """How far a ray starts from the surface that sends it [m]."""
+    """Distance of a ray's start from the surface that sends it [m]."""
     sun: wp.vec3
     """Unit vector towards the lamp."""
     fill: wp.vec3
-    """Unit vector towards a second, weak one, which is only seen in reflections."""
+    """Unit vector towards a second, weak lamp, which is only seen in reflections."""
     lamp: wp.vec3
-    """What is seen of the first in reflections."""
+    """Colour of the first lamp in reflections."""
     strip: wp.vec3
-    """What is seen of the second."""
+    """Colour of the second lamp in reflections."""
     sunlight: wp.vec3
-    """The light of the lamp that falls on what faces it."""
+    """Light of the lamp that falls on surfaces that face it."""
     horizon: wp.vec3
     zenith: wp.vec3
     has_floor: wp.int32
@@ -172,13 +172,13 @@ class Environment:
     glass: wp.int32
     """NO_GLASS, GLASS_BOX or GLASS_CYLINDER, whose axis is the second of its own frame."""
     glass_frame: wp.mat33
-    """From the frame of the picture to that of the container."""
+    """Rotation from the frame of the picture to that of the container."""
     glass_lower: wp.vec3
     """[m] in its own frame"""
     glass_upper: wp.vec3
     """[m]"""
     has_room: wp.int32
-    """Whether fluid is shown within the container only."""
+    """True where fluid is shown within the container only."""
     room_lower: wp.vec3
     """[m] in the frame of the container: where that ends; -FAR where it does not"""
     room_upper: wp.vec3
@@ -186,9 +186,9 @@ class Environment:
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
     edge_colour: wp.vec3
-    """Of the container's edges."""
+    """Colour of the container's edges."""
     has_walls: wp.int32
-    """Whether the container is opaque: one looks into it from outside, and sees its walls from within."""
+    """True for an opaque container: one looks into it from outside, and sees its walls from within."""
     wall_colour: wp.vec3
     wall_reflectivity: wp.float32
     solids: Solids
@@ -202,7 +202,7 @@ def smooth_step(lower: wp.float32, upper: wp.float32, x: wp.float32):
 
 @wp.func
 def schlick(normal_reflectance: wp.float32, cosine: wp.float32):
-    """Fresnel's reflectance, as Schlick (1994) approximates it."""
+    """Return Fresnel's reflectance, as Schlick (1994) approximates it."""
     m = wp.clamp(1.0 - cosine, 0.0, 1.0)
     m2 = m * m
     return normal_reflectance + (1.0 - normal_reflectance) * m2 * m2 * m
@@ -215,7 +215,7 @@ def mirrored(direction: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def sky(s: Environment, d: wp.vec3):
-    """Light from a direction above the floor: a gradient, a soft lamp, and a strip of light on the other side."""
+    """Return the light from a direction above the floor: a gradient, a soft lamp, and a strip of light opposite."""
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
@@ -224,13 +224,13 @@ def sky(s: Environment, d: wp.vec3):
 
 @wp.func
 def open_light(s: Environment, normal: wp.vec3):
-    """The light that falls on what nothing lies in the way of."""
+    """Return the light that falls on a surface that nothing hides."""
     return 0.35 * (s.horizon + s.zenith) + s.sunlight * wp.max(wp.dot(normal, s.sun), 0.0)
 
 
 @wp.func
 def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
-    """The part of the light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
+    """Return the part of light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
     i = wp.int32(wp.floor(u))
@@ -246,14 +246,14 @@ def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
 
 @wp.func
 def line(x: wp.float32, grid: wp.float32, width: wp.float32):
-    """1 on the lines of a grid, 0 between them; thinner than a pixel they fade."""
+    """Return 1 on the lines of a grid, 0 between them; lines thinner than a pixel fade."""
     off = wp.abs(x / grid - wp.round(x / grid)) * grid
     return 1.0 - smooth_step(0.35 * width, width, off)
 
 
 @wp.func
 def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
-    """The floor at p, which becomes the horizon further out; ``footprint``: the width of a pixel there [m]."""
+    """Return the floor's colour at p, fading to the horizon; ``footprint`` is the width of a pixel there [m]."""
     colour = s.floor_colour
     if s.grid > 0.0:
         thin = 0.0035 * s.size
@@ -267,7 +267,7 @@ def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
 
 @wp.func
 def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """What a ray sees that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
+    """Return the light of a ray that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
         if t > 0.0:
@@ -278,7 +278,7 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """The part of a ray's span, from where to where, between two planes across an axis; o and d along that axis."""
+    """Return the part of a ray's span that lies between two planes across an axis; o and d along that axis."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -290,8 +290,8 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """From where to where a ray is within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR
-    where it is not."""
+    """Return the span of a ray within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR where
+    it is not."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])
@@ -309,7 +309,7 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
-    """From where to where a ray is within the walls of the container; from FAR to -FAR where it is not."""
+    """Return the span of a ray within the walls of the container; from FAR to -FAR where it is not."""
     p = s.glass_frame * o
     q = s.glass_frame * d
     span = wp.vec2(-FAR, FAR)
@@ -325,7 +325,7 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
+    """Return the span of a ray in which fluid is shown; from FAR to -FAR where there is none."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -333,7 +333,7 @@ def room(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def wall_normal(s: Environment, p: wp.vec3):
-    """Outwards, of the wall that a point is on."""
+    """Return the outward normal of the wall that a point is on."""
     q = s.glass_frame * p
     n = wp.vec3(0.0)
     best = FAR
@@ -359,13 +359,13 @@ def wall_normal(s: Environment, p: wp.vec3):
 
 
 EDGE = (0.50, 0.62, 0.64)
-"""Linear, of an edge of clear glass."""
+"""Linear colour of an edge of clear glass."""
 GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
 
 
 @wp.struct
 class Passed:
-    """What the glass on a way adds and leaves."""
+    """The light that the glass on a ray's way adds, and the part that it leaves."""
 
     light: wp.vec3
     through: wp.float32
@@ -375,8 +375,8 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge, which
-    has a colour, is seen, 0 to 1."""
+    """Add one more sheet of glass behind those that are passed; ``rim``: how much of its coloured edge is seen, 0 to
+    1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
     reflectance = 0.7 * is_pane * 2.0 * f / (1.0 + f)
@@ -393,5 +393,5 @@ def pane(
 
 @wp.func
 def rim_of(off: wp.float32, width: wp.float32):
-    """How much of an edge is seen at a distance from it."""
+    """Return how much of an edge is seen at a distance from it."""
     return 0.8 * (1.0 - smooth_step(0.55 * width, width, off))

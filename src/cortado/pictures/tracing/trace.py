@@ -36,7 +36,7 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """The light that comes to a point against a direction d, of ``light``, which comes if no solid is there.
+    """Return the part of ``light`` that comes to a point against a direction d past solids.
 
     A solid within ``reach`` [m] hides it, the less the further off it is, and sends a little light in its own colour.
     Nothing is hidden from points within a solid, which are not seen.
@@ -51,7 +51,7 @@ def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light
 
 @cache
 def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
-    """The kernel that finds the light on surfaces, where there are opaque or transparent solids."""
+    """Make the kernel that finds the light on surfaces, for scenes with opaque or transparent solids or none."""
     module = shading_module(has_opaque, has_clear)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -67,9 +67,9 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
         clearness: wp.float32,
         light: Vec3s,
     ):
-        """The light that falls on each of the points of a surface with normals: from all around, as far as neither
-        other fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that goes
-        through fluid, from 0 to 1."""
+        """Compute the light that falls on each of the points of a surface with normals: from all around, as far as
+        neither other fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that
+        goes through fluid, from 0 to 1."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
@@ -108,12 +108,12 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
-"""Refractive index, of water."""
+"""Refractive index of water."""
 FAINT = wp.constant(wp.float32(0.05))
 """Reflectance below which light that leaves fluid is not split: what remains of it grows from 0 there, and is 1 where
 reflection is total, or else there would be an edge in the light where a smooth surface comes near that angle."""
 DARK = wp.constant(wp.float32(10.0))
-"""How many free paths of light within fluid nothing is seen beyond: a part of 5e-5 goes as far."""
+"""Number of free paths of light within fluid beyond which nothing is seen: a part of 5e-5 goes as far."""
 
 
 @wp.struct
@@ -130,7 +130,7 @@ class Eye:
 
 @wp.func
 def toned(colour: wp.vec3):
-    """Bright light is bent below 1; up to 0.75 it stays what it is."""
+    """Bend bright light below 1; light up to 0.75 stays as it is."""
     found = wp.vec3(0.0)
     for k in range(3):
         x = colour[k]
@@ -142,14 +142,14 @@ def toned(colour: wp.vec3):
 
 @wp.func
 def tinted(colour: wp.vec3, taken: wp.float32):
-    """What is left of white light where fluid of a colour takes away the others, up to the colour itself at 1."""
+    """Return the rest of white light where coloured fluid takes away other colours, up to the colour itself at 1."""
     base = wp.vec3(wp.max(colour[0], 0.02), wp.max(colour[1], 0.02), wp.max(colour[2], 0.02))
     return wp.vec3(wp.pow(base[0], taken), wp.pow(base[1], taken), wp.pow(base[2], taken))
 
 
 @cache
 def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
-    """The kernel that traces rays, where there are opaque or transparent solids, or none, which takes no time then."""
+    """Make the kernel that traces rays, for scenes with opaque or transparent solids, or faster with none."""
     module = shading_module(has_opaque, has_clear)
     glass, background = glass_functions(has_opaque, has_clear)
     meet, leave = surface_functions(has_opaque, has_clear)
@@ -164,7 +164,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         entered: SurfaceHit,
         spread: wp.float32,
     ):
-        """Light that comes out of the fluid against a ray that was refracted into it."""
+        """Return the light that comes out of the fluid against a ray that was refracted into it."""
         found = wp.vec3(0.0)
         through = wp.vec3(1.0)
         o = start
@@ -230,7 +230,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
     @wp.func
     def seen(s: Environment, shadow: Vec3s2d, surface: LitSurface, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-        """The light that comes to the eye against a ray."""
+        """Return the light that comes to the eye against a ray."""
         met = meet(s, surface, o, d)
         floor_at = FAR
         if s.has_floor > 0 and d[1] < -1.0e-4:
@@ -283,7 +283,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
         offsets: Vec2s,
         image: Vec3s,
     ):
-        """The light of some pixels, the mean of that through points of each; ``offsets``: where in the pixel, from -0.5
+        """Compute the light of some pixels, the mean over points of each; ``offsets``: places in the pixel, from -0.5
         to 0.5."""
         pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
@@ -300,8 +300,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """1 where a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it, and
-    0 elsewhere."""
+    """Write 1 where a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below
+    it, and 0 elsewhere."""
     i = first + wp.tid()
     column = i % columns
     greatest = wp.float32(0.0)

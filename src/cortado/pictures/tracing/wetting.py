@@ -19,7 +19,7 @@ from cortado.pictures.tracing.near_particles import MODULE, Ints, Look, Particle
 from cortado.pictures.tracing.surroundings import GLASS_BOX, Environment
 
 SKIN = 0.7
-"""In spacings: how far beyond a particle fluid is drawn, about."""
+"""In spacings: about how far beyond a particle fluid is drawn."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
 """Of mirror images behind a surface, in parts of the distance of what they show; the first that a thin solid hides."""
 ON_SURFACE = 0.05
@@ -31,7 +31,7 @@ SAME_SIDE = 0.8
 def mirrored(
     points: Points, solids: Sequence[ShownSolid], touching: float, spacing: float
 ) -> tuple[Points, np.ndarray]:
-    """Mirror images (m, d) [m] of points (n, d) [m] behind solids, and which point each of them shows, (m,).
+    """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the point of each, (m,).
 
     Points have images if they are nearer to a solid than ``touching`` [m]: behind each side of it that they touch, and
     behind corners between these. Where a solid is too thin to hide fluid that is drawn there, images are nearer to the
@@ -52,8 +52,8 @@ def mirrored(
 
 
 def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) -> list[Points]:
-    """From each of the points (n, d) [m] to its image behind each side that it touches, (n, d) [m]; 0 where there is
-    none. Sides are looked for towards the nearest point, and along the axes of the solid."""
+    """Return the way (n, d) [m] from each of the points (n, d) [m] to its image behind each side that it touches; 0
+    where there is none. Sides are looked for towards the nearest point, and along the axes of the solid."""
     solid, normals, ways = shown.solid, list[Points](), list[Points]()
     for probe in touching * np.concatenate([np.zeros((1, len(shown.turn))), shown.turn.T, -shown.turn.T]):
         feet, away = solid.nearest(points + probe), solid.outward(points + probe)
@@ -85,8 +85,9 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """Those at positions (n, 3) [m] in the axes of the scene, with colours (n, 3) and mass fractions (n, phases), even
-    ones if left out. Along a periodic axis they are where their images within the period are."""
+    """Return particles in the picture's frame, at positions (n, 3) [m] in the scene's axes, with colours (n, 3) and
+    mass fractions (n, phases), even ones if left out. Along a periodic axis they are where their images within the
+    period are."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -96,8 +97,8 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Whether a particle, in the frame of the container, has a first and a second image along an axis, as bits 1 and 2:
-    those behind the lower and the upper wall; along the first axis of a cylinder those behind its round wall."""
+    """Return which images a particle, in the container's frame, has along an axis, as bits 1 and 2: those behind the
+    lower and the upper wall. Along the first axis of a cylinder they are behind its round wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -114,7 +115,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """From a particle to an image: no way at all to 0, itself, and then to those of `images_along`."""
+    """Return the way from a particle to an image: 0 to image 0, itself, and then to those of `images_along`."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -132,7 +133,7 @@ def has_image(which: wp.int32, images: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def count_images(first: wp.int32, s: Environment, spacing: wp.float32, places: Vec3s, counts: Ints):
-    """Of each particle, itself among them."""
+    """Count the images of each particle, itself among them."""
     i = first + wp.tid()
     q = s.glass_frame * places[i]
     count = wp.int32(1)
@@ -153,7 +154,7 @@ def list_images(
     image_places: Vec3s,
     image_looks: wp.array(dtype=Look),
 ):
-    """``counts``: of those up to each particle."""
+    """List places and looks of all images; ``counts`` has the number of images up to each particle."""
     i = first + wp.tid()
     n = wp.int32(0)
     if i > 0:
@@ -173,8 +174,7 @@ def list_images(
 
 
 def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> Particles:
-    """Particles with their images behind solids and behind the walls of the container, as the `Environment` s has
-    them."""
+    """Return particles with their images behind solids and behind the walls of the container of an `Environment` s."""
     if stage.solids:
         placed = particles.places.numpy().astype(np.float64)
         images, of = mirrored(placed, stage.solids, TOUCHING_SOLID * stage.spacing, stage.spacing)
