@@ -16,7 +16,7 @@ from programs import PEERS
 
 from benchmarks.bench.scene import dam_break
 from cortado import Simulation
-from cortado.scene.containers import NoContainer
+from cortado.scene.shape_tables import NoContainer
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cortado.files.output_files import write_atomically
+from cortado.files.disk import write_atomically
 from cortado.pictures.plots import STYLE
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from cortado.files.terminal import Advance
 from cortado.scene import tables
-from cortado.scene.fields import Text, components, quantity
 from cortado.scene.scene import Scene
+from cortado.scene.tables import Text, components, quantity
 from experiments.tables import Table
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Settings(tables.Table):
     """The settings in the file of an experiment; each type of experiment adds its own.
 
-    Their field types are those of `cortado.scene.fields`, which make sentences of errors.
+    Their field types are those of `cortado.scene.tables`, which make sentences of errors.
     """
 
     title: Text

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from cortado.pictures.plots import DASHED, FAINT, PALETTE
-from cortado.scene.fields import OneOf, Several, count, quantity
+from cortado.scene.tables import OneOf, Several, count, quantity
 from experiments.canvas import blank
 from experiments.experiment import ExperimentType, Progress, SceneSettings
 from experiments.gravity_tangents import COST, LABEL, along_gravity

@@ -9,7 +9,7 @@ from cortado.losses import FinalPositions, Image
 from cortado.pictures.plots import PALETTE
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene.fields import Several, Vector, count, quantity
+from cortado.scene.tables import Several, Vector, count, quantity
 from cortado.simulation import Simulation
 from experiments.canvas import blank
 from experiments.comparison import growth

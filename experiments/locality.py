@@ -17,7 +17,7 @@ import numpy as np
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE
 from cortado.reference import History, Simulation
-from cortado.scene.fields import Vector, count, quantity
+from cortado.scene.tables import Vector, count, quantity
 from experiments import spatial_scales
 from experiments.canvas import blank
 from experiments.ensembles import perturbed, side_by_side

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from cortado.reference import Simulation, Terms
 from cortado.scene import tables
-from cortado.scene.fields import Several, Text, components, count, quantity
 from cortado.scene.scene import Scene
+from cortado.scene.tables import Several, Text, components, count, quantity
 from experiments.ensembles import perturbed, side_by_side
 from experiments.estimates import growth_rate, norms
 from experiments.experiment import Progress, SceneSettings

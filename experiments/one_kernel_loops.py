@@ -18,7 +18,7 @@ from cortado.device.modules import Kernels
 from cortado.gradients import Tape
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.rollout.rollout import BackwardStep, Rollout
-from cortado.solvers.density import Density
+from cortado.sph.density import Density
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.pictures.plots import PALETTE
 from cortado.reference import Terms
-from cortado.scene.fields import OneOf, Several, count
+from cortado.scene.tables import OneOf, Several, count
 from experiments.canvas import blank
 from experiments.comparison import growth
 from experiments.experiment import ExperimentType, Progress, SceneSettings

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import InputError
-from cortado.files.input_files import content
-from cortado.files.output_files import parsed_json, write_atomically
+from cortado.files.disk import content, parsed_json, write_atomically
 from cortado.files.terminal import track
 from experiments.canvas import save
 from experiments.experiment import Experiment

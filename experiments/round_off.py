@@ -15,7 +15,7 @@ import numpy as np
 
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
-from cortado.scene.fields import OneOf, Several, Vector, count, quantity
+from cortado.scene.tables import OneOf, Several, Vector, count, quantity
 from experiments.canvas import blank
 from experiments.ensembles import perturbed, side_by_side
 from experiments.estimates import Estimate, Line, growth_rate, norms

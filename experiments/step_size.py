@@ -15,7 +15,7 @@ import numpy as np
 
 from cortado.pictures.plots import DASHED, FAINT, INK
 from cortado.reference import Simulation
-from cortado.scene.fields import Several, Vector, count, quantity
+from cortado.scene.tables import Several, Vector, count, quantity
 from experiments.canvas import blank
 from experiments.ensembles import perturbed, side_by_side
 from experiments.estimates import Estimate, Line, geometric_mean, norms

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError
-from cortado.files.input_files import content, reason
-from cortado.files.output_files import write_atomically
+from cortado.files.disk import content, reason, write_atomically
 
 MOST_BYTES = 2**30
 """Of a file of results that is read again."""

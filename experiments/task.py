@@ -12,7 +12,7 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.task import Setup, load_task, setup
 from cortado.optimisation.optimise import Record, optimise
 from cortado.pictures.plots import PALETTE, whole_numbers
-from cortado.scene.fields import Several, Text
+from cortado.scene.tables import Several, Text
 from experiments.canvas import blank
 from experiments.experiment import DeviceSettings, ExperimentType, Progress
 from experiments.tables import Table

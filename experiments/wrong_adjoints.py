@@ -14,7 +14,7 @@ import numpy as np
 from cortado import gradients, losses, reference
 from cortado.pictures.plots import DASHED, INK, PALETTE
 from cortado.problem import Problem
-from cortado.scene.fields import Several, count, quantity
+from cortado.scene.tables import Several, count, quantity
 from cortado.simulation import Simulation
 from experiments.canvas import blank
 from experiments.ensembles import perturbed

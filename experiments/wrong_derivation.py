@@ -13,7 +13,7 @@ import numpy as np
 
 from cortado.pictures.plots import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
-from cortado.scene.fields import Vector, count, quantity
+from cortado.scene.tables import Vector, count, quantity
 from experiments.canvas import blank
 from experiments.ensembles import perturbed, side_by_side
 from experiments.estimates import Estimate, geometric_mean, growth_rate, norms

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 
 from cortado import Scene, Simulation
-from cortado.scene.fields import rotation_matrix
 from cortado.scene.solids import BoxSolid, CupSolid, MeshSolid, SolidTable
+from cortado.scene.tables import rotation_matrix
 from scenes import box
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}

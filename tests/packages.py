@@ -10,7 +10,7 @@ import warp as wp
 
 import cortado
 from cortado.errors import InputError, SceneError
-from cortado.scene.fields import quantity
+from cortado.scene.tables import quantity
 from cortado.scene.parameters import Axis, Parameter
 from own_forces import Breeze
 from solvers import MakeFalling, MakeRemembering

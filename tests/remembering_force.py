@@ -8,7 +8,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.particles.fields import Entry, StateField
+from cortado.particles.state import Entry, StateField
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.parts import Carried, Part, PartAdjoint, PartTangent
 

@@ -11,14 +11,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.particles.fields import Entry, StateField
+from cortado.particles.state import Entry, StateField
 from cortado.scene.parameters import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
-from cortado.solvers.pcisph.solver import Pcisph
+from cortado.solvers.pcisph.solver import Pcisph, PcisphAdjoint, PcisphTangent
 
 MEMORY = "memory"
 

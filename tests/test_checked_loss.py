@@ -11,8 +11,7 @@ from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.errors import InputError
 from cortado.losses import FinalPositions, Frames, Recorded, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.run_losses import as_loss
-from cortado.particles.fields import POSITIONS, VELOCITIES
-from cortado.particles.state import Layout, State
+from cortado.particles.state import POSITIONS, VELOCITIES, Layout, State
 from cortado.sph.mixture import MASS_FRACTIONS
 
 N, PHASES = 5, 2

@@ -24,7 +24,7 @@ import cortado.files.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
-from cortado.files.output_files import locked
+from cortado.files.disk import locked
 from cortado.optimisation.inverse.solved_task import TaskFigures
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.transforms import TimeInterpolation

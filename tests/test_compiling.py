@@ -13,9 +13,8 @@ import warp as wp
 
 import cortado
 from compiling_notice import COMPILING, UNOPTIMISED
-from cortado.device import compiling
-from cortado.device.compiling import kernels_of
-from cortado.device.modules import DEEP, SHALLOW, UNUSED, is_derivative, kernel_module
+from cortado.device import modules
+from cortado.device.modules import DEEP, SHALLOW, UNUSED, is_derivative, kernel_module, kernels_of
 from scenes import plane, pour
 
 FIRST = {
@@ -185,13 +184,13 @@ def test_what_is_compiled_meanwhile_is_waited_for_and_not_compiled_again(monkeyp
         compiled.extend(modules)
         done.update(modules)
 
-    monkeypatch.setattr(compiling, "_compile_all", slowly)
-    monkeypatch.setattr(compiling, "_is_compiled", lambda module, device: module in done)
-    monkeypatch.setattr(compiling, "usable_cores", lambda: 2)
-    compiling.compile_meanwhile(solver, wp.get_device("cpu"))
+    monkeypatch.setattr(modules, "_compile_all", slowly)
+    monkeypatch.setattr(modules, "_is_compiled", lambda module, device: module in done)
+    monkeypatch.setattr(modules, "usable_cores", lambda: 2)
+    modules.compile_meanwhile(solver, wp.get_device("cpu"))
     assert not compiled
     Timer(0.1, wanted.set).start()
-    compiling.compile_ahead(solver, wp.get_device("cpu"))
+    modules.compile_ahead(solver, wp.get_device("cpu"))
     assert len(compiled) == len(set(compiled)) == len(done) > 1
 
 

@@ -13,9 +13,8 @@ from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
 from cortado.discretise.room import Region
 from cortado.discretise.shapes import corners
-from cortado.particles.fields import POSITIONS, VELOCITIES
-from cortado.particles.state import Layout, to_device
-from cortado.scene.containers import CylinderContainer
+from cortado.particles.state import POSITIONS, VELOCITIES, Layout, to_device
+from cortado.scene.shape_tables import CylinderContainer
 from cortado.solvers.containment import Containment, Walled
 from scenes import jet, plane, scene
 

@@ -19,7 +19,7 @@ from cortado import (
     losses,
 )
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
-from cortado.gradients.adjoint_filters import EddyViscosity
+from cortado.gradients.reverse_mode import EddyViscosity
 from reference import complex_step
 from scenes import jet, plane, plane_of_three, pour, scene, splash
 from twins import twin

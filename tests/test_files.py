@@ -12,11 +12,10 @@ import sys
 
 import pytest
 
-import cortado.files.output_files
+import cortado.files.disk
 from cortado.errors import ComputationError, InputError
-from cortado.files import output_files
-from cortado.files.input_files import content, reason, regular_file
-from cortado.files.output_files import LOCK, locked, unfinished, write_atomically
+from cortado.files import disk
+from cortado.files.disk import LOCK, content, locked, reason, regular_file, unfinished, write_atomically
 from full_disk import largest_file
 
 
@@ -44,7 +43,7 @@ def test_a_full_disk_is_told_from_a_wrong_path(tmp_path, monkeypatch):
 
 def test_a_link_under_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
     (tmp_path / "precious").write_text("mine")
-    monkeypatch.setattr(cortado.files.output_files.secrets, "token_hex", lambda count: "guessed")
+    monkeypatch.setattr(cortado.files.disk.secrets, "token_hex", lambda count: "guessed")
     unfinished(tmp_path / "a").symlink_to(tmp_path / "precious")
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(tmp_path / "a", "theirs")
@@ -118,7 +117,7 @@ def test_a_file_that_the_system_makes_up_has_an_end():
 HOLDER = """
 import sys, time
 from pathlib import Path
-from cortado.files.output_files import locked
+from cortado.files.disk import locked
 
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)
@@ -197,7 +196,7 @@ def test_a_lock_on_windows_is_one_byte_that_others_need_not_read(tmp_path, monke
 
     monkeypatch.setitem(sys.modules, "msvcrt", Msvcrt)
     monkeypatch.setattr(sys, "platform", "win32")
-    found = runpy.run_path(output_files.__file__)
+    found = runpy.run_path(disk.__file__)
     with open(tmp_path / LOCK, "w+b") as file:
         found["lock"](file.fileno())
         assert asked == [(found["BEYOND"], 2, 1)] and file.tell() == 0

@@ -11,8 +11,8 @@ import pytest
 
 from bad_scenes import assert_one_sentence, one_sentence
 from cortado.errors import CortadoError, CortadoWarning, InputError
+from cortado.files.disk import read_columns
 from cortado.files.image_encoding import write_video
-from cortado.files.input_files import read_columns
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.image_files import read_frames, write_picture

@@ -14,14 +14,13 @@ from cortado import Simulation
 from cortado.forces import Body, Pair
 from cortado.particles.state import Fields, Layout
 from cortado.particles.wall_terms import ALL_WALLS, SolidShares
-from cortado.solvers.pcisph.derivatives import PcisphAdjoint
+from cortado.runs.quantity_formulas import circulation_kernels
+from cortado.solvers.pcisph.solver import PcisphAdjoint
 from cortado.sph.curvature_kernels import curvature_adjoints, curvature_kernels, curvature_tangents, entries
 from cortado.sph.emitter import Nozzle, emitter_kernels, nozzle_type
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
-from cortado.sph.surface_stress import surface_tension_kernels
-from cortado.sph.surface_tension import normal_kernels
-from cortado.sph.vorticity import circulation_kernels
+from cortado.sph.surface_tension import normal_kernels, surface_tension_kernels
 from cortado.sph.walls import wall_slope_term
 from scenes import plane_of_three, splash
 from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros

@@ -7,7 +7,7 @@ import cortado
 from cortado import CortadoError, CortadoWarning, Problem, Simulation, gradients, losses
 from cortado.cli import main
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
-from cortado.sph.implicit_viscosity import ImplicitViscousStress
+from cortado.sph.viscous_stress import ImplicitViscousStress
 from scenes import HONEY, plane, scene
 
 STEPS = 6
@@ -151,7 +151,7 @@ def test_iterations_of_every_step_are_noted_and_too_few_are_told_of(monkeypatch)
     np.testing.assert_array_equal(both[0].diagnostics["viscous_iterations"], noted)
     assert (both[1].diagnostics["viscous_iterations"] != noted).any()
     assert "viscous_iterations" not in Simulation(thick("explicit"), precision="float64").run(1).diagnostics
-    monkeypatch.setattr("cortado.sph.implicit_viscosity.MOST", 3)
-    monkeypatch.setattr("cortado.sph.implicit_viscosity.Solve.most", 3)
+    monkeypatch.setattr("cortado.sph.viscous_stress.MOST", 3)
+    monkeypatch.setattr("cortado.sph.viscous_stress.Solve.most", 3)
     with pytest.warns(CortadoWarning, match="the viscosity did not converge in 4 of 4 steps, in which it took 3 iter"):
         Simulation(thick(), precision="float64").run(4)

@@ -29,8 +29,7 @@ from cortado.scene.parameter_values import (
     reference_density_tangent,
 )
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
-from cortado.solvers.pcisph.relaxation import density_ratio_kernels, wall_kernels
-from cortado.solvers.pcisph.steps import begin_adjoint_kernel
+from cortado.solvers.pcisph.steps import begin_adjoint_kernel, density_ratio_kernels, wall_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE

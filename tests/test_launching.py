@@ -12,20 +12,19 @@ from cortado.device.launching import Bundles, KernelLauncher, bound, launch, lau
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
-from cortado.gradients.adjoint_filters import adjoint_filter_kernels
+from cortado.gradients.reverse_mode import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import fill_kernel
 from cortado.particles.pair_sums import fluid_sum
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
-from cortado.solvers.pcisph.relaxation import density_ratio_kernels, wall_kernels
+from cortado.solvers.pcisph.steps import density_ratio_kernels, wall_kernels
 from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
 from cortado.sph.stress_kernels import stress_kernels
-from cortado.sph.surface_stress import surface_tension_kernels
-from cortado.sph.surface_tension import normal_kernels
+from cortado.sph.surface_tension import normal_kernels, surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from cortado.sph.viscosity_law import newtonian_law
 from scenes import plane, scene, two_layers

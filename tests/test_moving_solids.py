@@ -9,10 +9,10 @@ from cortado.gradients import AdjointViscosity, ImplicitPressure
 from cortado.losses import CentreOfMass
 from cortado.pictures.run_pictures import run_page
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.fields import rotation_matrix
 from cortado.scene.motions import greatest_speed
 from cortado.scene.scene_warnings import standing_sentences
 from cortado.scene.stability import stability_limits
+from cortado.scene.tables import rotation_matrix
 from finite_differences import both_modes, central_difference
 from scenes import box, jet, pool
 

@@ -8,7 +8,7 @@ import pytest
 import cortado
 from cortado import InputError, Problem, Simulation, gradients
 from cortado.errors import MissingDerivativeError
-from cortado.particles.fields import Entry, StateField
+from cortado.particles.state import Entry, StateField
 from cortado.scene.parameters import Axis, Parameter
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Carried, Part

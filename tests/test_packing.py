@@ -15,8 +15,8 @@ from cortado.discretise.shapes import apart, pairs_among, pairs_within
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.fields import rotation_matrix
 from cortado.scene.fluid_particles import period
+from cortado.scene.tables import rotation_matrix
 
 SPACING = 0.05
 DISC = {"shape": "sphere", "centre": [0.31, -0.2], "radius": 0.5}

@@ -17,7 +17,7 @@ from bad_scenes import plane
 from bad_tasks import TINY_SCENE
 from cortado import InputError, Scene
 from cortado.cli import main
-from cortado.files.output_files import unfinished
+from cortado.files.disk import unfinished
 from cortado.files.terminal import track
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
 from cortado.pictures.report import Section, write_report, written

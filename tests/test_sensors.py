@@ -14,10 +14,10 @@ from cortado.discretise.room import Domain
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
-from cortado.losses.series import SensorMatch
+from cortado.losses.distances import SensorMatch
 from cortado.runs.sensor import Readings, as_csv, from_csv, value_of
-from cortado.scene.containers import Container, NoContainer
 from cortado.scene.discrete_scene import Lattice
+from cortado.scene.shape_tables import Container, NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
 from cortado.watching import Watch
 from finite_differences import both_modes, distance

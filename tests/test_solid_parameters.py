@@ -11,7 +11,7 @@ from cortado.certificate.horizon import coherent_directions, scales
 from cortado.errors import CortadoWarning, InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
-from cortado.losses.series import SensorMatch
+from cortado.losses.distances import SensorMatch
 from cortado.pictures.exported import Exported
 from cortado.runs.solid_motion import posed
 from cortado.sensors import PressureProbe, WallForce

@@ -11,7 +11,7 @@ import pytest
 
 import cortado
 from cortado import InputError, SceneError, Simulation, Trajectory
-from cortado.rollout import retaking
+from cortado.rollout.step_sizes import Retaken
 from cortado.scene.restart import Clock
 from cortado.scene.solids import PolygonSolid
 from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
@@ -560,7 +560,7 @@ def test_what_was_compressed_before_is_no_reason_to_shorten_steps():
     ],
 )
 def test_a_step_is_shortened_where_that_helps(added, sizes, wanted):
-    retaken, asked = retaking.Retaken(), []
+    retaken, asked = Retaken(), []
     for more, size in zip(added, sizes, strict=True):
         lost = {0: 5} if np.isinf(more) else {}
         tried, longest = np.array([[0.0], [more], [9.0]]), np.array([[8.0], [size if asked else 8.0], [8.0]])

@@ -13,8 +13,8 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.discretise.solid import cut_box_faces
 from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box, wall_layers
 from cortado.pictures.shown_solids import solid_outline
-from cortado.scene.containers import BoxContainer, Container
 from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.shape_tables import BoxContainer, Container
 from test_packing import densities as packed_densities
 from test_solids import volume_and_middle, winding
 

@@ -1,10 +1,10 @@
 """The scene of benchmarks, of any size; the programs in ``benchmarks/peers`` simulate the same block."""
 
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.scene.containers import BoxContainer
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.model import DiscretisationTable, Forces, Phase
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import BoxContainer
 from cortado.scene.solvers import PcisphSolver
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver

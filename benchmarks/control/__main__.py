@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from cortado.errors import CortadoError, InputError
-from cortado.files.output_files import locked
+from cortado.files.disk import locked
 from cortado.files.terminal import track
 
 from .catalogue import SIZES, TASKS, task

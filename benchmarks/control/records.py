@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado import CortadoError, CortadoWarning, InputError, __version__
-from cortado.files.output_files import sentences
+from cortado.files.disk import sentences
 
 from .catalogue import task
 from .contenders import contender

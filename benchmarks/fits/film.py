@@ -7,8 +7,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from cortado.errors import InputError
+from cortado.files.disk import sentences
 from cortado.files.image_encoding import pyav
-from cortado.files.output_files import sentences
 
 WIDTH, HEIGHT = 0.16, 0.08
 """Of what the camera sees [m]."""

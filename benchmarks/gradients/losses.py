@@ -9,7 +9,7 @@ import numpy as np
 from cortado import Simulation
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss, Snapshot
 from cortado.losses.image_losses import Pyramid
-from cortado.scene.containers import BoxContainer
+from cortado.scene.shape_tables import BoxContainer
 
 PIXELS = 32
 """Of the shorter side of a picture."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cortado import InputError
-from cortado.files.output_files import lock
+from cortado.files.disk import lock
 
 from .cells import Cell, Record
 

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from cortado.scene.fields import GREATEST
+from cortado.scene.tables import GREATEST
 
 Schema = Mapping[str, Any]
 WORDS = {"number": "number", "integer": "whole number", "boolean": "`true` or `false`", "string": "text"}

@@ -1,5 +1,6 @@
 """Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from inspect import signature
 from numbers import Real
@@ -20,6 +21,17 @@ REFUSED = {
 """What an array holds whose entries are not real numbers, by the kind of its type."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
+
+
+def as_number(value: Any) -> float | None:
+    """A finite number as a float; None for anything else, a bool included."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Forces of one's own, each one function: given to ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
 
 from cortado.calls import face
-from cortado.sph.own_force import Body, OverTime, Pair
-from cortado.sph.rheology import Rheology
+from cortado.sph.own_force import Body, OverTime, Pair, Rheology
 
 __all__ = ["Body", "OverTime", "Pair", "Rheology"]
 

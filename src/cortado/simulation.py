@@ -44,11 +44,22 @@ from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
 from cortado.solvers.build import first_capacity
-from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver, forces_named, solver_named
+from cortado.solvers.makers import (
+    ForceMaker,
+    SolverMaker,
+    SolverSetting,
+    built,
+    called,
+    check_own,
+    checked_makers,
+    checked_solver,
+    forces_named,
+    known_of,
+    solver_named,
+)
 from cortado.solvers.solver import Solver
 from cortado.sph.diffusion import stable_substeps
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
-from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
 from cortado.watching import Watch
 from cortado.words import counted
 

@@ -15,6 +15,11 @@ def quoted(names: Iterable[str]) -> str:
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
+def point_in_words(point: Iterable[float]) -> str:
+    """The coordinates of a point, in brackets."""
+    return f"({', '.join(f'{value:g}' for value in point)})"
+
+
 def sized(arrays: Mapping[str, Any]) -> str:
     """Names with the shapes of what they stand for: ``gravity (3,), viscosity``."""
     shapes = {name: getattr(value, "shape", ()) for name, value in arrays.items()}

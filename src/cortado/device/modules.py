@@ -1,15 +1,29 @@
-"""The Warp modules that kernels are compiled in.
+"""The Warp modules that kernels are compiled in, before they are launched: all that a step needs, side by side, and one
+line says so.
 
 For a CPU LLVM finds what can be done four numbers at a time in loops over neighbours, which take `UNROLL` of them at
 once (`cortado.particles.neighbourhood`), if it looks deep enough: with Warp's depth of 4 a step of the projection takes
 a fifth longer, one of PCISPH a twentieth, and both have the same bits. With LLVM's own depth of 12 the density takes a
 fifth longer than with 7.
+
+Warp compiles a module when the first of its kernels is launched, one module after the other. `wp.force_load` of all of
+them with workers of its own is as fast as what is done here. But after Ctrl-C it waits for all of them, and of a few at
+a time it takes 1.7 times as long.
 """
 
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import warp as wp
+
+from cortado.device.threads import MOST_CORES, helpers, in_parallel, usable_cores
+from cortado.files.terminal import note, timed_note
 
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
 """An option of LLVM, as Warp gives it and as it is for our modules. Other flags are those of Warp's configuration."""
@@ -52,3 +66,126 @@ def kind_of(forward: bool, taped: bool) -> str:
 def is_derivative(module: Any) -> bool:
     """Whether the kernels of a Warp module are derivatives."""
     return "_derivative_" in module.name or "_tangent_" in module.name
+
+
+_ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
+"""Objects whose kernels were compiled ahead, by their identity."""
+_begun: dict[Any, Future[None]] = {}
+"""Modules that another thread compiles, or has compiled, which nobody has asked for yet."""
+_looked_at: set[Any] = set()
+"""Modules of kernels that were launched."""
+
+
+class _Said:
+    """Whether this process has announced that it compiles."""
+
+    anything = False
+
+
+def compile_ahead(owner: Any, device: Any) -> None:
+    """Compile the modules of all kernels that an object of Cortado's holds, itself or by what it is made of, but those
+    of derivatives: what a step of a solver is about to launch. Once for each object; those in the cache are left to be
+    loaded when they are launched."""
+    if _ahead.get(id(owner)) is not owner:
+        _ahead[id(owner)] = owner
+        _compile([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)], device)
+
+
+def compile_ahead_adjoint(owner: Any, device: Any) -> None:
+    """The same for what a step back is about to launch: those of adjoints too."""
+    if _ahead.get(id(owner)) is not owner:
+        _ahead[id(owner)] = owner
+        _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
+
+
+def compile_meanwhile(owner: Any, device: Any) -> None:
+    """Begin to compile the same in another thread, on a CPU with a core to spare, while this one goes on with something
+    else; `compile_ahead` waits for what was begun."""
+    if not device.is_cpu or usable_cores() < 2:
+        return
+    sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
+    missing = _missing({module: size for module, size in sizes.items() if module not in _begun}, device)
+    if missing:
+        _Said.anything = True  # or else a line would come of what nobody waits for
+        _begun.update(dict.fromkeys(missing, helpers().submit(_compile_all, missing, device, 1)))
+
+
+def announce(kernel: wp.Kernel, device: Any) -> None:
+    """Before a kernel is launched: say on stderr that kernels are compiled if its module has to be, once a process."""
+    module = kernel.module
+    if module not in _looked_at:
+        _looked_at.add(module)
+        if not _Said.anything and module.name.startswith("cortado_") and not _is_compiled(module, device):
+            _Said.anything = True
+            note("Compiling kernels, once on this machine.")
+
+
+def kernels_of(owner: Any) -> list[wp.Kernel]:
+    """The kernels that an object of Cortado's holds, itself or by what it is made of."""
+    found: dict[int, Any] = {}
+    seen: dict[int, Any] = {}
+    waiting = [owner]
+    while waiting:
+        one = waiting.pop()
+        if id(one) in seen:
+            continue
+        seen[id(one)] = one
+        if isinstance(one, wp.Kernel):
+            found[id(one)] = one
+        elif isinstance(one, (list, tuple, set, frozenset)):
+            waiting += one
+        elif isinstance(one, Mapping):
+            waiting += one.values()
+        elif isinstance(one, SimpleNamespace) or any(
+            base.__module__.startswith("cortado.") for base in type(one).__mro__
+        ):
+            waiting += getattr(one, "__dict__", {}).values()
+    return list(found.values())
+
+
+def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
+    """Compile and load the modules of kernels that are not in the cache, if there are several; one alone can as well be
+    compiled when it is launched."""
+    sizes = _sizes(kernels)
+    wait([_begun.pop(module) for module in sizes if module in _begun])
+    missing = _missing(sizes, device)
+    if len(missing) < 2:
+        return
+    # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
+    cores = min(usable_cores(), MOST_CORES, len(missing)) if device.is_cpu else 1
+    _Said.anything = True
+    with timed_note(f"Compiling {len(missing)} kernel modules for {device.alias}, once on this machine"):
+        _compile_all(missing, device, cores)
+
+
+def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
+    in_parallel(lambda module: wp.force_load(device, [module], max_workers=0), modules, cores)
+
+
+def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
+    """The modules of kernels, and a number for each that grows with the time that it takes to compile, which is long
+    for kernels that sum over neighbours."""
+    found: dict[Any, int] = {}
+    for kernel in kernels:
+        source = kernel.adj.source
+        found[kernel.module] = found.get(kernel.module, 0) + len(source) * (10 if "s.first" in source else 1)
+    return found
+
+
+def _missing(sizes: Mapping[Any, int], device: Any) -> list[Any]:
+    """The modules that have to be compiled, those that take longest first."""
+    return sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
+
+
+def _is_compiled(module: Any, device: Any) -> bool:
+    """Whether a module is loaded, or in the cache."""
+    block_dim = 1 if device.is_cpu else module.options["block_dim"]
+    if (device.context, block_dim) in module.execs:
+        return True
+    folder = Path(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim))
+    return (folder / module._get_compile_output_name(device, block_dim=block_dim)).exists()
+
+
+if hasattr(os, "register_at_fork"):
+    # A child would wait for ever for what no thread of its own ends.
+    os.register_at_fork(before=lambda: wait(list(_begun.values())))

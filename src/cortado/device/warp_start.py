@@ -1,6 +1,6 @@
 """Warp is started without a word, with a folder for compiled kernels that can be written, and its devices are named.
 
-What Warp says of itself is kept back, unless it is asked for; `cortado.device.compiling` says what is compiled. Who
+What Warp says of itself is kept back, unless it is asked for; `cortado.device.modules` says what is compiled. Who
 sets the environment variable CORTADO_VERBOSE to 1 hears all of it: the greeting, a line for every module that is
 loaded, warnings about drivers. Who sets ``warp.config.log_level`` before the first simulation is made keeps that level,
 if it is another one than Warp's own. Containers and clusters often have a home that is read-only or full.

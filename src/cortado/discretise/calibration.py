@@ -93,7 +93,7 @@ def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: floa
 
 
 def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of `cortado.solvers.pcisph.relaxation`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of `cortado.solvers.pcisph.steps`."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 

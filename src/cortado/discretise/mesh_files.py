@@ -15,7 +15,7 @@ from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_checks import FoundMesh, found_mesh
 from cortado.discretise.shapes import Numbers, Points, bisected
 from cortado.errors import InputError, Words, shown, warn
-from cortado.files.input_files import reason, regular_file
+from cortado.files.disk import reason, regular_file
 
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
 """How a file of triangles may end."""

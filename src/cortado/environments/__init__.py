@@ -7,9 +7,8 @@ from typing import Any
 
 from cortado.calls import face
 from cortado.environments.catalogue import TASKS
-from cortado.environments.fluid_env import FluidEnv, FluidVectorEnv, gymnasium
+from cortado.environments.fluid_env import FluidEnv, FluidVectorEnv, Twin, gymnasium
 from cortado.environments.task import Task
-from cortado.environments.twin import Twin
 
 __all__ = ["FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 

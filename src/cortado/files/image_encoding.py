@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
+from cortado.files.disk import sentences, unfinished, write_atomically
 from cortado.files.interruption import held
-from cortado.files.output_files import sentences, unfinished, write_atomically
 
 ROWS = 32
 """Rows of a picture that are converted at a time, so that they stay in the processor's cache."""

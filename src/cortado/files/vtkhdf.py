@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cortado.errors import ComputationError, InputError
-from cortado.files.output_files import sentences, unfinished, write_fully
+from cortado.files.disk import sentences, unfinished, write_fully
 from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frame_checksum, frames_seed, steps_seed
 
 

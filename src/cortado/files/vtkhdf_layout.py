@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.files.output_files import write_fully
+from cortado.files.disk import write_fully
 
 FORMAT = 3
 """Of the group "cortado"; the first had no checksums, the second no states to go on from."""

@@ -9,7 +9,6 @@ runs alone, is the reference that they are compared with.
 
 from cortado.arrays import require_function, require_methods
 from cortado.calls import face
-from cortado.gradients.adjoint_filters import AdjointNorms
 from cortado.gradients.ensembles import EnsembleMean, Guided, RandomizedSmoothing
 from cortado.gradients.estimator import (
     AdjointEstimator,
@@ -21,7 +20,7 @@ from cortado.gradients.estimator import (
     checked_estimate,
     checked_estimator,
 )
-from cortado.gradients.reverse_mode import AdjointViscosity, Exact, ImplicitPressure, Tape
+from cortado.gradients.reverse_mode import AdjointNorms, AdjointViscosity, Exact, ImplicitPressure, Tape
 from cortado.rollout.rollout import OBSERVED, Observer
 from cortado.scene.parameter_values import Values
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.arrays import as_numbers, is_whole, require_at_most, require_whole
+from cortado.arrays import as_number, as_numbers, is_whole, require_at_most, require_whole
 from cortado.calls import keep_own
 from cortado.device.memory import require
 from cortado.device.precision import Precision
@@ -24,7 +24,6 @@ from cortado.gradients.estimator import (
 )
 from cortado.gradients.reverse_mode import AdjointViscosity
 from cortado.rollout.rollout import Observer
-from cortado.scene.fields import as_number
 from cortado.scene.parameter_values import Arrays, Values
 
 MOST_SAMPLES = 100_000

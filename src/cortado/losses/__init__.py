@@ -1,10 +1,17 @@
 """What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
 
 from cortado.calls import face
-from cortado.losses.distances import CentreOfMass, CentreOfMassAlong, FinalPositions, Image, SolidPose
+from cortado.losses.distances import (
+    CentreOfMass,
+    CentreOfMassAlong,
+    FinalPositions,
+    Image,
+    SensorMatch,
+    Series,
+    SolidPose,
+)
 from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, fingerprint
 from cortado.losses.run_losses import Recorded
-from cortado.losses.series import SensorMatch, Series
 
 __all__ = [
     "CentreOfMass",

@@ -14,14 +14,13 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from cortado.discretise.shapes import wrapped
 from cortado.errors import ComputationError
-from cortado.files.output_files import sentences, unfinished, write_atomically
+from cortado.files.disk import sentences, unfinished, write_atomically
 from cortado.losses import FinalPositions
 from cortado.particles.state import State
 from cortado.problem import Problem
-from cortado.scene.fields import Flag, Text, count, field_error, quantity
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene
-from cortado.scene.tables import Table
+from cortado.scene.tables import Flag, Table, Text, count, field_error, quantity
 from cortado.simulation import Simulation
 from cortado.version import __version__
 

@@ -25,7 +25,7 @@ from cortado.arrays import (
 from cortado.calls import public
 from cortado.errors import InputError, shown, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
-from cortado.files.input_files import as_path
+from cortado.files.disk import as_path
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import NO_RUN, Differentiable, Point, checked_estimator, evaluated, without_runs
 from cortado.lazy import on_top

@@ -18,10 +18,10 @@ from typing import Any, BinaryIO, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from cortado.arrays import as_number
 from cortado.errors import ComputationError, InputError, shown
-from cortado.files.output_files import parsed_json, sentences, write_atomically, write_fully
+from cortado.files.disk import parsed_json, sentences, write_atomically, write_fully
 from cortado.runs.run_folder import REPLAY_LOG
-from cortado.scene.fields import as_number
 from cortado.words import quoted
 
 Vector = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.files.output_files import write_atomically
+from cortado.files.disk import write_atomically
 
 MOST_COMBINATIONS = 100_000
 """Most combinations of a sweep; more are taken for a mistake."""

@@ -1,4 +1,4 @@
-"""Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.terms`).
+"""Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.pair_sums`).
 
 For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) and their adjoints S_i^, the adjoint gathers what the pair gives
 to particle i, from its own sum and from that of its neighbour:
@@ -23,8 +23,18 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.pair_sums import Body, Types, over_fluid, summed, type_name, zero
-from cortado.particles.terms import NUMBERS, Term, array_of, own_entry
+from cortado.particles.pair_sums import (
+    NUMBERS,
+    Body,
+    Term,
+    Types,
+    array_of,
+    over_fluid,
+    own_entry,
+    summed,
+    type_name,
+    zero,
+)
 
 TermMaker = Callable[[Discretisation], Callable[..., Any]]
 

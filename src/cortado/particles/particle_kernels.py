@@ -40,7 +40,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.made_derivatives import bars_of, dot_of, work_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.terms import Term, array_of
+from cortado.particles.pair_sums import Term, array_of
 
 Types = Mapping[str, Any]
 KERNEL = """\

@@ -37,10 +37,9 @@ from cortado.device.reduction import add
 from cortado.particles.made_derivatives import dot_of
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.pair_sums import scope_of
+from cortado.particles.pair_sums import Term, scope_of
 from cortado.particles.particle_kernels import MADE, made_kernel
 from cortado.particles.state import Layout
-from cortado.particles.terms import Term
 
 ALL_WALLS = -(2**31)
 """Stands in place of a solid's number for the walls of all solids and of the container."""
@@ -276,7 +275,7 @@ def solid_kernel(
 ) -> Any:
     """Make the kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
-    ``make(discretisation)`` gives W, a term of walls (`cortado.particles.terms`) that returns a number, of functions
+    ``make(discretisation)`` gives W, a term of walls (as of `pair_sums`) that returns a number, of functions
     that Warp can differentiate; it knows entries of arrays of particle i, ``v_ij`` or ``v_j``, and ``constants``. As
     those of walls, a sum that ``rubs`` has nothing of walls that slip freely. A ``looped`` one is of iteration k, and
     leaves out scenes that make fewer ``rounds``.

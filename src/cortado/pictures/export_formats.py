@@ -11,9 +11,8 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.errors import ComputationError, ExtraMissingError, InputError, shown
+from cortado.files.disk import as_path, sentences, unfinished, write_atomically
 from cortado.files.image_encoding import to_srgb
-from cortado.files.input_files import as_path
-from cortado.files.output_files import sentences, unfinished, write_atomically
 from cortado.files.terminal import announce, track
 from cortado.pictures.exported import Exported, ExportedFrame, Mesh, Pose, in_space
 from cortado.runs.frames import FRACTION

@@ -30,8 +30,8 @@ from cortado.runs.frames import SAME, Marks, fraction_names
 from cortado.runs.solid_motion import SolidMotions, posed, sized
 from cortado.runs.trajectory import Frame, Trajectory
 from cortado.scene.appearance import Picture
-from cortado.scene.containers import CylinderContainer
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import CylinderContainer
 from cortado.simulation import Simulation
 
 EVEN = 1e-6

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from cortado.calls import public
 from cortado.device.memory import require
 from cortado.errors import InputError, warn
+from cortado.files.disk import as_path, reason, regular_file, write_atomically
 from cortado.files.image_encoding import from_srgb, png, pyav
-from cortado.files.input_files import as_path, reason, regular_file
-from cortado.files.output_files import write_atomically
 from cortado.render.cameras import check_resolution, positive, vector
 
 Picture = NDArray[np.float64]

@@ -18,9 +18,8 @@ from cortado.files.image_encoding import to_srgb
 from cortado.pictures.painter import colours_of
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.stage import upright
-from cortado.scene.common_shapes import INDEX_OF_AXIS
-from cortado.scene.containers import CylinderContainer
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import INDEX_OF_AXIS, CylinderContainer
 
 MOST_BYTES = 2_200_000
 """Most bytes of the positions, speeds and colours in one view; base64 makes them a third larger."""

@@ -15,8 +15,8 @@ from cortado.pictures.stage import fluid_extent, thinned
 from cortado.pictures.tracing.space import State
 from cortado.pictures.tracing.wetting import mirrored
 from cortado.scene.appearance import Picture
-from cortado.scene.containers import BoxContainer
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import BoxContainer
 
 LIGHT = (-0.45, 0.70, 0.55)
 """Direction of the lamp: to the right, up, towards the viewer."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
+from cortado.files.disk import write_atomically
 from cortado.files.image_encoding import to_srgb
-from cortado.files.output_files import write_atomically
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
 """Muted colours that stay apart in print and for most eyes."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.files.output_files import write_atomically
+from cortado.files.disk import write_atomically
 from cortado.pictures import particle_view
 from cortado.runs.run_folder import RunFolder
 

@@ -18,10 +18,10 @@ from cortado.arrays import whole_number
 from cortado.device.warp_start import device_named, start_warp
 from cortado.discretise.shapes import Points, corners
 from cortado.errors import InputError, SceneError, shown
+from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
-from cortado.files.input_files import as_path
 from cortado.files.terminal import announce
-from cortado.particles.fields import Entry
+from cortado.particles.state import Entry
 from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, alone, coloured_by, film, lacking
 from cortado.pictures.image_files import write_picture
 from cortado.pictures.painter import Scale

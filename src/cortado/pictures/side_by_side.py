@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
-from cortado.files.input_files import as_path
+from cortado.files.disk import as_path
 from cortado.pictures.film import (
     MOST_PICTURES,
     Around,

@@ -10,9 +10,8 @@ from cortado.discretise.room import WITHOUT_PERIODS, Domain
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.shown_solids import ShownSolid, extent_with, extents_of_solids, shown_solids, union
 from cortado.scene.appearance import LIQUIDS, Picture, View
-from cortado.scene.common_shapes import INDEX_OF_AXIS
-from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, CylinderContainer
 
 DROPS = 0.002
 """The share of particles at either end of an axis that may lie outside of a picture."""

@@ -16,8 +16,7 @@ from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.particles.fields import Entry
-from cortado.particles.state import Parameters, State, components
+from cortado.particles.state import Entry, Parameters, State, components
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import one_for_each, shapes_of_fields

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.rollout.rollout import Rollout
 from cortado.scene.scene import Scene
-from cortado.sph.implicit_viscosity import Solve
+from cortado.sph.viscous_stress import Solve
 from cortado.words import counted
 
 TORN = 0.015

@@ -15,9 +15,9 @@ import numpy as np
 import warp as wp
 
 from cortado.calls import Staying
-from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph
 from cortado.device.memory import require, step_parts, within
+from cortado.device.modules import compile_ahead, compile_ahead_adjoint
 from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
-from cortado.particles.fields import first_values
-from cortado.particles.state import State
+from cortado.particles.state import State, first_values
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.motions import Steady
 from cortado.scene.parameter_values import (
@@ -27,7 +26,7 @@ from cortado.scene.parameter_values import (
 )
 from cortado.scene.parameters import Axis, Changing, Source
 from cortado.scene.restart import Clock, RestartState
-from cortado.sph.makers import ForceMaker
+from cortado.solvers.makers import ForceMaker
 
 DENSITY = "reference_density"
 """The field of a state that the first mass fractions and the rest densities decide."""

@@ -30,7 +30,7 @@ from cortado.runs.sensor import (
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.quantity_names import load_name
 from cortado.scene.scene import Scene
-from cortado.scene.tables import point_in_words
+from cortado.words import point_in_words
 
 MOST_CELLS = 200_000
 """Cells of half a spacing that are looked at; a larger container is not judged."""

@@ -3,6 +3,13 @@
 Sums over neighbours are kernels; what is done with the sum of each particle alone is NumPy in float64. n is the number
 density, m a particle's mass over its volume V on the rest lattice, p the pressure that it pushes walls with.
 
+Vorticity is by summation over the fluid around a particle (Monaghan 1992):
+
+    c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
+
+mu = -(V / d) sum_j x_j . G_j is that of the rest lattice, on which a fluid that turns as a whole has twice its rate of
+turning. Walls have no part in it.
+
 Particle i pushes walls, those of one solid or all, with
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i),
@@ -12,8 +19,9 @@ where A_i is the sum over wall particles along which its pressure acts (``wall_p
 walls so get what momentum the fluid loses to them: the mass of a particle is m_i s^d, with the spacing s.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -21,14 +29,41 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import Named
+from cortado.device.modules import Kernels
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.particle_kernels import sum_kernels
 from cortado.particles.state import Fields, padded
 from cortado.particles.wall_terms import ALL_WALLS
 from cortado.scene.quantity_names import load_name
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import Adjoints, StepContext, Tangents
-from cortado.sph.vorticity import circulation_kernels
 from cortado.sph.walls import WallAction
+
+
+def turns(discretisation: Discretisation) -> Callable[..., Any]:
+    """Make the function of a pair's term (v_i - v_j) x G_ij in the circulation."""
+    vector, neighbourhood = discretisation.precision.vector, neighbourhood_type(discretisation.precision)
+    gradient = pair_functions(discretisation).gradient
+
+    def turning(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
+        return wp.cross(v_ij, gradient(x_ij, s))
+
+    return turning
+
+
+@cache
+def circulation_kernels(discretisation: Discretisation) -> Kernels:
+    """Make kernels ``forward``, ``tangent`` and ``adjoint`` of the sum c, the vorticity times mu n."""
+    sums = (
+        fluid_sum(discretisation)(turns(discretisation)),
+        *(make(discretisation, turns) for make in (made_tangent, made_adjoint)),
+    )
+    _, tangent_module, adjoint_module = discretisation.modules("vorticity")
+    modules = adjoint_module, tangent_module, adjoint_module  # a tape does not see the sum
+    return sum_kernels("circulation", modules, sums, "circulation", times="s.volume")
 
 
 def vectors(array: wp.array) -> NDArray:
@@ -321,7 +356,7 @@ class SpeedQuantity:
 
 @dataclass(frozen=True)
 class Vorticity:
-    """c_i / (mu n_i): see `cortado.sph.vorticity`. In the plane it is the component that stands on it."""
+    """c_i / (mu n_i): see `cortado.runs.quantity_formulas`. In the plane it is the component that stands on it."""
 
     factor: float
     """mu [-]"""

@@ -17,11 +17,11 @@ from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Fields, Parameters, State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.quantity_formulas import OnDevice, Particles, Pressures, Sums, formulas
-from cortado.scene.containers import Container
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.quantity_names import LOAD, QUANTITIES, check_quantity, is_load
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from cortado.errors import LONGEST, InputError, SceneError, shown, unwarned
-from cortado.files.input_files import content, reason
-from cortado.files.output_files import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.files.disk import UNFINISHED, content, parsed_json, reason, sentences, write_atomically
 from cortado.runs.sensor import Readings, as_csv, from_csv
 from cortado.scene.parameter_values import NAMES
 from cortado.scene.scene import Scene

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from cortado.arrays import as_numbers, as_one_number, read_only, require_methods, unit
 from cortado.discretise.shapes import grid
 from cortado.errors import DivergedError, InputError, shown
-from cortado.files.input_files import read_columns
-from cortado.scene.containers import Container
+from cortado.files.disk import read_columns
 from cortado.scene.discrete_scene import Lattice
+from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 
 

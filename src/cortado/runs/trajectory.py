@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from cortado.calls import public
 from cortado.errors import InputError, shown
 from cortado.files import vtkhdf
+from cortado.files.disk import as_path
 from cortado.files.image_encoding import ShadedPicture
-from cortado.files.input_files import as_path
 from cortado.lazy import on_top
 from cortado.runs.frames import FRACTION, Film, Marks, append_frame, fraction_names, frame_writer
 from cortado.runs.sensor import Readings

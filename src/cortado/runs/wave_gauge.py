@@ -36,8 +36,8 @@ from cortado.runs.sensor import (
     positive,
     reach_of,
 )
-from cortado.scene.containers import Container
 from cortado.scene.motions import Pose, position_name, scale_name
+from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5

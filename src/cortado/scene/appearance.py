@@ -14,21 +14,21 @@ from pydantic import Field, SerializationInfo, ValidationInfo, field_serializer,
 from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import Words
-from cortado.scene.fields import (
+from cortado.scene.quantity_names import NAMES
+from cortado.scene.tables import (
     MISSING,
     Colour,
     FieldPath,
     Flag,
     Length,
     OneOf,
+    Table,
     Text,
     components,
     count,
     field_error,
     quantity,
 )
-from cortado.scene.quantity_names import NAMES
-from cortado.scene.tables import Table
 
 Numbers = tuple[float, ...]
 

@@ -13,17 +13,16 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words, shown
-from cortado.scene.common_shapes import MeshShape
-from cortado.scene.containers import check_length
 from cortado.scene.emitter import EmitterTable
-from cortado.scene.fields import MISSING, FieldPath, field_error
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.model import MixtureTable, SceneTables, SolidLoadTable, room_of
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
+from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
-from cortado.scene.tables import field_name, point_in_words
+from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
+from cortado.words import point_in_words
 
 DEEPEST = 0.25
 """In spacings: how deep bodies may begin in walls and in each other."""

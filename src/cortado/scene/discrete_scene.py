@@ -27,13 +27,13 @@ from cortado.discretise.walls import (
     wall_weights,
 )
 from cortado.errors import InputError, MassWarning, warn
-from cortado.scene.containers import Container, NoContainer
 from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles, period
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.model import resting_room
 from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
 from cortado.scene.scene_warnings import standing_sentences, thin_sentences
+from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import ProjectionSolver
 
@@ -201,7 +201,7 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.relaxation`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.steps`."""
     laplacian_correction: float
     """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
     domain: Domain

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import field_validator
 
 from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, disc_cells
-from cortado.scene.fields import GREATEST, Length, Vector, field_error, quantity
 from cortado.scene.fluids import FluidBody
+from cortado.scene.tables import GREATEST, Length, Vector, field_error, quantity
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from cortado.discretise.primitives import block_around, points_inside
 from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
 from cortado.discretise.solid import Placed, Solid
-from cortado.scene.common_shapes import (
+from cortado.scene.point_files import read_points
+from cortado.scene.shape_tables import (
     INDEX_OF_AXIS,
     BoxShape,
     CylinderShape,
@@ -20,10 +21,11 @@ from cortado.scene.common_shapes import (
     PolygonShape,
     SphereShape,
 )
-from cortado.scene.fields import (
+from cortado.scene.tables import (
     FieldPath,
     Length,
     Rotation,
+    Table,
     Text,
     Turning,
     Vector,
@@ -31,8 +33,6 @@ from cortado.scene.fields import (
     quantity,
     rotation_matrix,
 )
-from cortado.scene.point_files import read_points
-from cortado.scene.tables import Table
 
 ALIGNED = 1e-3
 """In spacings: by how much a surface may be off the faces of cells that it does not cut."""

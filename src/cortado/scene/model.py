@@ -12,29 +12,28 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 
 from cortado.discretise.room import Room
 from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
-from cortado.scene.common_shapes import check_order
-from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
-from cortado.scene.fields import (
+from cortado.scene.fluids import AnyFluid, turned
+from cortado.scene.motions import Schedule
+from cortado.scene.packages import AnyForces
+from cortado.scene.parameters import PARAMETERS
+from cortado.scene.shape_tables import AnyContainer, NoContainer, check_order
+from cortado.scene.solids import AnySolid, solids_of
+from cortado.scene.solvers import AnySolver, what_suits
+from cortado.scene.tables import (
     Colour,
     FieldPath,
     Flag,
     Length,
     OneOf,
     Several,
+    Table,
     Text,
     Vector,
     count,
     field_error,
     quantity,
 )
-from cortado.scene.fluids import AnyFluid, turned
-from cortado.scene.motions import Schedule
-from cortado.scene.packages import AnyForces
-from cortado.scene.parameters import PARAMETERS
-from cortado.scene.solids import AnySolid, solids_of
-from cortado.scene.solvers import AnySolver, what_suits
-from cortado.scene.tables import Table
 
 SHORTEST = 40.0
 """Regularisation [s] that a fluid with a yield stress has at least, if it is not given: what does not yield creeps at

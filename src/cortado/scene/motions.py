@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field, create_model, model_validator
 
 from cortado.errors import Words
-from cortado.scene.fields import FieldPath, Several, field_error, quantity
 from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, Source
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import Table
+from cortado.scene.tables import FieldPath, Several, Table, field_error, quantity
 
 
 @dataclass(frozen=True, eq=False)

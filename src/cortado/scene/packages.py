@@ -19,9 +19,19 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from cortado.errors import ComputationError, CortadoError, InputError, SceneError, Words, shown
-from cortado.scene.fields import MISSING, FieldPath, Flag, Text, count, field_error, quantity, without_numpy
 from cortado.scene.parameters import PARAMETERS, Parameter
-from cortado.scene.tables import Table, wanted
+from cortado.scene.tables import (
+    MISSING,
+    FieldPath,
+    Flag,
+    Table,
+    Text,
+    count,
+    field_error,
+    quantity,
+    wanted,
+    without_numpy,
+)
 
 GUARDED = "_guarded_by_cortado"
 """The attribute of classes that are guarded."""

@@ -22,7 +22,7 @@ from numpy.lib import format as npy
 
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
-from cortado.files.input_files import reason, regular_file
+from cortado.files.disk import reason, regular_file
 
 MOST_POINTS = 10_000_000
 """Of a file."""

@@ -17,10 +17,10 @@ from cortado.calls import public
 from cortado.device.memory import require, sampling_parts
 from cortado.errors import InputError, SceneError, shown, warn
 from cortado.scene.checks import check_bounded, check_scene
-from cortado.scene.containers import BoxContainer, CylinderContainer
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
 from cortado.scene.scene_warnings import check_idle, creep_sentence, idle_sentences, wall_sentence
+from cortado.scene.shape_tables import BoxContainer, CylinderContainer
 from cortado.scene.stability import broken_limit, longest_step
 from cortado.scene.tables import sentences
 from cortado.scene.toml import put_in, read_toml

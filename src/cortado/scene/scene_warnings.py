@@ -9,15 +9,15 @@ import numpy as np
 from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
 from cortado.scene.appearance import Keyframes, Picture
-from cortado.scene.containers import BoxContainer
-from cortado.scene.fields import FieldPath, field_error
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.model import Carreau, DiscretisationTable, SceneTables, Thinning, Yielding, resting_room
 from cortado.scene.motions import Steady, courses, told
+from cortado.scene.shape_tables import BoxContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import what_suits
 from cortado.scene.stability import fluid_lengths
-from cortado.scene.tables import Table, field_name, point_in_words
+from cortado.scene.tables import FieldPath, Table, field_error, field_name
+from cortado.words import point_in_words
 
 OF_DIFFUSION = ("free_energy", "strength", "mobility_form", "interface_width")
 OF_ITERATIONS = (

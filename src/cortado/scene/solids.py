@@ -16,9 +16,16 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
 from cortado.scene.appearance import FINISHES, Coloured, Finish
-from cortado.scene.common_shapes import INDEX_OF_AXIS, BoxShape, CylinderShape, MeshShape, PolygonShape, SphereShape
-from cortado.scene.containers import Container
-from cortado.scene.fields import (
+from cortado.scene.shape_tables import (
+    INDEX_OF_AXIS,
+    BoxShape,
+    Container,
+    CylinderShape,
+    MeshShape,
+    PolygonShape,
+    SphereShape,
+)
+from cortado.scene.tables import (
     MISSING,
     Colour,
     FieldPath,

@@ -7,9 +7,8 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from cortado.errors import InputError
-from cortado.scene.fields import Flag, OrWord, Text, count, field_error, quantity
 from cortado.scene.packages import Inline, PackageTable
-from cortado.scene.tables import Table
+from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, quantity
 
 OWN = ("projection", "pcisph")
 """The kinds that are Cortado's own; a scene that names none has the first."""

@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from cortado.errors import LONGEST, InputError, SceneError, Words, shown
-from cortado.files.input_files import SCHEMA, as_path, content, reason
+from cortado.files.disk import SCHEMA, as_path, content, reason
 
 MOST_BYTES = 1_000_000
 """Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""

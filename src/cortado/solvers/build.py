@@ -16,23 +16,22 @@ from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, padded
-from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.fluid_particles import reserve_offset
 from cortado.scene.motions import moving, solid_frames, wall_numbers
 from cortado.scene.parameters import PARAMETERS
 from cortado.scene.scene import Scene
+from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.containment import Walled
-from cortado.solvers.makers import SolverSetting
+from cortado.solvers.makers import ForceMaker, SolverSetting
 from cortado.solvers.obstacles import FINE, NamedSolid, Obstacle
 from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.free_solids import FreeSolids, FreeTable
-from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.parts import Force, Part, PartMaker, Setting

@@ -9,7 +9,7 @@ from cortado.particles.state import Fields, Parameters, State
 from cortado.particles.wall_terms import SolidShares
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import WithinBar
-from cortado.sph.begin_adjoint import begin_adjoint_kernel
+from cortado.sph.integration import begin_adjoint_kernel
 from cortado.sph.parts import Adjoints, Carried, Shares, StepContext, Tangents
 
 

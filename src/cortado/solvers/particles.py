@@ -19,16 +19,15 @@ from cortado.device.threads import Turn
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.shapes import Points
 from cortado.errors import MissingDerivativeError
-from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.state import Fields, Layout, Parameters, State
+from cortado.particles.state import POSITIONS, VELOCITIES, Fields, Layout, Parameters, State, StateField, check_fields
 from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
-from cortado.solvers.density import Density
 from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
 from cortado.solvers.obstacles import NamedSolid
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
+from cortado.sph.density import Density
 from cortado.sph.integration import integration_kernels
 from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext
 from cortado.sph.walls import WallAction, WallSums, wall_slope_term

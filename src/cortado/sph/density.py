@@ -4,10 +4,13 @@ n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib),   rho_i = m_i n_i.
 
 V is the rest volume on the lattice and m_i a particle's mass over V. No mass of a neighbour enters (Solenthaler and
 Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
+
+`Density` measures it in a step, with derivatives; a solver that measures more of the same neighbours at once has a
+subclass of its own.
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
@@ -17,6 +20,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.particles.wall_terms import solid_kernel
+from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 @dataclass(frozen=True)
@@ -87,3 +91,48 @@ def density_kernels(discretisation: Discretisation, topic: str = "density") -> K
         sum_kernel("density_tangent", tangent_module, "n_dot", sums.weights_tangent, times="s.volume"),
         sum_kernel("density_adjoint", adjoint_module, "+x_bar", sums.weights_adjoint, times="s.volume", r="n_bar"),
     )
+
+
+class Density:
+    """The measurement of the number density n of particles, once their neighbours are listed."""
+
+    def __init__(self, discretisation: Discretisation, topic: str, kernels: Kernels | None = None):
+        """Take given ``kernels``, or make those of the density alone, in the Warp modules of a topic."""
+        self.discretisation, self.topic = discretisation, topic
+        self.kernels = kernels or density_kernels(discretisation, topic)
+
+    def measure(self, context: StepContext) -> None:
+        context.launch(self.kernels.forward)
+
+    def new_tangent(self) -> "DensityTangent":
+        return DensityTangent(self)
+
+    def new_adjoint(self) -> "DensityAdjoint":
+        return DensityAdjoint(self)
+
+
+class DensityTangent:
+    """The tangent of the measured number density, for forward mode."""
+
+    def __init__(self, density: Density):
+        self._density = density
+
+    def measure(self, context: StepContext, dot: Tangents) -> None:
+        context.launch(self._density.kernels.tangent, *dot.named)
+
+
+class DensityAdjoint:
+    """The adjoint of the measured number density, for reverse mode."""
+
+    def __init__(self, density: Density):
+        self._density = density
+
+    def begin(self) -> None:
+        """Forget the adjoints that an earlier step back has left."""
+
+    def measure(self, context: StepContext, bar: Adjoints) -> None:
+        """Turn the adjoint of the number density n into those of positions and of solids."""
+        density = self._density
+        context.launch(density.kernels.adjoint, *bar.named)
+        kernel = partial(density_solid_kernel, density.discretisation, density.topic)
+        bar.solids.add(context.launch, kernel, *bar.named, bar=bar.fields["n"])

@@ -20,9 +20,8 @@ import warp as wp
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
-from cortado.particles.fields import POSITIONS, VELOCITIES, Entry, StateField
 from cortado.particles.particle_kernels import particle_kernel
-from cortado.particles.state import Layout, Parameters, State, to_device
+from cortado.particles.state import POSITIONS, VELOCITIES, Entry, Layout, Parameters, State, StateField, to_device
 from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents

@@ -14,10 +14,9 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
-from cortado.particles.fields import Entry, StateField
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.state import Layout, State
+from cortado.particles.state import Entry, Layout, State, StateField
 from cortado.scene.motions import (
     AXES,
     angular_velocity_name,

@@ -1,4 +1,6 @@
-"""Semi-implicit Euler, and the way of particles' entries from the scene's order to the sorted one, and back."""
+"""Semi-implicit Euler and its derivatives, and the way of particles' entries from the scene's order to the sorted one,
+and back.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -166,3 +168,30 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         acceleration_adjoint=acceleration_adjoint,
         collect_masses=collect_masses,
     )
+
+
+@cache
+def begin_adjoint_kernel(precision: Precision) -> Any:
+    """Make the kernel from the adjoint of the new state, in scene order, to that of its prediction."""
+    real, vector = precision.real, precision.vector
+    adjoin_new_state = new_state_adjoint(precision)
+
+    vectors = wp.array(dtype=vector)
+
+    @particle_kernel(integration_module(precision, False), "x_bar v_bar n_bar m_bar rho_0_bar mu_bar time_step_bar")
+    def begin_adjoint(
+        order_i: wp.int32,
+        time_step: real,
+        v_i: vector,
+        v_star_i: vector,
+        x_scene_bar: vectors,
+        v_scene_bar: vectors,
+        time_step_bar_i: real,
+    ) -> tuple[vector, vector, real, real, real, real, real]:
+        x_bar, v_bar, dt_bar = adjoin_new_state(
+            x_scene_bar[order_i], v_scene_bar[order_i], time_step_bar_i, v_i, v_star_i, time_step
+        )
+        no = real(0.0)
+        return x_bar, v_bar, no, no, no, no, dt_bar
+
+    return begin_adjoint

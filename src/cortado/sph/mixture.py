@@ -19,9 +19,8 @@ import warp as wp
 
 from cortado.device.modules import Kernels, kernel_module, kind_of
 from cortado.device.precision import Precision
-from cortado.particles.fields import Entry, StateField
 from cortado.particles.particle_kernels import particle_kernel
-from cortado.particles.state import Layout, State
+from cortado.particles.state import Entry, Layout, State, StateField
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import FREE_ENERGIES
 from cortado.sph.integration import OrderKernels, order_kernels

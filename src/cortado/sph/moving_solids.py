@@ -16,10 +16,9 @@ import warp as wp
 from cortado.device.launching import bundle
 from cortado.device.precision import Precision
 from cortado.errors import MissingDerivativeError
-from cortado.particles.fields import Entry, StateField
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
-from cortado.particles.state import Layout, Parameters, State
+from cortado.particles.state import Entry, Layout, Parameters, State, StateField
 from cortado.particles.wall_terms import share_kinds
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters import Axis

@@ -30,9 +30,8 @@ from cortado.device.modules import kernel_module, kind_of
 from cortado.device.reduction import add, type_name
 from cortado.discretise.walls import WallLayers
 from cortado.errors import MissingDerivativeError
-from cortado.particles.fields import StateField
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.state import Arrays, Fields, Layout, Parameters, State, zeros
+from cortado.particles.state import Arrays, Fields, Layout, Parameters, State, StateField, zeros
 from cortado.particles.wall_terms import SolidShares
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameter_values import argument

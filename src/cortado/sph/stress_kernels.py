@@ -16,8 +16,21 @@ turns as a whole, whatever the order of its particles, so that linear and angula
 shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). With the moments m_2 and m_4
 of s_ij along k, C = 4 / (3 m_2) takes the second term out, in every direction and for every kernel.
 
-mu_i is the harmonic mean of the viscosities between i and its neighbours (`cortado.sph.stress_functions`): it keeps the
-shear stress the same on both sides of a layer.
+From M, A and R of one particle (`stress_functions`) follow
+
+    G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
+    mu = S law(sqrt(2 D : D), mu_m).
+
+mu_m is the harmonic mean of the viscosities between i and its neighbours, which keeps the shear stress the same on both
+sides of a layer, and the law of a Newtonian fluid is mu_m.
+
+S(M) is 1 where neighbours lie on all sides or on one side, and falls smoothly to 0 where they lie on a line or are
+missing: M has no inverse there, and the particle takes no part in the stress. With the invariants of M, I_2 and I_3,
+
+    H = 3 I_3 / I_2 (in the plane 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
+
+H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S is not 0, det M is at least 0.008, so that the
+inverse needs no guard of its own.
 
 Walls without slip: `cortado.sph.stress_forces`.
 """
@@ -30,13 +43,272 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.particles.neighbourhood import Discretisation
+from cortado.device.precision import Precision
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
 from cortado.particles.wall_terms import solid_kernel
-from cortado.sph.moment_functions import matrix_type, moment_functions
-from cortado.sph.stress_forces import stress_sums, stress_work
-from cortado.sph.stress_functions import moment_sums, moments_work, stress_of_particle
+from cortado.sph.formula import theta_of
+from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions
+from cortado.sph.stress_forces import contact_functions, stress_sums, stress_work
 from cortado.sph.viscosity_law import Law
+
+LEAST_VISCOSITY = 1e-12
+"""The number added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
+SLOWEST = 1e-6
+"""Shear rate [1/s] that is added to that of the fluid, in squares: at rest a law has a derivative."""
+EMPTY, FULL = 0.2, 0.5
+"""H below which a particle takes no part in the stress, and above which it takes part in all of it."""
+
+
+@cache
+def fluidity_function(precision: Precision) -> Any:
+    """Make the Warp function 1 / mu of a viscosity mu, kept finite by `LEAST_VISCOSITY`."""
+    real = precision.real
+    least = wp.constant(real(LEAST_VISCOSITY))
+
+    @wp.func
+    def fluidity(mu: real) -> real:
+        return real(1.0) / (mu + least)
+
+    return fluidity
+
+
+@cache
+def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
+    """Make the Warp functions of S, a particle's part in the stress, and of M where S is not 0."""
+    real, matrix, moments = precision.real, matrix_type(precision), moment_functions(precision, dimension)
+    fullness, smoothstep = moments.fullness, moments.smoothstep
+    empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
+
+    @wp.func
+    def part(M: matrix) -> real:
+        """Return S, a particle's part in the viscous stress by its moments M: 0 in spray and 1 within the fluid."""
+        return smoothstep(fullness(M), empty, full)
+
+    @wp.func
+    def regular(M: matrix) -> matrix:
+        """Return M, or the unit matrix where S is 0 and nothing depends on M."""
+        result = M
+        if part(M) == real(0.0):
+            result = matrix(
+                real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0)
+            )
+        return result
+
+    return part, regular
+
+
+@cache
+def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
+    """Make the Warp function of the traction T by M, A, mu and C, in a Warp module."""
+    real, matrix, regular = precision.real, matrix_type(precision), part_functions(precision, dimension)[1]
+    inverse = moment_functions(precision, dimension).inverse
+
+    @wp.func(module=module)
+    def traction(M: matrix, A: matrix, mu: real, control: real) -> matrix:
+        K = inverse(regular(M))
+        G = A * K
+        return mu * ((G + wp.transpose(G)) * K - control * G)
+
+    return traction
+
+
+def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
+    """Make the function of T and mu of a particle, in 2 or 3 dimensions, with a law of viscosity. mu follows from A,
+    and T from ``A_u``, that of the resisted velocities; ``control`` is C."""
+    real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
+    part, regular = part_functions(precision, dimension)
+    inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
+    plane = wp.constant(real(float(dimension == 2)))
+    tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
+    theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
+
+    def stress(
+        control: real, theta: theta_type, M_i: matrix, A_i: matrix, A_u_i: matrix, R_i: real, mu_i: real
+    ) -> tuple[matrix, real]:
+        M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
+        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
+        mean = real(1.0) / (real(0.5) * fluidity(mu_i) + real(0.5) * R_i / (trace + tiny))
+        G = A_i * inverse(regular(M))
+        D = G + wp.transpose(G)
+        mu = part(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
+        return traction(M, A_u_i, mu, control), mu
+
+    return stress
+
+
+@dataclass(frozen=True)
+class MomentSums:
+    """Warp functions of the moments' sums over neighbours."""
+
+    sums: Any
+    """The diagonal of M, its entries yz, xz and xy, the rows of A, and R."""
+    tangent: Any
+    """The tangents of these sums."""
+    back: Any
+    """From the sums' adjoints, two matrices and a number for each particle, to those of its x, v and mu."""
+
+
+@cache
+def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
+    """Make the sums of M, A and R over neighbours, with walls without slip if fluid ``sticks``."""
+    precision = discretisation.precision
+    real, vector = precision.real, precision.vector
+    neighbourhood = neighbourhood_type(precision)
+    slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
+    weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
+    hold, hold_gradient = contact.hold, contact.hold_gradient
+    summed = rubbing_sum(discretisation, sticks)
+    fluidity, matrix = fluidity_function(precision), matrix_type(precision)
+    cross_terms = cross_terms_function(precision)
+
+    @wp.func
+    def even_terms(a: vector, b: vector) -> vector:
+        """Return the entries yz, xz and xy of the symmetric matrix a b^T + b a^T."""
+        return cross_terms(a, b) + cross_terms(b, a)
+
+    def wall_moments(
+        x_ij: vector, v_ij: vector, mu_i: real, least: real, foot: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, real]:
+        w, y = hold(x_ij, foot, least, s), fall(x_ij, foot)
+        z = w * y
+        rub = wp.dot(z, y) * fluidity(mu_i)
+        return wp.cw_mul(z, y), cross_terms(z, y), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
+
+    @summed(wall_moments)
+    def moments(
+        x_ij: vector, v_ij: vector, mu_i: real, mu_j: real, least: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, real]:
+        """Return a pair's terms of M in two parts, of the rows of A, and of R."""
+        z = weight(x_ij, s) * x_ij
+        rub = wp.dot(z, x_ij) * fluidity(mu_j)
+        return wp.cw_mul(z, x_ij), cross_terms(z, x_ij), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
+
+    def wall_moments_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        mu_i: real,
+        mu_dot_i: real,
+        least: real,
+        foot: vector,
+        turn_dot: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, vector, vector, real]:
+        """Return the tangent of a wall particle's terms; a turning wall turns y, and the rest moves it."""
+        w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
+        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
+        w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
+        z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
+        rub = wp.dot(even, y) * thin - wp.dot(z, y) * thin * thin * mu_dot_i
+        others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
+        return (
+            wp.cw_mul(even, y),
+            others,
+            v_ij[0] * z_dot + v_dot_ij[0] * z,
+            v_ij[1] * z_dot + v_dot_ij[1] * z,
+            v_ij[2] * z_dot + v_dot_ij[2] * z,
+            rub,
+        )
+
+    @tangent_of(moments)
+    @summed(wall_moments_tangent, ahead=False, grows=moments)
+    def moments_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        mu_i: real,
+        mu_j: real,
+        mu_dot_i: real,
+        mu_dot_j: real,
+        least: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, vector, vector, real]:
+        w, w_dot = weight(x_ij, s), -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij)
+        thin = fluidity(mu_j)
+        z, z_dot, even = w * x_ij, w_dot * x_ij + w * x_dot_ij, w_dot * x_ij + real(2.0) * w * x_dot_ij
+        rub = wp.dot(even, x_ij) * thin - wp.dot(z, x_ij) * thin * thin * mu_dot_j
+        others = w_dot * cross_terms(x_ij, x_ij) + w * even_terms(x_ij, x_dot_ij)
+        return (
+            wp.cw_mul(even, x_ij),
+            others,
+            v_ij[0] * z_dot + v_dot_ij[0] * z,
+            v_ij[1] * z_dot + v_dot_ij[1] * z,
+            v_ij[2] * z_dot + v_dot_ij[2] * z,
+            rub,
+        )
+
+    def wall_moments_back(
+        x_ij: vector,
+        v_ij: vector,
+        mu_i: real,
+        M_bar_i: matrix,
+        A_bar_i: matrix,
+        R_bar_i: real,
+        least: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real]:
+        w, y, thin = hold(x_ij, foot, least, s), fall(x_ij, foot), fluidity(mu_i)
+        turned, pulled, square = M_bar_i * y, A_bar_i * y, wp.dot(y, y)
+        level = wp.dot(y, turned) + wp.dot(v_ij, pulled) + R_bar_i * square * thin
+        by_y = real(2.0) * turned + wp.transpose(A_bar_i) * v_ij + (real(2.0) * R_bar_i * thin) * y
+        x_part = level * hold_gradient(x_ij, foot, least, s) + w * fall_change(x_ij, by_y, foot)
+        return x_part, w * pulled, -R_bar_i * w * square * thin * thin
+
+    @summed(wall_moments_back)
+    def moments_back(
+        x_ij: vector,
+        v_ij: vector,
+        mu_i: real,
+        mu_j: real,
+        M_bar_i: matrix,
+        M_bar_j: matrix,
+        A_bar_i: matrix,
+        A_bar_j: matrix,
+        R_bar_i: real,
+        R_bar_j: real,
+        least: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real]:
+        """Return a pair's part in the adjoints of x, v and mu of i, for adjoints of M, of A and of R."""
+        w, square, thin_i = weight(x_ij, s), wp.dot(x_ij, x_ij), fluidity(mu_i)
+        A_bar, rub = A_bar_i + A_bar_j, R_bar_i * fluidity(mu_j) + R_bar_j * thin_i
+        turned, pulled = (M_bar_i + M_bar_j) * x_ij, A_bar * x_ij
+        level = wp.dot(x_ij, turned) + wp.dot(v_ij, pulled) + rub * square
+        by_x = real(2.0) * turned + wp.transpose(A_bar) * v_ij + (real(2.0) * rub) * x_ij
+        x_part = (-s.volume * level) * slope_gradient(x_ij, s) + w * by_x
+        return x_part, w * pulled, -R_bar_j * w * square * thin_i * thin_i
+
+    return MomentSums(moments, moments_tangent, moments_back)
+
+
+def moments_work(d: Discretisation) -> Any:
+    """Make the work of the moments' sums on solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the
+    first of the ``constants`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    precision, contact = d.precision, contact_functions(d)
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+    fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
+
+    def moments_work(
+        x_ij: vector,
+        v_ij: vector,
+        mu_i: real,
+        M_bar_i: matrix,
+        A_bar_i: matrix,
+        R_bar_i: real,
+        constants: pair,
+        foot: vector,
+        s: neighbourhood_type(precision),
+    ) -> real:
+        y = fall(x_ij, foot)
+        bars = wp.dot(y, M_bar_i * y) + wp.dot(v_ij, A_bar_i * y) + R_bar_i * wp.dot(y, y) * fluidity(mu_i)
+        return hold(x_ij, foot, constants[0], s) * bars
+
+    return moments_work
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,8 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import adjoint_of, rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernels
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
-from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.viscous_stress import ViscousStress
+from cortado.sph.viscous_stress import ViscousStress, stress_of
 from cortado.sph.walls import WallSums
 
 

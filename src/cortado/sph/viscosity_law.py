@@ -87,7 +87,7 @@ LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, 
 
 
 SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
-"""[1/s]: no particle has a lower one (`cortado.sph.stress_functions.SLOWEST`)."""
+"""[1/s]: no particle has a lower one (`cortado.sph.stress_kernels.SLOWEST`)."""
 
 
 @cache

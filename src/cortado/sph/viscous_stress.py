@@ -1,25 +1,47 @@
-"""The viscous force as a stress: the arrays and constants of its kernels (`cortado.sph.stress_kernels`), and what walls
-without slip do to particles by it.
+"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, and at the end of a step, where its time step
+has no limit.
 
 T_i and mu_i of a particle follow from sums over all of its neighbours, so that the way back goes on from them to these.
+
+With the acceleration a by all other forces, and g(v) by the stress of fluid with velocities v, with M and mu of the
+velocities at the start, what acts at the end of a step is a' of
+
+    a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
+
+which `cortado.sph.conjugate_gradients` solves to round-off. B is symmetric and positive with respect to the product
+sum_i m_i a_i . b_i. mu is that of the velocities v at the start, the stress that of u = v + dt a' at the end. So the
+derivatives are those of the solution, whatever way led to it: the tangent is one more solve with B, and so is the
+adjoint, as B is symmetric in the product weighted with masses.
 """
 
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.device.launching import Named
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
 from cortado.device.reduction import add
 from cortado.discretise.calibration import stress_control
+from cortado.errors import MissingDerivativeError
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.particle_kernels import over, particle_kernel
+from cortado.particles.state import Layout
 from cortado.particles.wall_terms import WallTerm, WorkMaker
 from cortado.scene.parameters import Parameter
+from cortado.scene.scene import Scene
+from cortado.scene.stability import is_implicit
+from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
 from cortado.sph.formula import Packed, compiled
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import stress_couple_work, stress_work
-from cortado.sph.stress_kernels import stress_kernels, stress_solid_kernels
+from cortado.sph.stress_forces import stress_couple_work, stress_sums, stress_work
+from cortado.sph.stress_kernels import moment_sums, stress_kernels, stress_solid_kernels, traction_function
 from cortado.sph.viscosity_law import Law, newtonian_law
 from cortado.sph.walls import WallSums
 
@@ -177,3 +199,187 @@ class StressWalls:
         sizes = {"shape": self._layout.all_particles, "device": self._layout.device}
         v_bar = wp.zeros(dtype=self._layout.precision.vector, **sizes)
         return {**{f"{name}_bar": array for name, array in own.items()}, "v_bar": v_bar}
+
+
+@cache
+def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
+    """Make the kernel of the stress T for some velocities with M and mu kept, and that of the implicit operator B."""
+    precision = discretisation.precision
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
+    traction = traction_function(precision, dimension, module)
+    moments, force = moment_sums(discretisation, sticks).sums, stress_sums(discretisation, sticks).force
+    constants = ["control", "least"]
+
+    @particle_kernel(module, "A T", [over(moments, "diagonal others row_x row_y row_z thin")], numbers=constants)
+    def pull(
+        row_x: vector, row_y: vector, row_z: vector, control: real, M_i: matrix, eta_i: real
+    ) -> tuple[matrix, matrix]:
+        A = wp.matrix_from_rows(row_x, row_y, row_z)
+        return A, traction(M_i, A, eta_i, control)
+
+    @particle_kernel(module, "product share", [over(force, "total", mu="eta")], numbers=constants)
+    def multiply(total: vector, time_step: real, v_i: vector, m_i: real) -> tuple[vector, real]:
+        """Return B v of the implicit viscosity, and each particle's share in the product with v."""
+        found = v_i - time_step * total
+        return found, m_i * wp.dot(v_i, found)
+
+    return pull, multiply
+
+
+@dataclass(frozen=True)
+class ImplicitKernels:
+    """Kernels of implicit viscosity that need no neighbours."""
+
+    predict: Any
+    """u = v + dt a; with tangents of v and dt that of u, where a does not change."""
+    weigh: Any
+    """r = a_bar / m."""
+    unweigh: Any
+    """r = m y."""
+    end_adjoint: Any
+    """From the adjoint of u to those of v and dt."""
+
+
+@cache
+def implicit_kernels(precision: Precision) -> ImplicitKernels:
+    """Make the kernels of implicit viscosity that need no neighbours, in a precision."""
+    real, vector, module = precision.real, precision.vector, kernel_module(f"implicit_step_derivative_{precision.name}")
+
+    @particle_kernel(module, "u")
+    def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
+        return v_i + time_step * acceleration_i
+
+    @particle_kernel(module, "r")
+    def weigh(m_i: real, acceleration_bar_i: vector) -> vector:
+        return acceleration_bar_i / m_i
+
+    @particle_kernel(module, "r")
+    def unweigh(m_i: real, y_i: vector) -> vector:
+        return m_i * y_i
+
+    @particle_kernel(module, "+v_bar +time_step_bar")
+    def end_adjoint(acceleration_i: vector, u_bar_i: vector) -> tuple[vector, real]:
+        return u_bar_i, wp.dot(u_bar_i, acceleration_i)
+
+    return ImplicitKernels(predict, weigh, unweigh, end_adjoint)
+
+
+MOST = 1_000
+"""Greatest number of iterations of a solve."""
+
+
+class Solve(ConjugateGradients):
+    """A solve by conjugate gradients for the implicit viscosity of one solver's particles."""
+
+    name, most = "viscous_iterations", MOST
+
+    def __init__(self, layout: Layout, operator: tuple[Any, Any]):
+        """Prepare solves with an ``operator``: the kernels that `operator_kernels` gives."""
+        precision = layout.precision
+        super().__init__(layout, precision.vector, round_off(precision), MOST)
+        self._pull, self._multiply = operator
+
+    def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
+        """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
+        B's kernels."""
+
+        def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
+            step.launch(self._pull, *known, v=p)
+            step.launch(self._multiply, *known, found, v=p)
+
+        self.solve(step, multiply, step.fields["m"], r, y)
+
+
+class ImplicitViscousStress(ViscousStress):
+    """The viscous stress of the velocities at the end of a step; this force comes after all others."""
+
+    is_last = True
+
+    def __init__(self, setting: Setting, law: Law | None = None, parameters: Any = ()):
+        """Prepare the force with the arguments of `ViscousStress`."""
+        if setting.discretisation.taped:
+            raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
+        super().__init__(setting, law, parameters)
+        layout, (discretisation, *others) = setting.layout, self._made_for
+        self._implicit = implicit_kernels(layout.precision)
+        self._pull = operator_kernels(*self._made_for)[0]
+        self.solve = Solve(layout, operator_kernels(discretisation.still, *others))
+        sizes = {"shape": layout.all_particles, "device": layout.device}
+        vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
+        self._u, self._r, self._y, self._still = vectors
+        self._at_end = self.arrays("A", "T")
+        """A and T of u."""
+        self._after: Any = None
+        """a' of the last step."""
+        self._after_dot: Any = None
+        """Its tangent, after forward mode of the step."""
+
+    @property
+    def iterations(self) -> NDArray:
+        """Return the iterations (members,) of the last solve, of a run or of a derivative."""
+        return np.asarray(self.solve.count.numpy())
+
+    def _known(self, *more: Any) -> tuple[Any, ...]:
+        """Return arguments of the kernels of B, with A and T of the velocities u."""
+        return *more, self.constants, self._at_end, self._of
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        self._measure(step)
+        step.launch(self._implicit.predict, acceleration=before, u=self._u)
+        known = self._known()
+        step.launch(self._pull, *known, v=self._u)
+        step.launch(self._kernels.force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
+        self.solve(step, known, self._r, self._y)
+        wp.copy(after, before)
+        add(self._y, after)
+        self._after = after
+
+    def _find_end(self, step: StepContext) -> None:
+        """Write the velocities u = v + dt a' at the end of the step, with their A and T."""
+        step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
+        step.launch(self._pull, *self._known(), v=self._u)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        self._find_end(step)
+        u_dot, along = self._y, {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
+        step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
+        change = self._stress_along(step, dot, self._end_along(u_dot))
+        now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
+        step.launch(self._kernels.force.tangent, now, change, *self._known(*dot.named))
+        self.solve(step, self._known(), self._r, after)
+        self._after_dot = after
+
+    def _end_along(self, u_dot: wp.array) -> dict[str, wp.array]:
+        return {"v": self._u, "v_dot": u_dot, "A_u": self._at_end["A"]}
+
+    def resisted(self, step: StepContext) -> dict[str, wp.array]:
+        self._find_end(step)
+        return {"T": self._at_end["T"], "eta": self._of["eta"], "A_u": self._at_end["A"], "v": self._u}
+
+    def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
+        self._find_end(step)
+        by_time, u_dot = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}, self._y
+        step.launch(self._implicit.predict, by_time, acceleration=self._after, u=self._r)
+        step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
+        return {**self._stress_along(step, dot, self._end_along(u_dot)), "v_dot": u_dot}
+
+    def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
+        own = {"v_bar": v_star_bar, "u_bar": v_bar, "acceleration": self._after}
+        step.launch(self._implicit.end_adjoint, own, *bar.named)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
+        """Apply the adjoint of the force, and return the adjoint of the acceleration by all other forces."""
+        step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
+        self.solve(step, self._known(), self._r, self._y)
+        step.launch(self._implicit.unweigh, y=self._y, r=self._r)
+        now, u_bar = self.resisted(step), self._y
+        u_bar.zero_()
+        self._back(step, bar, self._r, now, u_bar)
+        step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
+        return self._r
+
+
+def stress_of(scene: Scene) -> type[ViscousStress]:
+    """Return the class of the viscous stress in a scene, explicit or implicit."""
+    return ImplicitViscousStress if is_implicit(scene) else ViscousStress

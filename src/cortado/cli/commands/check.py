@@ -65,7 +65,7 @@ def _make(folder: Path) -> None:
 
 
 def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
-    from cortado.files.output_files import write_atomically
+    from cortado.files.disk import write_atomically
     from cortado.pictures.run_pictures import gradient_check
 
     gradient_check(certificate, out / "certificate.png")

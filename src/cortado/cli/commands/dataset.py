@@ -19,8 +19,8 @@ from cortado.errors import (
     unwarned,
     warn,
 )
+from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.interruption import keeping
-from cortado.files.output_files import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import track, untracked
 from cortado.optimisation.datasets import (
     METADATA,
@@ -36,8 +36,8 @@ from cortado.optimisation.datasets import (
 )
 from cortado.pictures.side_by_side import differences
 from cortado.runs.run_folder import read_json
-from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, load_scene
+from cortado.scene.tables import MISSING
 from cortado.scene.tables import sentences as in_sentences
 from cortado.scene.toml import overrides_of, read_toml
 from cortado.simulation import Simulation

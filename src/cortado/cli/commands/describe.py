@@ -14,7 +14,7 @@ import warp as wp
 from cortado.device.memory import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.files.output_files import sentences
+from cortado.files.disk import sentences
 from cortado.files.terminal import timed_note
 from cortado.optimisation.inverse.task import load_task, task_in_words
 from cortado.pictures.image_files import write_picture

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import ComputationError
-from cortado.files.output_files import locked
+from cortado.files.disk import locked
 from cortado.files.terminal import announce, track
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, fit, unit_of

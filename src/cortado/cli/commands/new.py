@@ -6,8 +6,7 @@ import tomllib
 from pathlib import Path
 
 from cortado.errors import InputError, shown
-from cortado.files.input_files import SCHEMA, examples_folder
-from cortado.files.output_files import is_taken, sentences, write_atomically
+from cortado.files.disk import SCHEMA, examples_folder, is_taken, sentences, write_atomically
 from cortado.files.terminal import is_quiet
 
 DAM = "dam"

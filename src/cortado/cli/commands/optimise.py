@@ -22,8 +22,8 @@ from cortado.cli.commands.optimise_report import (
 from cortado.cli.commands.options import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
+from cortado.files.disk import locked
 from cortado.files.interruption import keeping
-from cortado.files.output_files import locked
 from cortado.files.terminal import announce, say, track
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.inverse.solved_task import (

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from cortado.cli.commands.run_report import RunSummary, write_run_report
-from cortado.device.compiling import compile_ahead
 from cortado.device.memory import frame_parts, require
+from cortado.device.modules import compile_ahead
 from cortado.errors import DivergedError, InputError, warn
+from cortado.files.disk import locked
 from cortado.files.interruption import keeping
-from cortado.files.output_files import locked
 from cortado.files.terminal import announce, track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State

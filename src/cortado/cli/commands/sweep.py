@@ -12,8 +12,8 @@ from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.options import HERE, Where
 from cortado.cli.commands.run import RunRequest, run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, unwarned, warn
+from cortado.files.disk import LOCK, locked
 from cortado.files.interruption import Interrupted, keeping
-from cortado.files.output_files import LOCK, locked
 from cortado.files.terminal import track, untracked
 from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.sweep import NAME, Combination, combinations, failed, write_table

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import InputError, SceneError
-from cortado.files.input_files import read_columns
+from cortado.files.disk import read_columns
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation, SensorSeries, Tracks, Video
 from cortado.optimisation.inverse.tables import (
@@ -25,9 +25,8 @@ from cortado.optimisation.inverse.tables import (
 from cortado.optimisation.inverse.task import GIVEN, read_tables
 from cortado.pictures.image_files import open_picture, read_frames, resized, warn_of_cropping
 from cortado.runs.probes import sensors_of
-from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import Table
+from cortado.scene.tables import MISSING, Table
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 

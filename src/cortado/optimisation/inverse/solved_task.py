@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.device.compiling import compile_meanwhile
+from cortado.device.modules import compile_meanwhile
 from cortado.files.image_encoding import write_video
 from cortado.files.terminal import announce
 from cortado.losses import Snapshot

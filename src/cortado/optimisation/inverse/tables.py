@@ -19,6 +19,7 @@ from pydantic import (
     model_validator,
 )
 
+from cortado.arrays import as_number
 from cortado.errors import Words
 from cortado.executors import Executor, InProcess
 from cortado.gradients import (
@@ -33,10 +34,9 @@ from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.datasets import DatasetTables
 from cortado.optimisation.optimise import MOST_ITERATIONS
 from cortado.optimisation.optimisers import BY_NAME, Optimiser
-from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, components, count, field_error, quantity
 from cortado.scene.parameter_values import NAMES, UNITS
 from cortado.scene.scene import Scene
-from cortado.scene.tables import Table, wanted
+from cortado.scene.tables import MISSING, OneOf, Several, Table, Text, components, count, field_error, quantity, wanted
 
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")

@@ -16,13 +16,12 @@ from cortado.pictures.image_files import heart, read_picture, rosetta
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene.containers import CylinderContainer
-from cortado.scene.fields import MISSING
 from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.parameter_values import SUM_TOLERANCE, Arrays, Known, is_too_small
 from cortado.scene.parameters import Axis, Parameter, Range, Role, offered
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import Table, sentences
+from cortado.scene.shape_tables import CylinderContainer
+from cortado.scene.tables import MISSING, Table, sentences
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.makers import known_in

@@ -16,8 +16,7 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import CortadoWarning, DivergedError, InputError
-from cortado.particles.fields import Entry
-from cortado.particles.state import State
+from cortado.particles.state import Entry, State
 from cortado.rollout.device_states import DeviceRows, DeviceState, DeviceStates
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields

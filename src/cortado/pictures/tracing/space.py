@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from cortado.device.cells import cell_kernels
-from cortado.device.compiling import compile_ahead
 from cortado.device.launching import BandLauncher
+from cortado.device.modules import compile_ahead
 from cortado.device.precision import FLOAT32
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points

@@ -12,9 +12,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.grid import Grid
-from cortado.particles.fields import Entry, StateField
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.state import Parameters, State
+from cortado.particles.state import Entry, Parameters, State, StateField
 from cortado.solvers.loop import ROOT_MEAN_SQUARE, IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies

@@ -13,12 +13,12 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
-from cortado.solvers.density import Density, DensityAdjoint, DensityTangent
 from cortado.solvers.projection.effects import effect_functions, weights_type
 from cortado.solvers.projection.images import image_share, image_sums
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.sums import APART, projection_sums
 from cortado.solvers.projection.walls import beside_solid_kernel, beside_sums, edge_functions
+from cortado.sph.density import Density, DensityAdjoint, DensityTangent
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
