@@ -24,7 +24,7 @@ GREATEST_NUMBER = 10**18
 
 
 def as_number(value: Any) -> float | None:
-    """A finite number as a float; None for anything else, a bool included."""
+    """Return a finite number as a float; None for anything else, a bool included."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         return None
     try:

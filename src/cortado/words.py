@@ -16,7 +16,7 @@ def quoted(names: Iterable[str]) -> str:
 
 
 def point_in_words(point: Iterable[float]) -> str:
-    """The coordinates of a point, in brackets."""
+    """Write the coordinates of a point, in brackets."""
     return f"({', '.join(f'{value:g}' for value in point)})"
 
 

@@ -25,7 +25,7 @@ LEAST_THICKNESS = 0.5
 """In spacings. In the plane, water 16 spacings deep on one side or on both goes through walls 0.2 spacings thick within
 0.2 s; those 0.3 thick hold it for 1 s, with either solver."""
 SHARE = 0.01
-"""Of the surface: where no more is too thin, nothing is said."""
+"""Part of the surface that may be too thin without a word."""
 ALONG = 0.9
 """Cosine between the normals of both sides of a sheet, one of them turned round, at least; of a wedge it is less."""
 TOO_LARGE = 100.0

@@ -65,9 +65,9 @@ class DatasetTable(Table):
     logarithmic: tuple[Text, ...] = ()
     """Keys of vary that are drawn evenly by their logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0, le=0.5)] = 0.0
-    """Standard deviation of what is added to every coordinate of the first positions [spacings]"""
+    """Standard deviation of noise in every coordinate of the first positions [spacings]"""
     velocity_noise: Annotated[float, quantity("m/s", ge=0.0)] = 0.0
-    """Standard deviation of what is added to every component of the first velocities [m/s]"""
+    """Standard deviation of noise in every component of the first velocities [m/s]"""
     valid: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
     """The part of the runs that is for validation."""
     test: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
@@ -77,9 +77,9 @@ class DatasetTable(Table):
     tangents: Annotated[int, count(0, 1_000)] = 0
     """Random directions of the first state along which each run is differentiated."""
     tangent_frames: Literal["last", "all"] = "last"
-    """Of which frames the derivatives are kept."""
+    """Frames whose derivatives are kept."""
     seed: Annotated[int, count(0, 2**31)] = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

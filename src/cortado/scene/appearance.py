@@ -35,10 +35,10 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Liquid:
-    """Fluid in pictures: on a way L within it light is taken away by Beer and Lambert's law."""
+    """A fluid's look in pictures: on a way L within it light is taken away by Beer and Lambert's law."""
 
     colour: Numbers
-    """Of light that it scatters, and of white light that has gone 1 / absorption through it."""
+    """Colour of scattered light, and of white light that has gone 1 / absorption through the fluid."""
     scattering: float
     """[1/m]: the part exp(-scattering L) of the light goes straight on."""
     absorption: float
@@ -47,7 +47,7 @@ class Liquid:
 
 @dataclass(frozen=True)
 class Finish:
-    """A surface of a solid, or of the walls of a container."""
+    """The look of the surface of a solid, or of the walls of a container."""
 
     colour: Numbers
     transparency: float = 0.0
@@ -63,12 +63,12 @@ LIQUIDS = {
     "honey": Liquid(colour=(0.80, 0.36, 0.03), scattering=3.0, absorption=25.0),
     "oil": Liquid(colour=(0.80, 0.62, 0.08), scattering=1.0, absorption=15.0),
 }
-"""What phases may be made of, by name."""
+"""Materials of phases, by name."""
 FINISHES = {
     "glass": Finish(colour=(0.72, 0.86, 0.82), transparency=0.92),
     "steel": Finish(colour=(0.62, 0.61, 0.59), reflectivity=0.75),
 }
-"""What solids and containers may be made of, by name."""
+"""Materials of solids and containers, by name."""
 
 
 class Coloured(Table):
@@ -87,24 +87,24 @@ class Coloured(Table):
 
     @field_serializer("colour", check_fields=False)
     def _given_colour(self, colour: Colour, info: SerializationInfo) -> Colour | None:
-        """None where it was not given, unless the context asks for all `colours`: another material has another."""
+        """Return None for a colour not given, unless the context asks for all `colours`: materials have theirs."""
         return colour if "colour" in self.model_fields_set or info.context == "colours" else None
 
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp, the sun, before a sky, and a weak strip of light on the other side; colours are linear."""
+    """The light of a picture: a lamp, the sun, before a sky, and a weak strip opposite; colours are linear."""
 
     azimuth: float
-    """Of the sun, to the right of the camera where it begins, which looks from there [degrees]."""
+    """Azimuth of the sun, to the right of the camera where it begins, which looks from there [degrees]."""
     elevation: float
-    """Of the sun, above the floor [degrees]."""
+    """Elevation of the sun above the floor [degrees]."""
     lamp: Numbers
-    """What is seen of the sun in reflections."""
+    """Colour of the sun in reflections."""
     strip: Numbers
-    """What is seen of the strip."""
+    """Colour of the strip in reflections."""
     sunlight: Numbers
-    """The light of the sun that falls on what faces it, of which white reflects 1."""
+    """The light of the sun that falls on a surface facing it, of which white reflects 1."""
     shadow: float
     """The part of the light on the floor that is the sun's."""
     background: Numbers
@@ -155,12 +155,12 @@ LIGHTS = {
         zenith=(1.15, 1.15, 1.15),
     ),
 }
-"""By their names."""
+"""The lights by their names."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera is and where it looks, in the scene's axes."""
+    """The view of a camera: its place and the point that it looks at, in the scene's axes."""
 
     eye: Points
     """(3,) [m]"""
@@ -170,7 +170,7 @@ class View:
 
 @dataclass(frozen=True)
 class Moment:
-    """When a picture of a film is taken."""
+    """The moment of a film at which a picture is taken, with the state of the run then."""
 
     share: float
     """The part of the film that is over, from 0 to 1."""
@@ -183,30 +183,30 @@ class Moment:
 
 
 class CameraPath(Table):
-    """How a camera moves."""
+    """A path on which a camera moves."""
 
     goes_around: ClassVar[bool] = False
-    """Whether it looks from all sides, and home has to be far enough off for that."""
+    """True where it looks from all sides, and home has to be far enough off for that."""
     kind: str
     """Name of the path."""
 
     def view(self, home: View, moment: Moment) -> View:
-        """Where the camera is at a moment; ``home``: where it is if it does not move."""
+        """Return the view of the camera at a moment; ``home`` is its view if it does not move."""
         raise NotImplementedError
 
     def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise the error of this table, at a path, if no solid of these names is the one that it names."""
+        """Raise the error of this table, at a path, if it names a solid that is none of these names."""
 
 
 @public
 class Orbit(CameraPath):
-    """Around what it looks at, at its height and its distance."""
+    """A camera path around the point that it looks at, at its height and its distance."""
 
     goes_around: ClassVar[bool] = True
     kind: Literal["orbit"] = "orbit"
     """Name of the path."""
     turns: Annotated[float, quantity(ge=-100.0, le=100.0)] = 1.0
-    """How often it goes around during the film: counterclockwise seen from above, clockwise if negative."""
+    """Number of turns during the film: counterclockwise seen from above, clockwise if negative."""
 
     def view(self, home: View, moment: Moment) -> View:
         from scipy.spatial.transform import Rotation
@@ -217,12 +217,12 @@ class Orbit(CameraPath):
 
 @public
 class Dolly(CameraPath):
-    """Straight towards what it looks at, or away from it, beginning and ending gently."""
+    """A camera path straight towards the point that it looks at, or away from it, beginning and ending gently."""
 
     kind: Literal["dolly"] = "dolly"
     """Name of the path."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
-    """How far off it is at the end, in its distance at the start."""
+    """Distance at the end, in its distance at the start."""
 
     def view(self, home: View, moment: Moment) -> View:
         factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
@@ -231,7 +231,7 @@ class Dolly(CameraPath):
 
 @public
 class Keyframes(CameraPath):
-    """Through places at given times of the run, on a smooth curve."""
+    """A camera path through places at given times of the run, on a smooth curve."""
 
     kind: Literal["keyframes"] = "keyframes"
     """Name of the path."""
@@ -265,7 +265,7 @@ class Keyframes(CameraPath):
 
 @public
 class Follow(CameraPath):
-    """Beside a solid, in its middle the picture's, as far off as the camera is at home."""
+    """A camera path beside a solid, whose middle is the picture's, as far off as the camera is at home."""
 
     kind: Literal["follow"] = "follow"
     """Name of the path."""
@@ -288,9 +288,9 @@ AnyCameraPath = Annotated[Orbit | Dolly | Keyframes | Follow, Field(discriminato
 
 
 COLOURS = ("phase", *NAMES, "age")
-"""What particles may be coloured by."""
+"""Values by which particles may be coloured."""
 SEARCHED_FRAMES = 121
-"""Of films of a search whose scene does not say how many."""
+"""Frames of films of a search whose scene does not say how many."""
 Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
@@ -335,13 +335,13 @@ class Picture(Table):
 
     @property
     def sun_and_sky(self) -> Light:
-        """The light by its numbers, with the background that is shown."""
+        """Return the light by its numbers, with the background that is shown."""
         light = LIGHTS[self.light]
         return light if self.background is None else replace(light, background=self.background)
 
     @property
     def searched_frames(self) -> int:
-        """The number of states that a search records for its films, at most."""
+        """Return the number of states that a search records for its films, at most."""
         return SEARCHED_FRAMES if self.film_frames is None else self.film_frames
 
     @field_validator("look_at")
@@ -352,7 +352,7 @@ class Picture(Table):
         return value
 
     def in_scene(self, dimension: int, solids: Sequence[str], path: FieldPath = ()) -> "Picture":
-        """This table, at a path, for 2 or 3 dimensions and solids of these names."""
+        """Return this table, at a path, for 2 or 3 dimensions and solids of these names."""
         for name in ("camera", "look_at", "camera_path"):
             value = getattr(self, name)
             if value is not None and dimension == 2:
@@ -367,7 +367,7 @@ Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("colum
 
 
 class Render(Table):
-    """The view, and for a view of the volume its camera."""
+    """The view of a differentiable picture, and for a view of the volume its camera."""
 
     view: Literal["top", "volume", "plane"] = "top"
     """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
@@ -405,7 +405,7 @@ class Render(Table):
         return self
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """This table, at a path, for 2 or 3 dimensions."""
+        """Return this table, at a path, for 2 or 3 dimensions."""
         if dimension == 2 and "view" not in self.model_fields_set:
             return self.model_copy(update={"view": "plane"})
         if (self.view == "plane") != (dimension == 2):

@@ -25,14 +25,15 @@ from cortado.scene.tables import MISSING, FieldPath, field_error, field_name
 from cortado.words import point_in_words
 
 DEEPEST = 0.25
-"""In spacings: how deep bodies may begin in walls and in each other."""
+"""In spacings: depth to which bodies may begin in walls and in each other."""
 FINE, MOST = 0.5, 40
 """In spacings: how far apart the points are by which a body is looked at, of which there are at most so many along an
 axis."""
 
 
 def check_free(scene: SceneTables) -> None:
-    """Only the projection moves free bodies, and they begin outside of walls and of each other."""
+    """Check that free bodies begin outside of walls and each other, and that the projection, which moves them, is
+    used."""
     bodies = free(scene.solid)
     if not bodies:
         return
@@ -60,13 +61,13 @@ def check_free(scene: SceneTables) -> None:
 
 
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
-    """The images of points (n, d) that are nearest to a middle (d,), for periods (d,), 0 along axes without one."""
+    """Return the images of points (n, d) nearest to a middle (d,), for periods (d,), 0 along axes without one."""
     periods = np.where(lengths > 0.0, lengths, np.inf)
     return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
 
 
 def _points_within(solid: Solid, step: float) -> Points:
-    """(n, d) the corners of a solid, and points of a lattice in it."""
+    """Return the corners of a solid, and points of a lattice in it, (n, d)."""
     sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
     return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
@@ -76,14 +77,14 @@ NEAREST = 0.5
 """In spacings: particles that start nearer to each other overlap."""
 OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
-"""Of the number density within a fluid: a particle that starts where another body has so much is inside of it, however
-the two lattices lie. In a corner of the other body, half a spacing away, there is at most 7/8 of it."""
+"""Part of the number density within a fluid: a particle that starts where another body has so much is inside of it,
+however the two lattices lie. In a corner of the other body, half a spacing away, there is at most 7/8 of it."""
 SUPPORT, NEIGHBOURS = 2.0, 40
 """By which the number density is computed: the support [spacings], and more particles than there are within it."""
 
 
 def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
-    """The points of a file may overlap each other; those of a lattice cannot."""
+    """Check that the points of a file do not overlap each other; those of a lattice cannot."""
     if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
         return
     points = fluid.points()
@@ -98,7 +99,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Between different bodies, and between a body and the periodic images of all; ``lengths`` (d,) of a period [m]."""
+    """Check that no body overlaps another one, or the periodic images of any; ``lengths`` (d,) of a period [m]."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -112,7 +113,7 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
 
 
 def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
-    """(d,) where a particle of one body is too near to those of the other, the second one shifted; None if nowhere."""
+    """Return a place (d,) where a particle of one body is too near to the other body, shifted; None if nowhere."""
     from scipy.spatial import cKDTree
 
     one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
@@ -132,13 +133,13 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
 
 
 def _near(points: Points, extent: Any, spacing: float) -> Points:
-    """(n, d) those points that are in a box or within the support of a particle in it."""
+    """Return the points (n, d) that are in a box or within the support of a particle in it."""
     reach = SUPPORT * spacing
     return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
 
 
 def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
-    """(n,) number density of the particles of a tree at points (n, d), over that within a fluid."""
+    """Return the number density (n,) of a tree's particles at points (n, d), over that within a fluid."""
     dimension = points.shape[1]
     distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
     return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
@@ -155,7 +156,7 @@ FURTHEST = 1e9
 
 
 def check_scene(scene: SceneTables) -> None:
-    """All checks, those that guard others first."""
+    """Run all checks of a scene, those that guard others first."""
     spacing = scene.discretisation.spacing
     if not scene.fluid and scene.emitter is None:
         found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
@@ -194,14 +195,14 @@ def check_scene(scene: SceneTables) -> None:
 
 
 def check_bounded(scene: SceneTables) -> None:
-    """Adaptive time steps need an upper bound where the fluid rests."""
+    """Check that adaptive time steps have an upper bound where the fluid rests."""
     if not np.isfinite(min(chosen_limits(scene).values())):
         wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
         raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
 
 
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
-    """All that has particles, in their order, each with its path in the scene."""
+    """Return all bodies with particles, in their order, each with its path in the scene."""
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
 
@@ -252,7 +253,7 @@ def _check_files(scene: SceneTables) -> None:
 
 
 def _check_mesh(scene: SceneTables, path: FieldPath, table: MeshShape, reach: float | None) -> None:
-    """A mesh can be read, and it fits beside the particles; ``reach`` is the support of a solid's [m]."""
+    """Check that a mesh can be read, and fits beside the particles; ``reach`` is the support of a solid's [m]."""
     try:
         read_mesh(table.file, table.scale, scene.discretisation.spacing, reach, scene.container.extent())
     except InputError as error:
@@ -260,7 +261,7 @@ def _check_mesh(scene: SceneTables, path: FieldPath, table: MeshShape, reach: fl
 
 
 def _check_counts(scene: SceneTables) -> None:
-    """Before anything is allocated."""
+    """Check the number of particles before anything is allocated."""
     spacing = scene.discretisation.spacing
     fluid = sum(body.count(spacing) for _, body in _bodies(scene))
     walls = scene.container.wall_count(spacing) + sum(solid.wall_count(spacing) for solid in scene.solid)
@@ -275,7 +276,7 @@ def _check_counts(scene: SceneTables) -> None:
 
 
 def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
-    """A box between corners, each (d,) [m], is not too far from the origin."""
+    """Check that a box between corners, each (d,) [m], is not too far from the origin."""
     furthest = np.abs(ends).max()
     if furthest > FURTHEST * spacing:
         wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
@@ -283,8 +284,8 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Containers are convex: if the corners of a box around the particles are inside, all are. A body that is too long
-    along an axis is refused before any of its particles is made."""
+    """Check that a body is inside of the container. Containers are convex: if the corners of a box around the particles
+    are inside, all are. A body that is too long along an axis is refused before any of its particles is made."""
     spacing = scene.discretisation.spacing
     if scene.container.contains(fluid.box_corners(spacing), 1e-6 * spacing).all():
         return
@@ -302,7 +303,7 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
 
 
 def _check_free(scene: SceneTables, path: FieldPath, points: Points) -> None:
-    """Points (n, d) [m] are outside of all solids."""
+    """Check that points (n, d) [m] are outside of all solids."""
     tolerance, room = TOLERANCE * scene.discretisation.spacing, room_of(scene)
     within = room.from_solids(points) < -tolerance
     if within.any():
@@ -316,7 +317,8 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
 
 
 def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
-    """The opening is inside, and fluid comes in through it; upstream of it the column may be outside.
+    """Check that the opening is inside, and that fluid comes in through it; upstream of it the column may be outside.
+    Along a periodic axis it may not: such fluid comes in again on the other side.
 
     Along a periodic axis it may not: what is outside there comes in again on the other side.
     """
@@ -342,8 +344,8 @@ def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
 
 
 def _check_schedule(scene: SceneTables) -> None:
-    """What is scheduled is there, and the opening of an emitter begins where it is and stays inside. Containers are
-    convex: if it is inside at two times it is in between."""
+    """Check that scheduled things exist, and that the opening of an emitter begins where it is and stays inside.
+    Containers are convex: if it is inside at two times it is in between."""
     courses, spacing = scene.schedule.courses, scene.discretisation.spacing
     for name in courses:
         if not BY_NAME[name].present(scene):

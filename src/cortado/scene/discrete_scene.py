@@ -41,37 +41,37 @@ if TYPE_CHECKING:
     from cortado.device.precision import Precision
 
 WHOLE = 1e-6
-"""By how much, relative, a solid may be shorter than a period that it fills."""
+"""Relative length by which a solid may be shorter than a period that it fills."""
 NEAREST_PLACE = 0.4
 """In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
 
 
 @dataclass(frozen=True)
 class Walls(Rows):
-    """Wall particles, those at rest first."""
+    """The wall particles of a scene, those at rest first."""
 
     positions: Points
     """(b, d) [m], at the start"""
     weights: Points
-    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+    """(b,) w_b [-]: weight of each in the density, a fluid particle being 1."""
     feet: Points
     """(b, d) from each to the nearest point of its surface [m]."""
     sticks: NDArray[np.bool_]
-    """(b,) whether fluid has no slip along each."""
+    """(b,) true where fluid has no slip along a wall particle."""
     slides: Points
-    """(b, d) how fast their surface slides along the solid, in its own frame [m/s]"""
+    """(b, d) velocity of their surface sliding along the solid, in its own frame [m/s]"""
     solid: NDArray[np.int64]
-    """(b,) whose they are: `wall_numbers` of solids; -1 of those of the container."""
+    """(b,) solid of each: `wall_numbers` of solids; -1 for the container."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
-        """Those of the container, with the weights that were found; whether all stick, or each of them (b,)."""
+        """Make the container's wall particles of points and weights; ``sticks`` is a flag for all, or for each (b,)."""
         grips, solid = np.full(len(points), sticks), np.full(len(points), -1)
         return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """The wall particles of a scene. Raises `InputError` for a solid that no fluid can touch."""
+    """Make the wall particles of a scene; raise `InputError` for a solid that no fluid can touch."""
     container = _container(scene, layers, lattice)
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
@@ -81,14 +81,14 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 
 def _container(scene: Scene, layers: WallLayers, lattice: RestLattice) -> ContainerWalls:
-    """The walls of the container as they are without solids, in layers of even particles."""
+    """Make the walls of the container as they are without solids, in layers of even particles."""
     points = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
     solids = scene.container.solids(scene.dimension, lattice.support)
     return ContainerWalls(points, solids, resting_room(scene), lattice.spacing, lattice.support)
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """The wall particles of the container that solids at rest leave."""
+    """Return the wall particles of the container that solids at rest leave."""
     from scipy.spatial import cKDTree
 
     points, dimension = container.points.some(container.stay), scene.dimension
@@ -105,7 +105,7 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
 
 
 def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
-    """The wall particles of a container."""
+    """Return the wall particles of a container, in even layers."""
     particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
     positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
@@ -114,8 +114,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """The wall particles of all solids at rest and of the container near them, of what fluid can touch of them
-    together."""
+    """Make the wall particles of all solids at rest and of the container near them, where fluid can touch them."""
     room, (lower, _) = container.room, scene.container.periods(scene.dimension)
     resting = [solid for solid in scene.solid if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -136,8 +135,9 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """The wall particles of one solid that moves, as if nothing else were there, but for its own images where it fills
-    a period.
+    """Make the wall particles of one solid that moves, as if nothing else were there, but for its own images where it
+    fills a period. They are found in its own frame, so that they do not depend on its first place, nor, unless it fills
+    a period, on its rotation.
 
     They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
     how it is turned.
@@ -162,8 +162,8 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
 def _weighed(
     surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
 ) -> tuple[WallPoints, Points]:
-    """Wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside`` and
-    those about solids."""
+    """Return wall particles beneath a surface, and their weights next to walls that are ``kept``, by places ``beside``
+    and those about solids."""
     room, spacing, reach = surface.room, lattice.spacing, lattice.support
     points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
@@ -174,8 +174,8 @@ def _weighed(
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where none
-    does, as with solvers that know of no images."""
+    """Return coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite where
+    none does, as with solvers that know of no images."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -205,11 +205,11 @@ class Lattice:
     laplacian_correction: float
     """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
     domain: Domain
-    """Along which axes it repeats."""
+    """The axes along which it repeats, with their periods."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, domain: Domain) -> "Lattice":
-        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
+        """Compute the constants of a kernel with a support radius [m] on a lattice with a spacing [m]."""
         return cls(
             support=support,
             normalisation=kernel.normalisation(dimension, support),
@@ -230,13 +230,13 @@ class DiscreteScene:
     kernel: SmoothingKernel
     """The smoothing kernel W."""
     lattice: Lattice
-    """Constants."""
+    """Constants of the rest lattice."""
     fluid: FluidSample
     """The first fluid particles."""
     masses: FluidMasses
-    """Theirs, and those that were asked for."""
+    """Masses of the first particles, and those that were asked for."""
     wall_layers: WallLayers
-    """How the walls lie and how they drag; also for a scene without walls."""
+    """Layers and drag of the walls; also for a scene without walls."""
     walls: Walls
     """The wall particles; none without a container and solids."""
     periods: Points
@@ -244,7 +244,7 @@ class DiscreteScene:
 
     @cached_property
     def near(self) -> Region:
-        """A box around all first particles and walls."""
+        """Return a box around all first particles and walls."""
         everything = np.concatenate([self.fluid.positions, self.walls.positions])
         return Region.between(everything.min(axis=0), everything.max(axis=0))
 
@@ -277,7 +277,7 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _velocities(scene: Scene, fluid: FluidSample) -> Points:
-    """(n, d) first velocities [m/s], where those of a body that spins follow from the places of its particles."""
+    """Return first velocities (n, d) [m/s]; those of a body that spins follow from the places of its particles."""
     found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
     for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
         found[end - size : end] = body.velocities(fluid.positions[end - size : end])
@@ -285,7 +285,7 @@ def _velocities(scene: Scene, fluid: FluidSample) -> Points:
 
 
 def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> FluidSample:
-    """The fluid with the particles of round bodies where they fill these at the rest density."""
+    """Pack the particles of round bodies until they fill these at the rest density, and return the fluid."""
     if not fluid.bodies:
         return fluid
     stays = ~fluid.is_packed
@@ -296,7 +296,7 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
-    """Far from the origin, positions are rounded to coarse steps; raises `InputError`."""
+    """Raise `InputError` where a scene is so far from the origin that positions are rounded to coarse steps."""
     spacing = scene.discretisation.spacing
     furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
     if furthest > precision.furthest:

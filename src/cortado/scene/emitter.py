@@ -44,10 +44,10 @@ class EmitterTable(FluidBody):
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length does not matter."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """Of the opening [m]. The cells of the lattice that it holds are what fluid comes through: its speed is the flow
-    rate over their area, which `describe` says."""
+    """Radius of the opening [m]. The cells of the lattice that it holds are what fluid comes through: its speed is the
+    flow rate over their area, which `describe` says."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Of the column that waits upstream of the opening [m]; six spacings if left out."""
+    """Length of the column that waits upstream of the opening [m]; six spacings if left out."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
     """Volume, in 2-D area, that comes out in a second [m3/s (m2/s in 2-D)]."""
     duration: Annotated[float, quantity("s", gt=0.0)] | None = None
@@ -61,54 +61,54 @@ class EmitterTable(FluidBody):
     @field_validator("direction")
     @classmethod
     def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
-        """A vector that is normalised but for round-off stays what it is, so that JSON brings the same emitter back."""
+        """Normalise a direction; one that is normalised but for round-off stays, as JSON must bring it back."""
         size = math.hypot(*direction)
         if size < 1.0 / GREATEST:
             raise field_error((), direction, "a vector that is not zero")
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
     def layers(self, spacing: float) -> float:
-        """The number of layers of the column, with their middle within its length, or all if they are fewer: a whole
-        number that may be larger than any array."""
+        """Return the number of layers of the column, with their middle within its length, or all if they are fewer: a
+        whole number that may be larger than any array."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.duration is None else min(within, self.supply(spacing))
 
     def supply(self, spacing: float) -> float:
-        """The number of layers, with those in reserve."""
+        """Return the number of layers, with those in reserve."""
         if self.duration is None:
             return self.layers(spacing)
         return float(max(math.ceil(self.duration * self.speed(spacing) / spacing - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """When all is out [s]."""
+        """Return the time when all fluid is out [s]."""
         return self.supply(spacing) * spacing / self.speed(spacing)
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """This table with a duration, if it has none and the column is out before a time [s]: the column is whole
-        then."""
+        """Return this table with a duration, if it has none and the column is out before a time [s]: the column is
+        whole then."""
         if self.duration is not None or self.dry_after(spacing) >= time:
             return self
         return self.model_copy(update={"duration": time + self.dry_after(spacing)})
 
     def speed(self, spacing: float) -> float:
-        """[m/s]; with it the volume of the particles that come out is that of the flow rate."""
+        """Return the speed of the flow [m/s], with which the volume of its particles is that of the flow rate."""
         return self.flow_rate / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """The area of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
+        """Return the area of the cells that a layer of particles has across the flow [m2], in 2-D their width [m]."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """The area of the opening [m2], in 2-D its width [m]."""
+        """Return the area of the opening [m2], in 2-D its width [m]."""
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
 
     def opening(self, spacing: float) -> Points:
-        """(n, d) [m] a layer of particles, moved into the opening."""
+        """Return a layer of particles, moved into the opening, (n, d) [m]."""
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
-        """The particles on a lattice of the spacing [m], those in reserve in line behind the column."""
+        """Return the particles on a lattice of the spacing [m], those in reserve in line behind the column."""
         cross_section = self._cross_section(spacing)
         layers, speed = int(self.supply(spacing)), self.speed(spacing)
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
@@ -136,10 +136,10 @@ class EmitterTable(FluidBody):
         return lower - np.maximum(first, last), upper - np.minimum(first, last)
 
     def particles(self, spacing: float) -> Points:
-        """(n, d) [m] those of the column."""
+        """Return the particles of the column, (n, d) [m]."""
         sample = self.sample(spacing)
         return sample.positions[sample.upstream < sample.column]
 
     def _cross_section(self, spacing: float) -> Points:
-        """(n, d) offsets of the particles of a layer from the axis [m]."""
+        """Return offsets (n, d) of the particles of a layer from the axis [m]."""
         return disc(self.radius, spacing, len(self.outlet) - 1) @ across(self.direction)

@@ -21,18 +21,18 @@ from cortado.scene.model import room_of
 from cortado.scene.scene import Scene
 
 FINER = 4
-"""Cells at the surface are cut into so many along each axis to measure a volume."""
+"""Number of parts of a cell at the surface along each axis, to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
 """Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
 lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
 FAR = 4.0
-"""In spacings: how deep in a body depths are told apart."""
+"""In spacings: the greatest depth in a body that is told from others."""
 DIGITS = 6
-"""Decimals of distances [spacings] by which particles are ordered: what is equal but for round-off stays in order."""
+"""Decimals of distances [spacings] by which particles are ordered: particles that differ by round-off stay in order."""
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """True where particles of a body may have another density than the lattice: where its own surface cuts cells, or
+    """Test whether particles of a body may have another density than the lattice: where its own surface cuts cells, or
     where it is no further than ``reach`` [m] from a solid."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
@@ -41,7 +41,7 @@ def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGua
 
 @dataclass(frozen=True)
 class CutBody:
-    """The part of a body of fluid that a container and solids leave room for."""
+    """A body of fluid cut by the container and the solids that leave room for a part of it."""
 
     fluid: RegionFluid
     room: Room
@@ -49,16 +49,16 @@ class CutBody:
     """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """(n,) distances [m] of points (n, d) [m] from the body, negative inside, with a reach as of
+        """Return distances (n,) [m] of points (n, d) [m] from the body, negative inside, with a reach as of
         `Room.from_solids`."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
+        """Return the part (n,) of the cell around each of the points (n, d) [m] that is within the body."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0) -> float:
-        """[m^d] of what is more than a depth [m] below the surface."""
+        """Return the volume [m^d] of the part that is more than a depth [m] below the surface."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         distances = self.distance(cells, reach) + depth
@@ -71,25 +71,25 @@ class CutBody:
 
     @cached_property
     def asked(self) -> float:
-        """[m^d] that it is to hold: the volume of the fluid's shape, times the part of it that walls leave."""
+        """Return the volume [m^d] that it is to hold: the fluid shape's, times the part of it that walls leave."""
         everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
         return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
 
     @cached_property
     def _held(self) -> float:
-        """Its volume, as cells measure it [m^d]."""
+        """Return its volume, as cells measure it [m^d]."""
         return self.volume()
 
     @cached_property
     def count(self) -> int:
-        """The number of its particles."""
+        """Return the number of its particles."""
         volume = self._held
         lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """(n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells as deep as there are
-        points, `count` of them."""
+        """Return the places (n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells the
+        deepest points, `count` of them."""
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
@@ -97,7 +97,7 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _cuts_cells(self) -> bool:
-        """True where a surface goes through cells: that of the body, or that of a solid."""
+        """Return True where a surface goes through cells: that of the body, or that of a solid."""
         if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
@@ -117,14 +117,14 @@ class Surroundings:
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
     def air(self, reach: float) -> tuple[Points, Points]:
-        """Points (m, d) [m] of lattices around the bodies up to ``reach`` [m] from their surfaces, and of the cell
-        around each the part (m,) where there is neither fluid nor wall."""
+        """Return points (m, d) [m] of lattices around the bodies up to ``reach`` [m] from their surfaces, and the part
+        (m,) of the cell around each without fluid or wall."""
         found = [self._air_around(body, reach) for body in self.bodies]
         points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """The air that is nearer to one body than to others, and no further from it than half a period."""
+        """Return the air that is nearer to one body than to others, and no further from it than half a period."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
@@ -140,7 +140,7 @@ class Surroundings:
         return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
 
     def _shares(self, points: Points, spacing: float) -> Points:
-        """(n,) the part of the cell around each of the points that is fluid."""
+        """Return the part (n,) of the cell around each of the points that is fluid."""
         found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
         reach = spacing * np.sqrt(points.shape[1])
         point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
@@ -160,25 +160,25 @@ class FluidSample:
     phase: NDArray[np.int64]
     """(n,) index into the scene's phases"""
     sizes: tuple[int, ...]
-    """How many particles each body of fluid has, without those of the emitter."""
+    """Number of particles of each body of fluid, without those of the emitter."""
     asked: tuple[float, ...]
-    """What each of these is to hold, without what walls take of it [m^d]; of points what they hold."""
+    """Volume [m^d] that each of these is to hold, less the walls' part; of points the volume that they hold."""
     bodies: tuple[CutBody, ...]
-    """Those whose particles are to be packed, in the order of the particles."""
+    """Bodies whose particles are to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
-    """(n,) whether a particle is of one of these."""
+    """(n,) true for a particle of one of these bodies."""
     is_placed: NDArray[np.bool_]
-    """(n,) whether somebody has said where a particle is: a point of a file, or one in a nozzle."""
+    """(n,) true for a particle with a given place: a point of a file, or one in a nozzle."""
     emitter: EmitterSample | None
     """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
 
     def jittered(self, most: float) -> Points:
-        """(n, d) [m] positions, with each coordinate changed by up to ``most`` [m], except those that are placed."""
+        """Return positions (n, d) [m] with coordinates changed by up to ``most`` [m], except placed ones."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """The sample of the particles with numbers (m,) in rising order, with all of the emitter among them."""
+        """Return the sample of the particles with numbers (m,) in rising order, with all of the emitter among them."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -186,14 +186,14 @@ class FluidSample:
 
     @property
     def emitted(self) -> slice:
-        """Which particles are the emitter's."""
+        """Return the slice of the emitter's particles."""
         count = len(self.positions)
         return slice(count if self.emitter is None else count - len(self.emitter.upstream), count)
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
-    gone since the scene was read, or if walls leave no room for any particle of a fluid."""
+    """Make the fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points
+    is gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = room_of(scene), scene.discretisation.support_radius
     bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
@@ -232,8 +232,8 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def reserve_offset(scene: Scene) -> Points:
-    """(d,) [m] the shift from their place in line at which particles in reserve wait: along every axis without a period
-    beyond all else, upstream of the opening."""
+    """Return the shift (d,) [m] from their place in line at which particles in reserve wait: along every axis without a
+    period beyond all else, upstream of the opening."""
     assert scene.emitter is not None
     spacing, direction = scene.discretisation.spacing, np.array(scene.emitter.direction)
     boxes = [fluid.extent(spacing) for fluid in scene.fluid] + [solid.body().extent() for solid in scene.solid]
@@ -244,7 +244,7 @@ def reserve_offset(scene: Scene) -> Points:
 
 
 def _why_none(body: CutBody | None, spacing: float) -> str:
-    """Why a body of fluid has no particles, and what to do, as the end of a sentence."""
+    """Say why a body of fluid has no particles, and what to do, as the end of a sentence."""
     if body is None:
         return (
             f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
@@ -255,7 +255,7 @@ def _why_none(body: CutBody | None, spacing: float) -> str:
 
 
 def period(scene: Scene) -> tuple[Points, Points]:
-    """Where the period of a scene begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
+    """Return begin and length of the period of a scene, each (d,) [m]; the length is 0 for axes without one."""
     return scene.container.periods(scene.dimension)
 
 
@@ -266,11 +266,11 @@ class FluidMasses:
     given: Mapping[str, float]
     """The mass of particles at the start, with those that wait in an emitter."""
     asked: Mapping[str, float]
-    """The mass of the volume of bodies of fluid, less what walls take of it, and of what an emitter holds."""
+    """The mass of the volume of bodies of fluid without the part that walls take, and of the emitter's fluid."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
-        """The masses of the first particles of a scene."""
+        """Compute the masses of the first particles of a scene."""
         names, cell = [phase.name for phase in scene.phase], scene.discretisation.spacing**scene.dimension
         densities = np.array([phase.rest_density for phase in scene.phase])
         held = cell * np.bincount(fluid.phase, minlength=len(names))
@@ -282,7 +282,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Sentence parts, by phase, for phases whose mass differs from what was asked for by more than `EXCESS`."""
+        """Return sentence parts, by phase, for phases whose mass differs from the asked one by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()
@@ -291,7 +291,7 @@ class FluidMasses:
 
     @property
     def warning(self) -> str | None:
-        """A warning before a scene runs; None where all phases hold what was asked for."""
+        """Return a warning before a scene runs; None where all phases have the asked mass."""
         if not self.off:
             return None
         return (

@@ -39,22 +39,22 @@ ALIGNED = 1e-3
 
 
 class FluidBody(Table):
-    """Particles of one phase: a body of fluid, or what an emitter holds."""
+    """Particles of one phase: a body of fluid, or the contents of an emitter."""
 
     phase: Text
     """Name of its phase."""
 
     @abstractmethod
     def count(self, spacing: float) -> float:
-        """The number of particles or somewhat more, without making any."""
+        """Return the number of particles or somewhat more, without making any."""
 
     @abstractmethod
     def extent(self, spacing: float) -> tuple[Points, Points]:
-        """A box that holds all particles: lower and upper, each (d,) [m]."""
+        """Return a box that holds all particles: lower and upper, each (d,) [m]."""
 
     @abstractmethod
     def particles(self, spacing: float) -> Points:
-        """(n, d) [m]"""
+        """Return the positions of the particles (n, d) [m]."""
 
 
 class Fluid(FluidBody):
@@ -71,7 +71,7 @@ class Fluid(FluidBody):
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
-        """(n, d) [m/s] at the start, of its particles at points (n, d) [m], whose mean is its middle."""
+        """Return first velocities (n, d) [m/s] of its particles at points (n, d) [m], whose mean is its middle."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
             return found
@@ -81,26 +81,26 @@ class Fluid(FluidBody):
         return found + np.cross(self.angular_velocity, arms)
 
     def greatest_speed(self, spacing: float) -> float:
-        """The greatest speed of its particles at the start, or somewhat more [m/s]."""
+        """Return the greatest speed of its particles at the start, or somewhat more [m/s]."""
         spin = np.linalg.norm(self.angular_velocity or 0.0)
         lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
     def box_corners(self, spacing: float) -> Points:
-        """(2^d, d) the corners of the extent [m]."""
+        """Return the corners of the extent (2^d, d) [m]."""
         return corners(*self.extent(spacing))
 
     def witnesses(self, spacing: float) -> Points:
-        """(n, d) [m] particles that lie in a convex region only if all of them do."""
+        """Return particles (n, d) [m] that lie in a convex region only if all of them do."""
         return self.particles(spacing)
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """(n, d) [m] those that a container and solids leave room for."""
+        """Return the particles (n, d) [m] for which a container and solids leave room."""
         return self.particles(spacing)
 
     @abstractmethod
     def volume(self, spacing: float) -> float:
-        """[m^d] of its shape, to round-off, whatever cuts it; of points what they hold."""
+        """Return the volume [m^d] of its shape, to round-off, whatever cuts it; of points the volume that they hold."""
 
 
 class RegionFluid(Fluid):
@@ -108,7 +108,7 @@ class RegionFluid(Fluid):
 
     @abstractmethod
     def block(self, spacing: float) -> Block:
-        """The lattice in the box around the shape."""
+        """Return the lattice in the box around the shape."""
 
     def count(self, spacing: float) -> float:
         return self.block(spacing).size
@@ -120,22 +120,22 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
+        """Return particles (n, d) [m] half a spacing or more from all walls; nearer ones would be compressed."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        """(n,) how far points (n, d) [m] are outside of what it fills, of a box its whole cells, negative inside [m].
-        What is not less than a reach [m] in size may be any other number of its sign that is not."""
+        """Return how far (n,) points (n, d) [m] are outside of the filled region, of a box its whole cells, negative
+        inside [m]. A distance of a reach [m] or more may be any number of its sign of that size."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Whether its surface goes through cells of the lattice."""
+        """Return True where its surface goes through cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it. There is
-        one for each cell of the spacing's volume, with whole layers between faces that are flat."""
+        """Return points (n, d) [m] of a lattice in the box around the shape and as far as ``reach`` [m] beyond it.
+        There is one for each cell of the spacing's volume, with whole layers between faces that are flat."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
@@ -179,7 +179,7 @@ class BoxFluid(BoxShape, Turnable):
 
 
 class RoundFluid(RegionFluid):
-    """A body whose surface cuts through cells of the lattice: its particles are packed before a run begins
+    """A body of fluid whose surface cuts through cells of the lattice: its particles are packed before a run begins
     (`cortado.discretise.packing`), and ``particles`` are whole cells, which tell roughly where they are."""
 
     def particles(self, spacing: float) -> Points:
@@ -191,7 +191,7 @@ class RoundFluid(RegionFluid):
 
 
 class SphereFluid(SphereShape, RoundFluid):
-    """A sphere, or a disc in 2-D."""
+    """A sphere of fluid, or a disc in 2-D."""
 
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
@@ -204,7 +204,7 @@ class SphereFluid(SphereShape, RoundFluid):
 
 
 class CylinderFluid(CylinderShape, Turnable, RoundFluid):
-    """A cylinder, in 3-D."""
+    """A cylinder of fluid, in 3-D."""
 
     instead: ClassVar = '"box", "sphere" or "points"'
 
@@ -224,7 +224,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Stretched along the axis, so that whole layers fill the height, and narrowed across it by as much."""
+        """Return a lattice stretched along the axis to fill the height with whole layers, and narrowed across it."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -236,7 +236,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
 
 
 class PointsFluid(Fluid):
-    """Particles at the positions that a file holds."""
+    """Fluid particles at the positions that a file holds."""
 
     shape: Literal["points"] = "points"
     file: File
@@ -244,7 +244,7 @@ class PointsFluid(Fluid):
     the scene file, and absolute once read."""
 
     def points(self) -> Points:
-        """(n, d) [m]; raises `InputError`."""
+        """Read the positions (n, d) [m] from the file; raise `InputError`."""
         return read_points(self.file, len(self.velocity))
 
     def count(self, spacing: float) -> float:
@@ -266,10 +266,10 @@ class Filled(Turnable):
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
+        """Return the shape about its middle, not turned, and the middle by its measures, (d,) [m]."""
 
     def body(self) -> Placed:
-        """The shape in its place."""
+        """Return the shape in its place."""
         shape, middle = self.shape_about()
         return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
 
@@ -297,7 +297,7 @@ class Filled(Turnable):
 
 
 class FilledShape(Filled):
-    """One with a place of its own."""
+    """A body of fluid that fills a shape, with a place of its own."""
 
     position: tuple[Length, ...] | None = None
     """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
@@ -324,7 +324,7 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """This body of fluid; with a rotation where it can do without, as one that is packed."""
+    """Return a body of fluid as it is, or as a packed one where it has a rotation but a kind that can do without."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:
@@ -333,11 +333,11 @@ def turned(fluid: Fluid) -> Fluid:
 
 
 class PolygonFluid(PolygonShape, FilledShape):
-    """What a polygon holds, in 2-D."""
+    """A body of fluid inside a polygon, in 2-D."""
 
 
 class MeshFluid(MeshShape, FilledShape):
-    """What a mesh of triangles holds, in 3-D."""
+    """A body of fluid inside a mesh of triangles, in 3-D."""
 
 
 AnyFluid = Annotated[

@@ -48,16 +48,16 @@ class RheologyTable(Table):
     """Name of the law."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """The parameters of the law, for the viscosity of the phase [Pa s]."""
+        """Return the parameters of the law, for the viscosity of the phase [Pa s]."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """The greatest viscosity of the fluid [Pa s], for that of the phase."""
+        """Return the greatest viscosity of the fluid [Pa s], for that of the phase."""
         return viscosity
 
 
 class Thinning(RheologyTable):
-    """What laws with a power of the shear rate have in common."""
+    """The base of laws of viscosity with a power of the shear rate."""
 
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
     """n [-]: below 1 the fluid gets thinner where it is sheared, above 1 thicker."""
@@ -69,16 +69,16 @@ class Thinning(RheologyTable):
 
 
 class PowerLaw(Thinning):
-    """eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the consistency, which is
-    that at a shear rate of 1/s."""
+    """The power law eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the
+    consistency, which is that at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
     """Name of the law."""
 
 
 class Carreau(RheologyTable):
-    """eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time shear rate)^2)^((flow_index -
-    1) / 2), of Carreau (1972): viscosity is that at rest."""
+    """The law eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time shear
+    rate)^2)^((flow_index - 1) / 2), of Carreau (1972): viscosity is that at rest."""
 
     kind: Literal["carreau"] = "carreau"
     """Name of the law."""
@@ -94,7 +94,7 @@ class Carreau(RheologyTable):
 
 
 class Yielding(RheologyTable):
-    """What laws with a yield stress have in common."""
+    """The base of laws of viscosity with a yield stress."""
 
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Below it the fluid hardly flows [Pa]."""
@@ -113,15 +113,15 @@ class Yielding(RheologyTable):
 
 
 class Bingham(Yielding):
-    """eta = viscosity + yield_stress (1 - exp(-m shear rate)) / shear rate, of Bingham, as Papanastasiou (1987) makes
-    it smooth: viscosity is that of the fluid once it flows."""
+    """The law eta = viscosity + yield_stress (1 - exp(-m shear rate)) / shear rate, of Bingham, as Papanastasiou (1987)
+    makes it smooth: viscosity is that of the fluid once it flows."""
 
     kind: Literal["bingham"] = "bingham"
     """Name of the law."""
 
 
 class HerschelBulkley(Yielding, Thinning):
-    """The sum of a power law and of a yield stress, as of Bingham's: viscosity is the consistency."""
+    """The law of Herschel and Bulkley, a power law with Bingham's yield stress: viscosity is the consistency."""
 
     kind: Literal["herschel_bulkley"] = "herschel_bulkley"
     """Name of the law."""
@@ -132,8 +132,8 @@ AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(di
 
 
 def greatest_viscosity(phase: Any, viscosity: float) -> float:
-    """The greatest viscosity of a phase [Pa s], for what its key viscosity, or a parameter in its place, says [Pa
-    s]."""
+    """Return the greatest viscosity of a phase [Pa s], for the value of its key viscosity, or of a parameter in its
+    place [Pa s]."""
     return viscosity if phase.rheology is None else float(phase.rheology.thickest(viscosity))
 
 
@@ -153,7 +153,7 @@ class MixtureTable(Table):
     wide."""
 
     def width(self, spacing: float) -> float:
-        """The interface width [m] of a scene of a spacing [m]."""
+        """Return the interface width [m] of a scene of a spacing [m]."""
         return spacing if self.interface_width is None else self.interface_width
 
 
@@ -162,15 +162,15 @@ Corner = tuple[Length, ...] | None
 
 
 class SensorTable(Table):
-    """Something that reads numbers of the fluid in every step."""
+    """A sensor that reads numbers of the fluid in every step."""
 
     name: Text
-    """What its columns in sensors.csv begin with."""
+    """Beginning of the names of its columns in sensors.csv."""
 
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        """A spreadsheet runs a cell that begins with one of these signs, wide ones too, as a formula."""
+        """Refuse a name that begins with a sign, wide ones too, by which a spreadsheet would run a formula."""
         plain = unicodedata.normalize("NFKC", name).strip()
         if plain[:1] in tuple("=+-@") or not name.isprintable():
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
@@ -183,7 +183,7 @@ class SensorTable(Table):
 
 
 class PressureProbeTable(SensorTable):
-    """The mean pressure of the particles around a point."""
+    """A sensor of the mean pressure of the particles around a point."""
 
     kind: Literal["pressure_probe"]
     """Which sensor it is."""
@@ -194,8 +194,8 @@ class PressureProbeTable(SensorTable):
 
 
 class WaveGaugeTable(SensorTable):
-    """How high the surface of the fluid is at a place: the level to which its volume in a column fills the room that
-    solids leave there."""
+    """A sensor of the height of the fluid's surface at a place: the level to which its volume in a column fills the
+    room that solids leave there."""
 
     kind: Literal["wave_gauge"]
     """Which sensor it is."""
@@ -208,7 +208,7 @@ class WaveGaugeTable(SensorTable):
 
 
 class FlowRateTable(SensorTable):
-    """Volume of fluid that goes through a plane in a second."""
+    """A sensor of the volume of fluid that goes through a plane in a second."""
 
     kind: Literal["flow_rate"]
     """Which sensor it is."""
@@ -229,7 +229,7 @@ class FlowRateTable(SensorTable):
 
 
 class WallForceTable(SensorTable):
-    """The force, and its torque, with which the fluid in a region pushes the walls."""
+    """A sensor of the force, and its torque, with which the fluid in a region pushes the walls."""
 
     kind: Literal["wall_force"]
     """Which sensor it is."""
@@ -248,7 +248,7 @@ class WallForceTable(SensorTable):
 
 
 class SolidLoadTable(SensorTable):
-    """The force of the fluid on a solid, and its torque about the solid's position."""
+    """A sensor of the force of the fluid on a solid, and its torque about the solid's position."""
 
     kind: Literal["solid_load"]
     """Which sensor it is."""
@@ -266,7 +266,7 @@ OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
 
 
 class DiscretisationTable(Table):
-    """How the fluid is cut into particles."""
+    """The spacing, the kernel and the lattice by which the fluid is cut into particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
@@ -284,18 +284,18 @@ class DiscretisationTable(Table):
 
     @property
     def support_radius(self) -> float:
-        """The distance at which the smoothing kernel ends [m]."""
+        """Return the distance at which the smoothing kernel ends [m]."""
         return self.support * self.spacing
 
 
 class Phase(Coloured):
-    """A fluid."""
+    """A phase of the fluid: a material with its density, viscosity and look."""
 
     materials: ClassVar = LIQUIDS
     plain: ClassVar = (0.1, 0.3, 0.8)
 
     name: Text
-    """What bodies of fluid call it."""
+    """Name by which bodies of fluid refer to it."""
     rest_density: Annotated[float, quantity("kg/m3", gt=0.0)]
     """Density of the fluid at rest [kg/m3]."""
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
@@ -376,13 +376,13 @@ class SceneTables(Table):
 
     @property
     def sticks(self) -> bool:
-        """Whether fluid has no slip along some walls."""
+        """Return True where fluid has no slip along some walls."""
         return self.container.sticks or any(solid.sticks for solid in self.solid)
 
     @model_validator(mode="before")
     @classmethod
     def _choose_for_solver(cls, data: Any) -> Any:
-        """The kernel with its support, and the jitters, that suit the solver, where they are not given."""
+        """Fill in the kernel with its support, and the jitters, that suit the solver, where they are not given."""
         if not isinstance(data, Mapping):
             return data
         data = dict(data)
@@ -431,12 +431,12 @@ class SceneTables(Table):
 
 
 def room_of(scene: SceneTables) -> Room:
-    """Where fluid of a scene may be at the start: in its container, outside of its solids; nothing closes a period."""
+    """Return the room of a scene's fluid at the start: in its container, outside of solids; nothing closes a period."""
     lengths = scene.container.periods(scene.dimension)[1]
     region = scene.container.region(scene.dimension).opened(lengths)
     return Room(region, solids_of(scene.solid), lengths)
 
 
 def resting_room(scene: SceneTables) -> Room:
-    """The `room_of` a scene with its solids at rest alone."""
+    """Return the `room_of` a scene with its solids at rest alone."""
     return replace(room_of(scene), solids=solids_of(tuple(solid for solid in scene.solid if not solid.moves)))

@@ -24,21 +24,21 @@ class Steady:
     """() or (components,), a second"""
 
     def at(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) at times (n,) [s]."""
+        """Return values (n,) or (n, components) at times (n,) [s]."""
         return np.multiply.outer(times, self.rate)
 
     def greatest(self) -> float:
-        """Size of the rate."""
+        """Return the size of the rate."""
         return float(np.linalg.norm(self.rate))
 
     def rates(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) the derivatives with respect to time."""
+        """Return the derivatives with respect to time, (n,) or (n, components), at times (n,) [s]."""
         return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Straight lines between values at some times, constant before the first and after the last."""
+    """A quantity on straight lines between values at some times, constant before the first and after the last."""
 
     times: NDArray[np.float64]
     """(k,) [s]"""
@@ -46,22 +46,22 @@ class Knots:
     """(k,) or (k, components)"""
 
     def at(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) at times (n,) [s]."""
+        """Return values (n,) or (n, components) at times (n,) [s], between the knots by linear interpolation."""
         columns = self.values.reshape(len(self.times), -1).T
         found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
         return found.reshape(len(times), *self.values.shape[1:])
 
     def greatest(self) -> float:
-        """Size of the greatest rate."""
+        """Return the size of the greatest rate."""
         return float(np.linalg.norm(self._slopes.reshape(len(self.times), -1), axis=1).max())
 
     def rates(self, times: NDArray) -> NDArray:
-        """(n,) or (n, components) the derivatives with respect to time, at a knot that of what comes after."""
+        """Return the derivatives with respect to time, (n,) or (n, components), at a knot those after it."""
         return self._slopes[np.searchsorted(self.times, times, side="right") - 1]
 
     @property
     def _slopes(self) -> NDArray[np.float64]:
-        """(k,) or (k, components) after each of the times; the last, 0, also before the first."""
+        """Return the slopes (k,) or (k, components) after each of the times; the last, 0, also before the first."""
         lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
         return np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
 
@@ -89,16 +89,16 @@ class Course(Table):
         return Knots(np.array(self.times), np.array(self.values, dtype=np.float64))
 
     def at(self, times: NDArray) -> NDArray:
-        """(n, components) at times (n,) [s]."""
+        """Return the parameter's values (n, components) at times (n,) [s]."""
         return self._knots.at(times)
 
     def rates(self, times: NDArray) -> NDArray:
-        """(n, components) the derivatives with respect to time at times (n,) [s], as those of `Knots`."""
+        """Return the parameter's time derivatives (n, components) at times (n,) [s], as those of `Knots`."""
         return self._knots.rates(times)
 
 
 def _course_table(parameter: Parameter) -> type[Course]:
-    """The table of one parameter, whose values have its unit."""
+    """Make the table of one parameter over time, whose values have its unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
     values: Any = (Several[row], Field(description="(k, components) one row for each of the times"))
@@ -113,21 +113,21 @@ _COURSES: dict[str, Any] = {
 
 
 class _Schedule(Table):
-    """What changes while the scene runs; of what is left out, nothing does."""
+    """The changes of parameters while the scene runs; a parameter that is left out does not change."""
 
     @property
     def courses(self) -> dict[str, Course]:
-        """The courses that are given, by the names of their parameters."""
+        """Return the courses that are given, by the names of their parameters."""
         found = {name: getattr(self, name) for name in _COURSES}
         return {name: course for name, course in found.items() if course is not None}
 
     @property
     def leads_gravity(self) -> bool:
-        """Whether gravity changes, as such or by a tilt."""
+        """Return True where gravity changes, as such or by a tilt."""
         return not self.courses.keys().isdisjoint(("gravity", "tilt"))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """This table, with rows of as many components as their parameters have in 2 or 3 dimensions."""
+        """Return this table, with rows of as many components as their parameters have in 2 or 3 dimensions."""
         for name, course in self.courses.items():
             components = next(p.components for p in _OVER_TIME if p.name == name)
             size = 1 if components is None else components(dimension, 1)
@@ -142,45 +142,45 @@ Schedule: Any = create_model("Schedule", __base__=_Schedule, __module__=__name__
 """A course for each parameter over time that changes, made from the registry of parameters."""
 
 AXES = ("turn_x", "turn_y", "turn_z")
-"""How fields of states end that keep how a free body is turned: how far the ends of its unit axes have moved [-]."""
+"""Endings of state fields' names for a free body's rotation: how far the ends of its unit axes have moved [-]."""
 RADIAN = 1.0
-"""What an optimiser would take for a large turn [rad]."""
+"""A large turn for an optimiser [rad]."""
 STRETCH = 0.2
-"""What it would take for a large change of a scale, in parts of it."""
+"""A large change of a scale for an optimiser, in parts of it."""
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """The solids that move, in their order."""
+    """Return the solids that move, in their order."""
     return [solid for solid in solids if solid.moves]
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Numbers of solids that their wall particles have, by name: those that move from 0 on, and those at rest from -2
-    on downwards, as -1 is the container."""
+    """Return the numbers by which wall particles name solids, by name: those that move from 0 on, and those at rest
+    from -2 on downwards, as -1 is the container."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
 
 
 def told(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """The solids whose motion is prescribed."""
+    """Return the solids whose motion is prescribed."""
     return [solid for solid in moving(solids) if solid.motion != "free"]
 
 
 def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
-    """The solids that fluid moves."""
+    """Return the solids that fluid moves."""
     return [solid for solid in solids if solid.motion == "free"]
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The middles (k, d) [m] and the rotation matrices (k, d, d), at the start, of the solids of a scene that move."""
+    """Return the first middles (k, d) [m] and rotation matrices (k, d, d) of a scene's solids that move."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """The greatest speed of any point of a solid [m/s], with values of parameters that replace the scene's."""
+    """Return the greatest speed of any point of a solid [m/s], with values of parameters that replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -193,14 +193,14 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """The distance from a solid's middle to its furthest point, at most [m], with values of parameters that replace the
-    scene's."""
+    """Return the distance from a solid's middle to its furthest point, at most [m], with values of parameters that
+    replace the scene's."""
     shape, _ = solid.shape_about()
     return float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)) * values.get(scale_name(solid.name), 1.0))
 
 
 def _name(end: str) -> Callable[[str], str]:
-    """The function that gives the name of a parameter of a solid, or of a field of a state, by the solid's name."""
+    """Make the function that returns the name of a solid's parameter, or of a field of a state, by the solid's name."""
     return lambda solid: f"{solid}.{end}"
 
 
@@ -223,15 +223,14 @@ density_name = _name("density")
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
-    """The names of the solids that fields of a state tell of."""
+    """Return the names of the solids that a state has fields of."""
     end = position_name("")
     return [field.removesuffix(end) for field in fields if field.endswith(end)]
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Parameters of solids that move: where those that are told begin, and where they are at the end of each step, as
-    from there, or, if their motion is steady, how fast they go, and how large they are; how free bodies begin, and
-    their density."""
+    """Return the parameters of solids that move. Prescribed ones have a first place and size, and places at the end of
+    each step from there, or, if their motion is steady, a speed. Free bodies have a first motion and a density."""
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
     names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
@@ -245,7 +244,7 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
 
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
-    """All parameters that a solid that moves may have."""
+    """Return all parameters that a solid that moves may have."""
     name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
     unturned = np.zeros(_shape_of(2 * len(middle) - 3))
     when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
@@ -288,8 +287,7 @@ def _shape_of(components: int) -> tuple[int, ...]:
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """The displacement [m] and the turn [rad] of a solid whose motion is prescribed, over time, from where it
-    begins."""
+    """Return displacement [m] and turn [rad] of a solid whose motion is prescribed, over time, from where it begins."""
     d = len(solid.middle())
     return _course(solid, "positions", "velocity", d), _course(solid, "rotations", "angular_velocity", 2 * d - 3)
 
@@ -306,16 +304,16 @@ def _course(solid: SolidTable, values: str, rate: str, components: int) -> Stead
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Place and rotation of a solid that moves, in a state: R = Q R(w), in space also for one in the plane."""
+    """The place and rotation of a solid that moves, in a state: R = Q R(w), in space also for one in the plane."""
 
     name: str
-    """Of the solid."""
+    """Name of the solid."""
     is_free: bool
-    """Whether it is a body that fluid moves: states keep Q of these by its columns, and of others by its vector."""
+    """True for a body that fluid moves: states keep Q of these by its columns, and of others by its vector."""
     position: NDArray[Any]
     """(d,) [m]"""
     scale: float
-    """How many times as large as in the scene it is."""
+    """Scale of the solid, relative to the scene's."""
     begun: NDArray[Any]
     """w, (3,), by which it was turned at first [rad]"""
     turn: NDArray[Any]
@@ -325,7 +323,7 @@ class Pose:
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """The pose of a solid in a state, ``at``, whose fields have an axis of one entry."""
+        """Read the pose of a solid in a state, ``at``, whose fields have an axis of one entry."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -336,11 +334,11 @@ class Pose:
 
     @property
     def rotation(self) -> NDArray[Any]:
-        """R, (3, 3)"""
+        """Return the rotation matrix R (3, 3)."""
         return np.asarray(self.turned @ matrix(self.begun))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """From ``t`` (3,), the derivative with respect to a further turn of R, to those of fields, by their names."""
+        """Turn ``t`` (3,), the derivative with respect to a further turn of R, into those of fields, by their names."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:
@@ -350,14 +348,14 @@ class Pose:
 
 
 def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """(3, 3) of a rotation vector (3,), or of an angle (1,) in the plane [rad]."""
+    """Return the matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in the plane [rad]."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(_in_space(rotation)).as_matrix())
 
 
 def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
-    """(3,) of a vector, or the rotation vector of an angle."""
+    """Return a vector as (3,), or the rotation vector of an angle."""
     found = np.zeros(3)
     if np.ndim(vector) == 0 or len(vector) == 1:
         found[2] = np.reshape(vector, ())
@@ -367,12 +365,12 @@ def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
-    """(1, 1) or (1, 3) a rotation vector w (3,) as a field of a state."""
+    """Return a rotation vector w (3,) as a field of a state, (1, 1) or (1, 3)."""
     return np.asarray(w[2:] if dimension == 2 else w[None])
 
 
 def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
-    """J of `cortado.sph.rotations`."""
+    """Return the matrix J of `cortado.sph.rotations` for a rotation vector."""
     size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
     if size < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)

@@ -34,14 +34,14 @@ from cortado.scene.tables import (
 )
 
 GUARDED = "_guarded_by_cortado"
-"""The attribute of classes that are guarded."""
+"""The attribute that marks guarded classes."""
 ABSENT = object()
 OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
 """Modules whose objects are no part of a package."""
 
 
 def _in_words(problem: BaseException, package: str) -> str:
-    """The error that a package raised, and where, in words without the full stop."""
+    """Describe the error that a package raised, and its place, in words without the full stop."""
     try:
         text = " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".: ")
     except Exception:  # words of its own that cannot be made
@@ -55,8 +55,8 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Has whatever a package raises within end as an ``error`` that begins with ``what``, but for Cortado's own errors,
-    for an interruption and for what is ``expected``. One that asks for the end of the process does not get it."""
+    """Turn an error that a package raises within into an ``error`` that begins with ``what``, but for Cortado's own,
+    for interruptions and for ``expected`` ones. A package that asks for the end of the process does not get it."""
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
         yield
@@ -67,10 +67,10 @@ def guarded(
 
 
 class PackageMaker:
-    """The part that a package makes of a table, as `Simulation` takes it; what it makes in turn is guarded too."""
+    """A part that a package makes of a table, as `Simulation` takes it; objects that it makes are guarded too."""
 
     def __init__(self, part: Any, kind: str, package: str):
-        """``kind``: the name that the package gives it; ``package``: what sentences call that."""
+        """Guard a part: ``kind`` is the name that the package gives it, ``package`` the package's name in messages."""
         self._part, self._kind, self._package = part, kind, package
 
     def __getattr__(self, name: str) -> Any:
@@ -84,7 +84,7 @@ class PackageMaker:
 
     @cached_property
     def parameters(self) -> Any:
-        """The parameters of the part, whose functions are guarded."""
+        """Return the parameters of the part, whose functions are guarded."""
         found = self.__getattr__("parameters")
         return [self._judged(one) for one in found] if isinstance(found, (list, tuple)) else found
 
@@ -109,8 +109,8 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """An object that a part of a package made, such as a solver: the methods and properties of its class are guarded
-    from then on, and what they return."""
+    """Guard an object that a part of a package made, such as a solver: the methods and properties of its class, and
+    their results."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
@@ -120,7 +120,7 @@ def _at_work(made: Any, kind: str, package: str) -> Any:
 
 @cache
 def _guarded_class(cls: type, kind: str, package: str) -> type:
-    """One of the same name, without the methods that are Cortado's."""
+    """Make a class of equal name whose methods are guarded, without those that are Cortado's."""
     if GUARDED in cls.__dict__:
         return cls
     own: dict[str, Any] = {"__slots__": (), "__module__": cls.__module__, GUARDED: True}
@@ -152,12 +152,12 @@ def _is_ours(function: Any) -> bool:
 
 MOST = 1_000_000_000
 TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
-"""Of keys whose argument is annotated with a plain type, what is checked."""
+"""Checks of keys whose argument is annotated with a plain type."""
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """The entry point of a group, such as "cortado.forces", with a name that is none of Cortado's ``own``; raises a
-    `SceneError` about ``kind``."""
+    """Return the entry point of a group, such as "cortado.forces", with a name that is none of Cortado's ``own``; raise
+    a `SceneError` about ``kind``."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
@@ -179,12 +179,12 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
 
 
 def _package_of(entry: EntryPoint) -> str:
-    """The name of a package in sentences."""
+    """Return the name of a package in messages."""
     return f"the package {entry.dist.name}" if entry.dist is not None else f"the package of {entry.value}"
 
 
 def loaded(entry: EntryPoint) -> Callable[..., Any]:
-    """The class or function that an entry point names; raises a `SceneError` about ``kind``."""
+    """Import the class or function that an entry point names; raise a `SceneError` about ``kind``."""
     where = f"is {shown(entry.name)}, for which {_package_of(entry)} registers {entry.value}"
     with _told("kind", entry, f"{where}, but that cannot be imported:"):
         found = entry.load()
@@ -196,7 +196,7 @@ def loaded(entry: EntryPoint) -> Callable[..., Any]:
 
 @contextmanager
 def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
-    """Has whatever a package raises end as a `SceneError` about a field, other errors of Cortado's own included."""
+    """Turn an error that a package raises into a `SceneError` about a field, other errors of Cortado's own included."""
     try:
         with guarded(what, _package_of(entry)):
             yield
@@ -209,8 +209,8 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """The keys of a table as the arguments of a factory, each checked by its annotation; raises a `SceneError` about
-    the first that does not fit."""
+    """Return the keys of a table as the arguments of a factory, each checked by its annotation; raise a `SceneError`
+    about the first that does not fit."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -230,7 +230,8 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
-    """The arguments of a function that have names, and ``**others`` if it takes them; None where Python cannot tell."""
+    """Return a function's arguments that have names, and ``**others`` if it takes them; None where Python cannot
+    tell."""
     for evaluated in (True, False):
         try:
             found = signature(factory, eval_str=evaluated).parameters
@@ -244,8 +245,8 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """The check of a value, and what the value must be, in words; of other annotations than plain types and fields of
-    scenes whoever is given the value judges it."""
+    """Return the check of a value, and in words a right value; values with other annotations than plain types and
+    fields of scenes are judged by whoever is given them."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -267,7 +268,7 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """The part that a factory makes of the keys of a table, which must have a method of that name; raises a
+    """Make a part by a factory from the keys of a table, and check that it has a method of that name; raise a
     `SceneError`."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
@@ -280,17 +281,17 @@ def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any]
 
 
 class PackageTable(Table):
-    """A table whose kind an installed package registers. Its other keys are the arguments of what is registered."""
+    """A table whose kind an installed package registers. Its other keys are the arguments of the registered factory."""
 
     model_config = ConfigDict(extra="allow")
     group: ClassVar[str]
-    """Of entry points."""
+    """Group of entry points."""
     method: ClassVar[str]
-    """That what is made has."""
+    """Name of a method that the made part must have."""
     own: ClassVar[Collection[str]] = ()
     """Names that no package can have."""
     advice: ClassVar[str] = ""
-    """What else may stand in the place of ``kind``, in words."""
+    """Other things that may stand in place of ``kind``, in words."""
     kind: Text
     """The name that the package gives it."""
 
@@ -311,7 +312,7 @@ class PackageTable(Table):
 
     @classmethod
     def _judged(cls, kind: str, keys: Mapping[str, Any]) -> dict[str, Any]:
-        """The keys as the part takes them; raises a `SceneError` about one of them."""
+        """Return the keys as the part takes them; raise a `SceneError` about one of them."""
         entry = registered(cls.group, kind, cls.own, cls.advice)
         factory = loaded(entry)
         checked = checked_keys(factory, keys, tuple(cls.model_fields))
@@ -319,7 +320,7 @@ class PackageTable(Table):
         return checked
 
     def make(self) -> Any:
-        """The part, as the package makes it of the keys; raises a `SceneError`."""
+        """Make the part, as the package does from the keys; raise a `SceneError`."""
         entry = registered(self.group, self.kind, self.own, self.advice)
         return made(entry, loaded(entry), self.model_extra or {}, self.method)
 
@@ -328,7 +329,7 @@ class PackageTable(Table):
 
 
 class Inline:
-    """Has the JSON schema of a table stand where it is used, and not among the tables whose keys are all known."""
+    """A mark that puts the JSON schema of a table where it is used, and not among tables whose keys are known."""
 
     def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}

@@ -17,14 +17,15 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """m (n,) [kg / m3] for mass fractions (n, phases) and rest densities (phases,) [kg / m3]."""
+    """Return mixtures' rest densities m (n,) [kg / m3], for fractions (n, phases) and rest densities (phases,) [kg /
+    m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
 
 def reference_density_tangent(
     fractions: np.ndarray, rest_density: np.ndarray, fractions_dot: np.ndarray, rest_density_dot: np.ndarray
 ) -> np.ndarray:
-    """The derivative of m (n,) along a direction."""
+    """Return the derivative of the mixture's rest density m (n,) along a direction."""
     change = (fractions_dot - fractions * rest_density_dot / rest_density) / rest_density
     return -(reference_density(fractions, rest_density) ** 2) * change.sum(axis=1)
 
@@ -32,18 +33,19 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The adjoints of fractions (n, phases) and of rest densities (phases,) for one of m (n,)."""
+    """Return the adjoints of fractions (n, phases) and of rest densities (phases,) for one of m (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
 
 SMALL = 1e-2
-"""Angles [rad] below which a series takes the place of a division by them; what it leaves out is below round-off."""
+"""Angles [rad] below which a series takes the place of a division by them; its error is below round-off."""
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """Gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k) of angles a (d - 1,) [degrees] from the rest e_0.
+    """A map to gravity g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k) of angles a (d - 1,) [degrees] from the
+    rest e_0.
 
     The unit vectors e_k are the axes other than the one that gravity at rest is most nearly along, in their order, made
     perpendicular to it and to each other: where it is along -y, gravity leans towards x by a_1 and towards z by a_2.
@@ -54,13 +56,13 @@ class Tilt:
     """(d,) gravity without a tilt [m/s2], not 0."""
 
     def gravity(self, angles: np.ndarray) -> np.ndarray:
-        """(d,) or (steps, d) [m/s2] of angles (d - 1,) or (steps, d - 1) [degrees]."""
+        """Return gravity (d,) or (steps, d) [m/s2] for angles (d - 1,) or (steps, d - 1) [degrees]."""
         a = np.radians(angles)
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         return self._size * np.concatenate([np.cos(size), np.sinc(size / np.pi) * a], axis=-1) @ self._axes
 
     def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
-        """The derivative of `gravity` along ``dot`` [m/s2], of the angles' shape."""
+        """Return the derivative of `gravity` along ``dot`` [m/s2], of the angles' shape."""
         a, a_dot = np.radians(angles), np.radians(dot)
         sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
@@ -71,7 +73,7 @@ class Tilt:
         )
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """The derivative with respect to the angles [1/degree], from that with respect to gravity."""
+        """Return the derivative with respect to the angles [1/degree], from that with respect to gravity."""
         a, bars = np.radians(angles), self._size * bar @ self._axes.T
         sine, sine_derivative = self._factors(a)
         rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
@@ -80,7 +82,7 @@ class Tilt:
 
     @property
     def towards(self) -> str:
-        """The names of the axes that gravity leans towards, such as "xz"."""
+        """Return the names of the axes that gravity leans towards, such as "xz"."""
         return "".join(np.delete(list("xyz"[: len(self.rest)]), np.abs(self.rest).argmax()))
 
     @property
@@ -89,7 +91,7 @@ class Tilt:
 
     @property
     def _axes(self) -> np.ndarray:
-        """(d, d) rows e_0, e_1 ..."""
+        """Return the unit vectors e_0, e_1 ... as rows (d, d)."""
         rows = [np.array(self.rest) / self._size]
         for axis in np.delete(np.eye(len(self.rest)), np.abs(self.rest).argmax(), axis=0):
             rest = axis - sum((axis @ row) * row for row in rows)
@@ -98,7 +100,7 @@ class Tilt:
 
     @staticmethod
     def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(..., 1) s = sin|a| / |a|, and its derivative along |a|, over |a|."""
+        """Return s = sin|a| / |a| (..., 1), and its derivative along |a|, over |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
         derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
@@ -106,13 +108,13 @@ class Tilt:
 
 
 class Known(Mapping[str, Parameter]):
-    """Parameters by name, those of the registry first. It is equal to itself alone."""
+    """A table of parameters by name, those of the registry first. It is equal to itself alone."""
 
     __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """``own``: those of forces and of a solver, each with whose it is, in words; `TIME` may be among them several
-        times. Raises `InputError` where two parameters have one name, or the same arguments of kernels."""
+        """Take parameters ``own`` of forces and of a solver, each with its owner in words; `TIME` may be among them
+        several times. Raises `InputError` where two parameters have one name, or the same arguments of kernels."""
         self._by_name = dict(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
@@ -140,7 +142,7 @@ class Known(Mapping[str, Parameter]):
         """How these change while a scene runs."""
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """True for a value of a parameter that has rows in time: one for each step, or for each of some knots."""
+        """Test whether a value of a parameter has rows in time: one for each step, or for each of some knots."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
@@ -174,35 +176,35 @@ TIME = Parameter(
     moment=0.0,
     course=_Passing(),
 )
-"""For forces that depend on time. Kernels find (members, steps) numbers; derivatives with respect to the time step
-follow, and runs that go on have their own."""
+"""The parameter for forces that depend on time. Kernels find (members, steps) numbers; derivatives with respect to the
+time step follow, and runs that go on have their own."""
 
 
 def argument(name: str) -> str:
-    """The name of a parameter among arguments of kernels: ``drag_k`` is that of ``drag.k``."""
+    """Return the name of a parameter among arguments of kernels: ``drag_k`` for ``drag.k``."""
     return name.replace(".", "_")
 
 
 REGISTRY = Known()
-"""Those of a simulation without forces of its own."""
+"""The parameters of a simulation without forces of its own."""
 
 
 Values = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
 
 NAMES = names()
-"""Every parameter."""
+"""Names of all parameters."""
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
-"""Every parameter with its unit."""
+"""Units of all parameters by name."""
 OVER_TIME = names(axis=Axis.STEP)
 """Parameters that may have a row for each step; a tilt takes the place of gravity."""
 SUM_TOLERANCE = 0.01
-"""How far the mass fractions of a particle may add up to something else than 1: differences need some room."""
+"""Deviation from 1 of the sum of a particle's mass fractions that is allowed: differences need some room."""
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Every parameter of the ``known`` that a scene has, as it has it, in the shape that a user would write; without a
-    tilt, which is another way to write gravity."""
+    """Return the scene's value of every parameter of the ``known`` that it has, in the shape that a user would write;
+    without a tilt, which is another way to write gravity."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -213,7 +215,7 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 
 
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
-    """Raises `InputError` for a parameter that there is not, or that a scene does not have."""
+    """Raise `InputError` for a parameter that does not exist, or that a scene does not have."""
     if name not in known or known[name].role is Role.CLOCK:
         owner = str(name).rpartition(".")[0]
         if owner in (solid.name for solid in scene.solid if not solid.moves):
@@ -227,7 +229,7 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: object) -> None:
-    """Raises `InputError` unless these are parameters by name, of at least one point."""
+    """Raise `InputError` unless these are parameters by name, of at least one point."""
     if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
         raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
     for point in points:
@@ -235,7 +237,7 @@ def require_points(points: object) -> None:
 
 
 def is_too_small(array: np.ndarray, allowed: Range) -> bool:
-    """True where a number is below a range that begins at 0."""
+    """Test whether a number is below a range that begins at 0."""
     if allowed is Range.POSITIVE:
         return bool((array <= 0.0).any())
     return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())
@@ -244,7 +246,7 @@ def is_too_small(array: np.ndarray, allowed: Range) -> bool:
 def checked_value(
     name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
 ) -> np.ndarray:
-    """A value as a float64 array of one of the shapes, finite and in range, or an `InputError` in a sentence: an
+    """Return a value as a float64 array of one of the shapes, finite and in range; raise `InputError` in a sentence, an
     `OutOfRangeError` where only the value is wrong. A ``what`` of "direction" may be negative."""
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""
@@ -269,10 +271,10 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
 
 
 def stacked(tables: Sequence[Arrays]) -> Arrays:
-    """Arrays of the same names with a first axis for each of the tables."""
+    """Stack arrays of equal names along a first axis for the tables."""
     return {name: np.stack([one[name] for one in tables]) for name in tables[0]}
 
 
 def entry(arrays: Arrays, number: int) -> Arrays:
-    """One entry of the first axis of each array."""
+    """Return one entry of the first axis of each array."""
     return {name: array[number] for name, array in arrays.items()}

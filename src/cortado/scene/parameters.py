@@ -34,7 +34,7 @@ class Role(Enum):
 
 
 class Range(Enum):
-    """Which numbers a parameter may be."""
+    """The range of numbers that a parameter may have."""
 
     ANY = "any"
     POSITIVE = "greater than 0"
@@ -55,10 +55,10 @@ class Changing(Protocol):
     """The course of a parameter while a scene runs, at times (n,) [s]."""
 
     def at(self, times: NDArray) -> NDArray:
-        """(n,) numbers or (n, components)."""
+        """Return numbers (n,) or (n, components) at times (n,) [s]."""
 
     def rates(self, times: NDArray) -> NDArray:
-        """The derivatives with respect to time, of the same shape."""
+        """Return the derivatives with respect to time at times (n,) [s], in the shape of the values."""
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
@@ -67,7 +67,7 @@ Limit = Callable[[Any, Mapping[str, Any]], float]
 
 @dataclass(frozen=True)
 class Parameter:
-    """Something that a run, or a loss of it, depends on."""
+    """An input of a run, or of its loss, with its unit, shape and range: an entry of the registry."""
 
     name: str
     unit: str
@@ -76,41 +76,41 @@ class Parameter:
     """In words, for the documents."""
     axis: Axis
     value: Callable[[Source], Any]
-    """What it is in a scene that has it."""
+    """Returns its value in a scene that has it."""
     components: Callable[[int, int], int] | None = None
-    """Of a vector, in so many dimensions and with so many phases; None for a number."""
+    """Returns the number of components of a vector, for a number of dimensions and of phases; None for a number."""
     role: Role = Role.RUN
     range: Range = Range.ANY
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
-    """What an optimiser would take for a large change, for one at a value: by default the value itself."""
+    """Returns a large change for an optimiser, at a value: by default the value itself."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Whether it can make a difference in a scene, with values of parameters by name."""
+    """Tells whether it can make a difference in a scene, with values of parameters by name."""
     present: Callable[[Any], bool] = lambda scene: True
-    """Whether a scene has it."""
+    """Tells whether a scene has it."""
     absent: str = ""
-    """What to say of a scene that does not: "has no emitter"."""
+    """Words about a scene that does not have it: "has no emitter"."""
     force: str | None = None
     """The module whose ``force`` makes the force that reads it, in scenes that have it: see `cortado.sph.parts`."""
     is_optional: bool = False
-    """Whether it is a key of [forces] that scenes may leave out, and its force with it."""
+    """True for a key of [forces] that scenes may leave out, and its force with it."""
     longest_step: Limit = lambda scene, values: inf
-    """The largest at which an optional force is likely to be stable."""
+    """The longest time step at which an optional force is likely to be stable."""
     moment: float = 0.5
-    """Of a parameter over time: when within a step its row is taken from a schedule; 0 is the start, 1 the end."""
+    """Moment within a step for which a schedule's row of a parameter over time is taken; 0 is the start, 1 the end."""
     grows: bool = False
-    """Whether one over time is 0 where a run begins, so that a steady change of it grows."""
+    """True for one over time that is 0 where a run begins, so that a steady change of it grows."""
     in_place_of: str | None = None
-    """Of another way to write a parameter: that one."""
+    """Name of the parameter in whose place this one is another way to write it."""
     course: Changing | None = None
-    """How one over time, of a force of one's own, changes where it is not given."""
+    """Course of a parameter over time of a user's force, where it is not given."""
 
     @property
     def rank(self) -> int:
-        """The number of axes that the value has for one step, one phase or one particle: 1 of a vector."""
+        """Return the number of axes that the value has for one step, one phase or one particle: 1 of a vector."""
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """The shapes that its values may have, () for a number, where positions are (n, d)."""
+        """Return the shapes that its values may have, () for a number, where positions are (n, d)."""
         particles, dimension = positions
         own = () if self.components is None else (self.components(dimension, phases),)
         if self.axis is Axis.STEP:
@@ -155,8 +155,9 @@ def _has_emitter(scene: Any) -> bool:
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
-    """C sqrt(rho s^3 / sigma) of the lightest phase, with the spacing s (the form is that of Brackbill et al. 1992). C
-    is 0.08, as with PCISPH drops in space need many more iterations from 0.1 on; by curvature, 0.2."""
+    """Return C sqrt(rho s^3 / sigma), the longest time step with surface tension, of the lightest phase, with the
+    spacing s (Brackbill et al. 1992). C is 0.08, as with PCISPH drops in space need many more iterations from 0.1 on;
+    by curvature, 0.2."""
     tension = float(values.get("surface_tension", scene.forces.surface_tension))
     density = float(np.min(values.get("rest_density", [phase.rest_density for phase in scene.phase])))
     part = 0.08 if scene.solver.kind == "pcisph" else 0.2
@@ -166,8 +167,8 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """A number of at least 0 that may stand in the table [forces] of a scene, and switches a force on: ``force`` is the
-    module that makes it, ``longest_step`` the largest time step at which it is likely to be stable."""
+    """Make the parameter of a number of at least 0 in the table [forces] of a scene, which switches a force on:
+    ``force`` is the module that makes it, ``longest_step`` the largest time step at which it is likely to be stable."""
     return Parameter(
         name,
         unit,
@@ -329,12 +330,12 @@ BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 
 def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]:
-    """The names of parameters of a role and with an axis, of any where none is given, in the order of the list."""
+    """Return the names of parameters of a role and with an axis, of any where none is given, in the list's order."""
     return tuple(p.name for p in PARAMETERS if role in (None, p.role) and axis in (None, p.axis))
 
 
 def offered(scene: Any) -> tuple[str, ...]:
-    """The names of parameters that a scene has, without what its particles are made of where there is one phase."""
+    """Return the names of parameters that a scene has, without mass fractions where there is one phase."""
     one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
     return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)
 
@@ -343,7 +344,7 @@ HEAD = "| parameter | shape | unit | | range |\n|---|---|---|---|---|\n"
 
 
 def markdown() -> str:
-    """A row for each parameter; n particles, d dimensions, in a run of several steps."""
+    """Return a Markdown table with a row for each parameter; n particles, d dimensions, in a run of several steps."""
     return HEAD + "".join(_row(parameter) for parameter in PARAMETERS)
 
 

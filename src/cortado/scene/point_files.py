@@ -25,14 +25,14 @@ from cortado.errors import InputError, Words, shown
 from cortado.files.disk import reason, regular_file
 
 MOST_POINTS = 10_000_000
-"""Of a file."""
+"""Most points of a file."""
 REFUSED = 3
 ROOM = 2**30
 """Memory that any file may take [byte]; a large file may take more."""
 
 
 class Refused(Exception):
-    """Why a file cannot be used, a clause."""
+    """The reason why a file with points cannot be used, a clause."""
 
 
 def _poly_data(path: str) -> Any:
@@ -65,7 +65,7 @@ def _read_by_vtk(reader: Any, path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """The points of the first step, of all its parts; those of a trajectory of Cortado's only if its checksums hold."""
+    """Read the points of the first step, of all its parts; of a trajectory of Cortado's only if its checksums hold."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -102,7 +102,7 @@ def _trajectory(path: str) -> Any:
 
 
 READERS: dict[str, Callable[[str], Any]] = {".vtk": _legacy, ".vtp": _poly_data, ".vtkhdf": _hdf5}
-"""By the end of a file's name."""
+"""Readers by the end of a file's name."""
 
 
 def _check_count(count: int) -> None:
@@ -111,7 +111,7 @@ def _check_count(count: int) -> None:
 
 
 def _limit_memory(size: int) -> None:
-    """For a file of a size [byte]: what VTK makes of it is several times as large, and an array of it on the way."""
+    """Limit the process's memory for a file of a size [byte]: VTK's data are several times as large, plus an array."""
     try:
         import resource
     except ImportError:  # on Windows
@@ -123,7 +123,7 @@ def _limit_memory(size: int) -> None:
 
 
 def main(path: str) -> int:
-    """Reads and writes; returns the exit code."""
+    """Read a file of points and write them for the parent process; return the exit code."""
     output, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     for terminal in (1, 2):
         os.dup2(nothing, terminal)
@@ -142,13 +142,13 @@ def main(path: str) -> int:
 
 SUFFIXES = (".npy", *READERS)
 MOST_BYTES = 2**30
-"""Of a file of points."""
+"""Most bytes of a file of points."""
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
 """How long a file may take to be read at most: this long, and its size over this pace."""
 
 
 def read_points(path: str, dimension: int) -> Points:
-    """(n, d) [m], not to be written to. Raises `InputError`, a sentence that names the file."""
+    """Read points (n, d) [m] from a file, not to be written to. Raises `InputError`, a sentence that names the file."""
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     try:
@@ -160,7 +160,7 @@ def read_points(path: str, dimension: int) -> Points:
 
 @lru_cache(maxsize=4)
 def _read(path: str, dimension: int, changed: int, size: int) -> Points:
-    """Read once for each version of the file: the time of its last change and its size stand for the version."""
+    """Read a file once for each version, for which the time of its last change and its size stand."""
     array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
     if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
         array = array[:, :2]  # VTK knows no plane
@@ -180,7 +180,7 @@ def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimensi
 
 
 def _read_npy(path: str, size: int, dimension: int) -> Any:
-    """The array, whose header is held against the size of the file before anything else is read."""
+    """Read the array of a NumPy file, whose header is first compared with the size of the file."""
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
         with open(path, "rb") as file, warnings.catch_warnings():
@@ -199,7 +199,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 
 def _read_apart(path: str, size: int) -> Any:
-    """The points that another process reads: see `cortado.scene.point_files`."""
+    """Return the points of a file that another process reads: see `cortado.scene.point_files`."""
     limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory

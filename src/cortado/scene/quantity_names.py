@@ -29,7 +29,7 @@ class Quantity:
     kind: Kind = Kind.NUMBER
 
     def shape(self, particles: int, dimension: int) -> tuple[int, ...]:
-        """The shape of its values."""
+        """Return the shape of its values for a number of particles and dimensions."""
         is_vector = self.kind is Kind.VECTOR or (self.kind is Kind.TURNING and dimension == 3)
         return (particles, dimension) if is_vector else (particles,)
 
@@ -49,36 +49,36 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Numbers (..., n) of the values of a quantity or, of one frame, of a field; of vectors (..., n, k) their
-    lengths."""
+    """Return sizes (..., n) of the values of a quantity or, of one frame, of a field: numbers, or lengths of vectors
+    (..., n, k)."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
 
 
 LOAD = ".load"
-"""What names of the loads on solids end with."""
+"""Ending of the names of loads on solids."""
 
 
 def load_name(solid: str) -> str:
-    """The name of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the
+    """Return the name of force [N] and torque [N m] of the fluid on a solid, in the plane [N/m] and [N], one behind the
     other."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """True for the name of a load; who computes it says whether there is such a solid."""
+    """Test whether a name is that of a load; its computation says whether there is such a solid."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """A name of a quantity, of one of the ``fields`` of a state, or of a load on a solid; raises `InputError` for any
-    other."""
+    """Return a name of a quantity, of one of the ``fields`` of a state, or of a load on a solid; raise `InputError` for
+    any other."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """A name of a quantity, or one of ``others``; raises `InputError` for any other."""
+    """Return a name of a quantity, or one of ``others``; raise `InputError` for any other."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

@@ -15,7 +15,7 @@ from cortado.words import ShortRepr
 
 @dataclass(frozen=True)
 class Clock:
-    """When a state is, counted from the first state of the first run; by default that is the state itself."""
+    """The time of a state, counted from the first state of the first run; by default that is the state itself."""
 
     steps: int = 0
     """Steps taken."""
@@ -25,12 +25,12 @@ class Clock:
     """Length of the step that led to the state, if it was chosen: the next one is hardly longer [s]; else 0."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """(frames,) [s] after so many steps more of ``time_step`` [s]; of the same size they are those of one run, bit
-        for bit."""
+        """Return times (frames,) [s] after more steps of ``time_step`` [s]; for equal steps they are those of one run,
+        bit for bit."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":
-        """The clock of the state so many steps later."""
+        """Return the clock of the state ``steps`` steps later."""
         return Clock(self.steps + steps, float(self.times(np.array(steps), time_step)))
 
 
@@ -39,16 +39,16 @@ class RecordedClock(Clock):
     """The clock of the first state of a run whose time steps were chosen, and recorded."""
 
     recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
-    """(steps + 1,) when each state was [s]; the states that the run did not come to have no meaning."""
+    """(steps + 1,) time of each state [s]; the states that the run did not come to have no meaning."""
     sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
     """(steps,) [s]"""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """(frames,) [s] after so many steps more; ``time_step`` does not matter. Within a step time goes on evenly."""
+        """Return times (frames,) [s] after ``steps`` more steps, evenly within a step; ``time_step`` is not used."""
         return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
 
     def after(self, steps: int, time_step: float) -> Clock:
-        """The clock of the state so many steps later."""
+        """Return the clock of the state ``steps`` steps later."""
         if steps == 0:
             return Clock(self.steps, self.time, self.time_step)
         return Clock(self.steps + steps, float(self.recorded[steps]), float(self.sizes[steps - 1]))
@@ -56,8 +56,8 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """The particles that a state is of: what is the same in every run that goes on from it. Forces, walls and the
-    length of a step may be others there, as they may change within a run."""
+    """The particles of a state, with all that is equal in every run that goes on from it. Forces, walls and the length
+    of a step may be others there, as they may change within a run."""
 
     spacing: float
     """[m]"""
@@ -68,19 +68,19 @@ class Origin:
     periods: tuple[float, ...]
     """(d,) lengths [m], 0 along an axis that is not periodic."""
     waiting: int
-    """How many particles, the last ones, are an emitter's."""
+    """Number of particles, the last ones, that are an emitter's."""
     rest_density: tuple[float, ...]
     """(phases,) that the run had [kg/m3]."""
     solver: str | None = None
-    """What sentences call the solver whose own fields the state has; None of a state that has none of such."""
+    """Name in messages of the solver whose own fields the state has; None for a state without such fields."""
 
     def to_json(self) -> str:
-        """To be read by `from_json`."""
+        """Write the origin as a text, to be read by `from_json`."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> "Origin":
-        """The origin that `to_json` wrote; raises `ValueError` or `TypeError` for anything else."""
+        """Read the origin that `to_json` wrote; raise `ValueError` or `TypeError` for anything else."""
         read: dict[str, Any] = json.loads(text)
         values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
         return cls(**values)
@@ -96,18 +96,18 @@ class RestartState(ShortRepr):
     (1, d), where its opening is [m], and emitted (1,), the length of fluid that has left it [m]; and what else a solver
     carries from step to step, of which PCISPH has nothing."""
     clock: Clock = field(default_factory=Clock)
-    """When the state is."""
+    """Time of the state."""
     origin: Origin | None = None
-    """Of which particles it is; None of one that was made by hand, or that an earlier version wrote."""
+    """Origin of its particles; None for a state that was made by hand, or that an earlier version wrote."""
 
     def __getitem__(self, name: str) -> NDArray:
-        """A field by name; raises `InputError` for one that the state does not have."""
+        """Return a field by name; raise `InputError` for one that the state does not have."""
         if name not in self.fields:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.fields)}.")
         return self.fields[name]
 
     def fixed(self) -> "RestartState":
-        """This state in arrays of its own, which nobody can change."""
+        """Return this state in arrays of its own, which nobody can change."""
         own = {name: np.array(value) for name, value in self.fields.items()}
         for array in own.values():
             array.setflags(write=False)

@@ -36,7 +36,7 @@ HEAVIEST = {2: 3e5, 3: 3e6}
 
 @public
 class Scene(SceneTables):
-    """Everything that a simulation starts from: `SceneTables` that fit each other."""
+    """A scene, from which a simulation starts: `SceneTables` that fit each other."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -55,7 +55,7 @@ class Scene(SceneTables):
         return self
 
     def replaced(self, *overrides: str) -> "Scene":
-        """This scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
+        """Return this scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
         The overrides are those of `load_scene`; a file that one names is looked for in the current folder. Raises
         `SceneError` as `load_scene` does.
@@ -63,7 +63,10 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """This scene with an emitter that has in reserve what a run for a time [s], or of so many ``steps``, takes.
+        """Return this scene with an emitter that has a reserve for a time [s], or for ``steps`` steps. It is the scene
+        itself where that has no emitter, or one with a duration, and where the column suffices. So it is where fluid
+        flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more particles than
+        memory holds.
 
         It is the scene as it is where that has no emitter, or one with a duration, and where the column suffices. So it
         is where fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more
@@ -84,7 +87,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """This scene with an emitter that has as many particles as the run that a state is of."""
+        """Return this scene with an emitter that has as many particles as the run of a state."""
         emitter, origin, spacing = self.emitter, state.origin, self.discretisation.spacing
         if emitter is None or origin is None or emitter.duration is not None:
             return self
@@ -97,12 +100,14 @@ class Scene(SceneTables):
         )
 
     def to_json(self) -> str:
-        """The scene with all defaults filled in but colours, which materials may have, to be read by `from_json`."""
+        """Return the scene as JSON with all defaults but colours, which materials may have, to be read by
+        `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """What results depend on: not [picture], [[sensor]] and materials, nor an empty [[force]] or [[solid]], a
-        jitter of 0, how a time step is chosen that is fixed, and options of the projection that are off."""
+        """Return as JSON the part of the scene on which results depend. It has no [picture], [[sensor]] and materials,
+        nor an empty [[force]] or [[solid]], a jitter of 0, keys of chosen time steps where they are fixed, and options
+        of the projection that are off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid") if not getattr(self, name)}
         jittered = {"discretisation": self.discretisation.jitter, "emitter": self.emitter and self.emitter.jitter}
@@ -119,7 +124,7 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """The scene that `to_json` wrote to a file, with replacements as for `load_scene`."""
+        """Read the scene that `to_json` wrote, with replacements as for `load_scene`."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -133,7 +138,7 @@ class Scene(SceneTables):
 
 
 def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
-    """Sentences about numbers that look as if they had another unit."""
+    """Yield sentences about numbers that look as if they had another unit."""
     for phase in scene.phase:
         if phase.rest_density < LIGHTEST:
             found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
@@ -149,8 +154,8 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """The sentence about fluid that weighs so much that its lengths may be in millimetres; None where it does not, or
-    where gravity is not the Earth's in metres."""
+    """Return the sentence about fluid that weighs so much that its lengths may be in millimetres; None where it does
+    not, or where gravity is not the Earth's in metres."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
@@ -161,7 +166,7 @@ def _millimetres(scene: SceneTables) -> str | None:
 
 
 def _given(value: Any) -> Any:
-    """Tables without what is left out, which JSON has as null."""
+    """Return tables without entries that are left out, which JSON has as null."""
     if isinstance(value, dict):
         return {name: _given(entry) for name, entry in value.items() if entry is not None}
     return [_given(entry) for entry in value] if isinstance(value, list) else value
@@ -182,7 +187,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """The scene itself, or the one in the file at a path; raises `InputError` for anything else, and `SceneError`."""
+    """Return the scene itself, or the one in the file at a path; raise `InputError` for anything else."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, (str, os.PathLike)):
@@ -191,7 +196,7 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
-    """A scene from the contents of its file, whose folder is where its other files are looked for."""
+    """Make a scene from the contents of its file, whose folder is where its other files are looked for."""
     if isinstance(data, Mapping):
         data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
     folder = Path(file).parent if file else Path()
@@ -203,7 +208,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def scene_in_words(scene: Scene, particles: int) -> str:
-    """One sentence about a scene that has so many particles: what is in it, what holds it, and what acts on it."""
+    """Describe a scene of a number of particles in one sentence: its contents, its container, and its forces."""
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )
@@ -216,7 +221,7 @@ def scene_in_words(scene: Scene, particles: int) -> str:
 
 
 def vector(components: tuple[float, ...]) -> str:
-    """``(0, -9.81)``"""
+    """Write a vector such as ``(0, -9.81)``."""
     return f"({', '.join(f'{component:.6g}' for component in components)})"
 
 

@@ -28,7 +28,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """The names, among some, of the fields of a table that are there with other values than their defaults."""
+    """Yield the names, among some, of the fields of a table that have other values than their defaults."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -36,14 +36,14 @@ def given(table: Table, *names: str) -> Iterator[str]:
 
 
 def check_idle(scene: SceneTables) -> None:
-    """Raises a `field_error` for the first key that belongs to a choice that was not made."""
+    """Raise a `field_error` for the first key that belongs to a choice that was not made."""
     for path, table, names, reason in _idle(scene):
         for name in given(table, *names):
             raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
 
 
 def idle_sentences(scene: SceneTables) -> Iterator[str]:
-    """Sentences about keys that a number of 0 turns off."""
+    """Yield sentences about keys that a number of 0 turns off."""
     for path, table, names, reason in _turned_off(scene):
         for name in given(table, *names):
             yield f"{field_name((*path, name))} changes nothing, as {reason}."
@@ -125,7 +125,7 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 
 
 def creep_sentence(scene: SceneTables) -> str | None:
-    """None for a scene without a yield stress, or without fluid at the start.
+    """Return a sentence on creeping fluid with a yield stress; None without one, or without fluid at the start.
 
     A film of depth H whose stress at the wall is a part r <= 1 of the yield stress has at its surface the speed
     (H / m) (1 + (1 - r) ln(1 - r) / r), where the shear rate at each height is -ln(1 - stress / yield stress) / m: at
@@ -145,16 +145,16 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 FAULT = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
-"""As measured in waves of shear (`docs/discretisation.md`)."""
+"""The fault of the pairwise viscosity, as measured in waves of shear (`docs/discretisation.md`)."""
 
 
 def wall_sentence(scene: SceneTables) -> str | None:
-    """The sentence about a scene whose walls hold the fluid back; None if there is nothing."""
+    """Return the sentence about a scene whose walls hold the fluid back; None if there is nothing."""
     return _sentence(scene, 'slip is "no" at walls') if scene.sticks else None
 
 
 def parameter_sentence(scene: SceneTables) -> str | None:
-    """The sentence about a viscosity that is a parameter of a problem; None if there is nothing."""
+    """Return the sentence about a viscosity that is a parameter of a problem; None if there is nothing."""
     return _sentence(scene, "the viscosity is a parameter")
 
 
@@ -173,7 +173,7 @@ FACING = 0.9
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
-    """One of each flat wall of the container that a solid moves along and ends on."""
+    """Yield a sentence on each flat wall of the container that a solid moves along and ends on."""
     box = scene.container
     if not isinstance(box, BoxContainer):
         return
@@ -196,7 +196,7 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """True for a path that does not turn a solid, and keeps its middle as far from a wall across an axis."""
+    """Test whether a path does not turn a solid, and keeps its middle as far from a wall across an axis."""
     shifts, turns = courses(table)
     if turns.greatest() > 0.0:
         return False
@@ -210,20 +210,20 @@ ONE_LAYER, TWO_LAYERS = 1.1, 1.5
 sees further than two spacings. Water 25 to 120 spacings deep, at rest, on a shelf or in a cup, went through those of
 0.75, in space 1.0, and of 1.0 to 1.25. It did so within 10 to 90 steps, with either solver and steps however short."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Of that thickness: beneath the surface there is to be no room for fluid so deep."""
+"""Parts of that thickness: beneath the surface there is to be no room for fluid so deep."""
 MARGIN = 1e-3
-"""Of it, too: what is so little thinner is thick enough."""
+"""Part of that thickness by which a wall may be thinner."""
 SHARE = 0.01
-"""Of the surface: where no more is too thin, nothing is said."""
+"""Part of the surface that may be too thin without a word."""
 
 
 def holding_thickness(cut: DiscretisationTable) -> float:
-    """The least thickness of walls that hold fluid [m]."""
+    """Return the least thickness of walls that hold fluid [m]."""
     return (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
 
 
 def thin_sentences(scene: SceneTables) -> Iterator[str]:
-    """One of each solid that has fluid on both sides where it is too thin to hold any."""
+    """Yield a sentence on each solid that has fluid on both sides where it is too thin to hold any."""
     least, spacing = holding_thickness(scene.discretisation), scene.discretisation.spacing
     for table in scene.solid if scene.forces.pressure else ():
         solid, resting = table.solid(), resting_room(scene)

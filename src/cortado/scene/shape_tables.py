@@ -30,19 +30,19 @@ THIN = 2.5
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Every component of upper must be greater than that of lower."""
+    """Check that every component of upper is greater than that of lower."""
     if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
         raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
-    """A cylinder needs three dimensions."""
+    """Raise a `field_error` for a cylinder in 2-D."""
     if dimension == 2:
         raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
-    """The absolute name of a file that a scene names, which is beside the scene's own."""
+    """Return the absolute name of a file that a scene names, which is beside the scene's own."""
     folder = Path((info.context or {}).get("folder", "."))
     try:
         return str((folder / file).absolute())
@@ -69,7 +69,7 @@ class BoxShape(Table):
         return self
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """The box about its middle, not turned, and where that is (d,) [m]."""
+        """Return the box about its middle, not turned, and the middle (d,) [m]."""
         return Box(0.5 * np.subtract(self.upper, self.lower)), 0.5 * np.add(self.lower, self.upper)
 
 
@@ -83,7 +83,7 @@ class SphereShape(Table):
     """From the middle to the surface [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """The sphere about its middle, and where that is (d,) [m]."""
+        """Return the sphere about its middle, and the middle (d,) [m]."""
         return Round(np.zeros(len(self.centre)), self.radius), np.array(self.centre)
 
 
@@ -107,7 +107,7 @@ class CylinderShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """The cylinder about its middle, not turned, and where that is (3,) [m]."""
+        """Return the cylinder about its middle, not turned, and the middle (3,) [m]."""
         along = INDEX_OF_AXIS[self.axis]
         middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[along]
         return Revolved(Box(np.array([self.radius, 0.5 * self.height])), along), middle
@@ -137,20 +137,20 @@ class PolygonShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """The polygon about its centroid, and where that is (2,) [m]."""
+        """Return the polygon about its centroid, and the centroid (2,) [m]."""
         corners = np.array(self.corners)
         middle = Polygon(corners).moments().centre
         return Polygon(corners - middle), middle
 
 
 class MeshShape(Table):
-    """What a mesh of triangles holds, in 3-D."""
+    """The inside of a mesh of triangles, in 3-D."""
 
     shape: Literal["mesh"] = "mesh"
     file: File
     """Its name: STL, OBJ, PLY, glTF or GLB; beside the scene file, and absolute once read."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """What its lengths are multiplied with, such as 0.001 where they are millimetres."""
+    """Factor of its lengths, such as 0.001 where they are millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:
@@ -158,30 +158,30 @@ class MeshShape(Table):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        """The mesh about its centroid, and where that is (3,) [m]."""
+        """Return the mesh about its centroid, and the centroid (3,) [m]."""
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest_sheet(self, spacing: float) -> float:
-        """The thickness of its thinnest sheet [m]; infinite where all are thicker than `THIN` spacings [m]."""
+        """Return the thickness of its thinnest sheet [m]; infinite where all are thicker than `THIN` spacings [m]."""
         return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
 
 
 @lru_cache(maxsize=8)
 def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
-    """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
+    """Return a mesh times a scale, about its middle, and the middle (3,) [m]; kept, as looking it up takes a tree."""
     middle = found.mesh.moments().centre
     return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
 
 
 @lru_cache(maxsize=8)
 def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
-    """The thickness of the thinnest sheet of a mesh times a scale [m]; infinite where all are thicker than a reach [m].
-    Once, as it takes thousands of points."""
+    """Return the thickness of the thinnest sheet of a mesh times a scale [m]; infinite where all are thicker than a
+    reach [m]. It is kept, as it takes thousands of points."""
     return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """The numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
+    """Return the numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -204,16 +204,16 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
 
 
 class Container(Table):
-    """What holds the fluid."""
+    """A container of the fluid, of any shape."""
 
     @property
     def sticks(self) -> bool:
-        """True where its walls have no slip."""
+        """Return True where its walls have no slip."""
         return getattr(self, "slip", "free") == "no"
 
     @property
     def finish(self) -> Finish | None:
-        """The finish of its walls; None if the scene says nothing of it."""
+        """Return the finish of its walls; None if the scene says nothing of it."""
         material, colour = getattr(self, "material", None), getattr(self, "colour", None)
         if material is None:
             return None if colour is None else Finish(colour)
@@ -222,35 +222,35 @@ class Container(Table):
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
-        """The box around it: lower and upper, each (d,) [m]; None if there is none."""
+        """Return the box around it: lower and upper, each (d,) [m]; None if there is none."""
 
     @abstractmethod
     def region(self, dimension: int) -> Region:
-        """Where fluid may be, within one period."""
+        """Return the region where fluid may be, within one period."""
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        """Return a mask (n,) of the points (n, d) [m] that are within, or outside by no more than the tolerance [m]."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
     @abstractmethod
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
-        """(b, d) one layer of wall particles [m], ``depth`` [m] outside"""
+        """Return one layer (b, d) of wall particles [m], ``depth`` [m] outside of it."""
 
     @abstractmethod
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        """Where fluid may rest less than ``reach`` [m] from a wall."""
+        """Return places where fluid may rest less than ``reach`` [m] from a wall."""
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """A container whose walls have the weights of those of this one beside fluid with a spacing and a support [m],
-        which may be found sooner; and which of its walls has that of each, by where both (b, d) are [m]."""
+        """Return a container whose walls beside fluid of a spacing and a support [m] have this one's weights, and which
+        may be found sooner. A function from places (b, d) [m] of walls gives the wall with each one's weight."""
         return self, lambda points: points
 
     @abstractmethod
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """The solids that close the container, up to ``reach`` [m] beyond the ends of a period."""
+        """Return the solids that close the container, up to ``reach`` [m] beyond the ends of a period."""
 
     def wall_count(self, spacing: float) -> float:
-        """About how many wall particles one layer has, without making any."""
+        """Estimate how many wall particles one layer has, without making any."""
         ends = self.extent()
         if ends is None:
             return 0.0
@@ -258,21 +258,21 @@ class Container(Table):
         return float(2.0 * np.sum(np.prod(cells) / cells))
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Where the period begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
+        """Return begin and length of the period, each (d,) [m]; the length is 0 for axes without one."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and at the upper end of each
-        axis, each (d,) [m], and -inf or inf where none does."""
+        """Return coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and at the upper end
+        of each axis, each (d,) [m], and -inf or inf where none does."""
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
-        """The container's room and its periods as one object."""
+        """Return the container's room and its periods as one object."""
         return Domain.of(*self.periods(dimension))
 
 
 class NoContainer(Container):
-    """Free space."""
+    """Free space without a container."""
 
     shape: Literal["none"] = "none"
 
@@ -293,7 +293,7 @@ class NoContainer(Container):
 
 
 class BoxContainer(Container):
-    """A box, closed on all sides along which it is not periodic."""
+    """A container in the shape of a box, closed on all sides along which it is not periodic."""
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
@@ -339,8 +339,8 @@ class BoxContainer(Container):
         return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Walls without slip do not: a mirror would bend the shear beside them. Nor do those of a box so narrow that
-        images had images."""
+        """Return the walls that mirror the fluid. Walls without slip do not: a mirror would bend the shear beside them.
+        Nor do walls of a box so narrow that images had images."""
         (lower, upper), periodic = self.extent(), np.array(self.periodic)
         if self.sticks or (upper - lower < support)[~periodic].any():
             return super().mirrors(dimension, support)
@@ -352,7 +352,7 @@ class BoxContainer(Container):
 
 
 class CylinderContainer(Container):
-    """A cup, in 3-D."""
+    """A container in the shape of a cup, in 3-D."""
 
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
@@ -410,7 +410,8 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
-    """A container is at least one spacing wide, and a period longer than two support radii.
+    """Check that a container is at least one spacing wide, and a period longer than two support radii. The search takes
+    the nearest periodic image only; in a shorter period a pair would have two.
 
     The neighbour search takes the nearest periodic image only; in a shorter period a pair would have two.
     """

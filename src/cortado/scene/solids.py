@@ -43,17 +43,17 @@ from cortado.scene.tables import (
 
 
 class SolidTable(Coloured):
-    """What fluid cannot enter."""
+    """A solid, which fluid cannot enter, of any shape."""
 
     measures: ClassVar[tuple[str, ...]] = ()
     """Fields with which its shape grows."""
     least_thickness: ClassVar = 1.0
-    """How thick it is at least, in spacings."""
+    """Least thickness, in spacings."""
     materials: ClassVar = FINISHES
     plain: ClassVar = (0.55, 0.55, 0.58)
 
     name: Text
-    """What others call it."""
+    """Name by which other tables refer to it."""
     position: tuple[Length, ...] | None = None
     """(d,) Where the centroid of its volume is [m]; left out, it is where its measures put it."""
     rotation: Rotation | None = None
@@ -63,20 +63,20 @@ class SolidTable(Coloured):
     """Whether it stays where it is; moves as it is told, by `times` with `positions`, `rotations` or both, or with a
     steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity move."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
-    """Of a free body: its mass over its volume [kg/m³]."""
+    """Density of a free body: its mass over its volume [kg/m³]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
     and after the last it rests."""
     positions: tuple[tuple[Length, ...], ...] | None = None
     """(k, d) Where the middle is at these times [m]; the first is where it begins."""
     rotations: tuple[Rotation, ...] | None = None
-    """(k, 3) By which rotation vectors it is turned from how it begins at these times, in 2-D (k,) by which angles; the
-    first is 0 [rad]."""
+    """(k, 3) Rotation vectors by which it is turned from how it begins at these times, in 2-D (k,) angles; the first is
+    0 [rad]."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Of the middle, if it is steady; of a free body at the start [m/s]."""
+    """(d,) Velocity of the middle, if it is steady; of a free body at the start [m/s]."""
     angular_velocity: Turning | None = None
-    """About the middle, if it is steady; of a free body at the start: in 3-D a vector, in 2-D one number,
-    counterclockwise [rad/s]."""
+    """Angular velocity about the middle, if it is steady; of a free body at the start: in 3-D a vector, in 2-D one
+    number, counterclockwise [rad/s]."""
     surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
     """(d,) How fast its surface slides while its shape stays, as that of a belt does, in the frame of the solid
     [m/s]."""
@@ -95,7 +95,7 @@ class SolidTable(Coloured):
 
     @property
     def finish(self) -> Finish:
-        """The finish of its surface."""
+        """Return the finish of its surface in pictures."""
         plain = Finish(self.plain, transparency=float(self.side == "inside"))
         own = plain if self.material is None else FINISHES[self.material]
         clear = own.transparency if self.transparency is None else self.transparency
@@ -103,24 +103,24 @@ class SolidTable(Coloured):
 
     @property
     def sticks(self) -> bool:
-        """True where fluid has no slip along it."""
+        """Return True where fluid has no slip along it."""
         return self.slip == "no"
 
     @property
     def moves(self) -> bool:
-        """True where it or its surface moves."""
+        """Return True where it or its surface moves."""
         return self.motion != "fixed" or self.surface_velocity is not None
 
     def middle(self) -> Points:
-        """(d,) where its middle is at the start [m]."""
+        """Return its middle (d,) at the start [m]."""
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
+        """Return the shape about its middle, not turned, and the middle by its measures, (d,) [m]."""
 
     def stretched(self, scale: float) -> Self:
-        """So many times as large about its middle."""
+        """Return the solid ``scale`` times as large about its middle."""
         if scale == 1.0:
             return self
         grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
@@ -128,35 +128,35 @@ class SolidTable(Coloured):
 
     @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """The thickness of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets are all
-        thicker than a few spacings [m]."""
+        """Return the thickness of its thinnest part [m]; infinite where that is not known, as of a mesh whose sheets
+        are all thicker than a few spacings [m]."""
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
-        """This table, at a path, as it is in a container, which shapes without an end need to know."""
+        """Return this table, at a path, as it is in a container, which shapes without an end need to know."""
         return self
 
     def wall_count(self, spacing: float) -> float:
-        """About how many wall particles one layer has, without making any."""
+        """Estimate how many wall particles one layer has, without making any."""
         lower, upper = self.shape_about()[0].extent()
         cells = np.maximum((upper - lower) / spacing, 1.0)
         return float(2.0 * np.sum(np.prod(cells) / cells))
 
     def solid(self) -> Solid:
-        """Where fluid may not be."""
+        """Return the solid where fluid may not be: the shape, or all outside of it for a tank."""
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """Where fluid may not be, about the middle of the solid, which is not turned."""
+        """Return the solid where fluid may not be, about its middle and not turned."""
         shape = self.shape_about()[0]
         return Hollow(shape) if self.side == "inside" else shape
 
     def body(self) -> Solid:
-        """The shape in its place."""
+        """Return the shape in its place."""
         middle = self.middle()
         return Placed(self.shape_about()[0], middle, self.turn(len(middle)))
 
     def turn(self, dimension: int) -> NDArray[np.float64]:
-        """(d, d) the rotation matrix."""
+        """Return the rotation matrix (d, d) at the start."""
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -169,17 +169,17 @@ class SolidTable(Coloured):
 
 @lru_cache(maxsize=8)
 def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
-    """The solids that tables describe, in their order."""
+    """Return the solids that tables describe, in their order."""
     return tuple(table.solid() for table in tables)
 
 
 def _times(scale: float, value: Any) -> Any:
-    """A number, or one by one those of a tuple."""
+    """Multiply a number by a scale, or one by one those of a tuple."""
     return tuple(_times(scale, part) for part in value) if isinstance(value, tuple) else scale * value
 
 
 def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
-    """Raises a `field_error` where the keys of a motion do not fit together."""
+    """Raise a `field_error` where the keys of a motion do not fit together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
     if solid.density is not None and solid.motion != "free":
@@ -207,7 +207,7 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 
 
 def _check_free(solid: SolidTable, path: FieldPath) -> None:
-    """A free body has a density, and nothing tells it where to go."""
+    """Check that a free body has a density, and that nothing tells it where to go."""
     if solid.density is None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, as motion is "free"')
     for name in ("times", "positions", "rotations", "surface_velocity"):
@@ -241,7 +241,7 @@ def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
 
 
 def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
-    """A solid is so thick that there is room for the particles of its walls."""
+    """Check that a solid is so thick that there is room for the particles of its walls."""
     least = solid.least_thickness * spacing
     if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
         found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
@@ -260,7 +260,7 @@ class PlaneSolid(SolidTable):
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
     normal: Vector[Annotated[float, quantity()]]
-    """(d,) Away from it into the fluid, of any length."""
+    """(d,) Normal from the plane into the fluid, of any length."""
     _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -309,7 +309,7 @@ Size = Annotated[float, quantity("m", gt=0.0)]
 
 
 class BoxSolid(BoxShape, SolidTable):
-    """A box, or a rectangle in 2-D."""
+    """A solid box, or a rectangle in 2-D."""
 
     measures: ClassVar = ("lower", "upper")
 
@@ -318,7 +318,7 @@ class BoxSolid(BoxShape, SolidTable):
 
 
 class SphereSolid(SphereShape, SolidTable):
-    """A sphere, or a disc in 2-D."""
+    """A solid sphere, or a disc in 2-D."""
 
     measures: ClassVar = ("centre", "radius")
 
@@ -327,7 +327,7 @@ class SphereSolid(SphereShape, SolidTable):
 
 
 class CapsuleSolid(SolidTable):
-    """All that is no further than a radius from a segment."""
+    """A solid capsule: all that is no further than a radius from a segment."""
 
     measures: ClassVar = ("start", "end", "radius")
     shape: Literal["capsule"] = "capsule"
@@ -347,7 +347,7 @@ class CapsuleSolid(SolidTable):
 
 
 class CylinderSolid(CylinderShape, SolidTable):
-    """A cylinder, in 3-D."""
+    """A solid cylinder, in 3-D."""
 
     measures: ClassVar = ("base", "radius", "height")
     instead: ClassVar = '"box", "sphere", "capsule", "cup" or "polygon"'
@@ -368,7 +368,7 @@ class CupSolid(SolidTable):
     height: Size
     """From the bottom, outside, to the rim [m]."""
     thickness: Size
-    """Of the side and the bottom [m]."""
+    """Thickness of the side and the bottom [m]."""
     axis: Literal["x", "y", "z"] = "y"
     """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
 
@@ -396,7 +396,7 @@ class CupSolid(SolidTable):
         return self.thickness
 
     def _middle(self) -> float:
-        """The height of its centroid above the base [m]."""
+        """Return the height of its centroid above the base [m]."""
         power = len(self.base) - 1
         solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
         whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
@@ -405,7 +405,7 @@ class CupSolid(SolidTable):
 
 
 class PolygonSolid(PolygonShape, SolidTable):
-    """A polygon, in 2-D."""
+    """A solid polygon, in 2-D."""
 
     measures: ClassVar = ("corners",)
     least_thickness: ClassVar = 0.5
@@ -415,7 +415,7 @@ class PolygonSolid(PolygonShape, SolidTable):
 
 
 class MeshSolid(MeshShape, SolidTable):
-    """What a mesh of triangles holds, in 3-D."""
+    """A solid inside a mesh of triangles, in 3-D."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.5

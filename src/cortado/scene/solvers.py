@@ -22,22 +22,22 @@ Suits = tuple[tuple[str, Mapping[str, Any]], ...]
 
 
 class SolverTable(Table):
-    """How a step is solved."""
+    """The algorithm that takes a step, and the length of a step."""
 
     kind: str
     """Name of the algorithm."""
     time_step: Annotated[float | Literal["auto"], OrWord(quantity("s", gt=0.0), "auto")]
     """Length of a step [s]; with "auto" each step has a length of its own, chosen before it."""
     courant: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Of a time step that is chosen, the Courant number: how far the fastest particle moves in a step at most, in
+    """The Courant number of a time step that is chosen: how far the fastest particle moves in a step at most, in
     smoothing lengths, of which the support radius has two; 0.2 if left out."""
     greatest_time_step: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """A time step that is chosen is no longer [s]; needed where nothing else bounds it, without gravity."""
+    """Upper bound of a time step that is chosen [s]; needed where nothing else bounds it, without gravity."""
 
     @model_validator(mode="before")
     @classmethod
     def _refuse_keys_of_others(cls, data: Any) -> Any:
-        """Raises a `field_error` for a key that another solver of Cortado's own has."""
+        """Raise a `field_error` for a key that another solver of Cortado's own has."""
         own = (ProjectionSolver, PcisphSolver)
         for other in own if cls in own and isinstance(data, Mapping) else ():
             for name in [name for name in data if name in other.model_fields and name not in cls.model_fields]:
@@ -54,18 +54,18 @@ class SolverTable(Table):
 
     @property
     def chooses(self) -> bool:
-        """True where the time step is chosen before each step."""
+        """Return True where the time step is chosen before each step."""
         return self.time_step == "auto"
 
     def fixed_time_step(self, what: str) -> float:
-        """Length of a step [s]; raises `InputError` where it is chosen, as ``what`` needs a fixed one."""
+        """Return the length of a step [s]; raise `InputError` where it is chosen, as ``what`` needs a fixed one."""
         if self.time_step == "auto":
             raise InputError(f'solver.time_step is "auto", but must be a number of seconds for {what}.')
         return self.time_step
 
 
 class ProjectionSolver(SolverTable):
-    """How a step is solved by a projection of velocities, which pulls where fluid is on all sides."""
+    """A solver by a projection of velocities, which pulls where fluid is on all sides."""
 
     kind: Literal["projection"] = "projection"
     """Name of the algorithm."""
@@ -100,7 +100,7 @@ class ProjectionSolver(SolverTable):
 
 
 class PcisphSolver(SolverTable):
-    """How a step is solved by PCISPH."""
+    """A solver by PCISPH, predictive-corrective incompressible SPH."""
 
     kind: Literal["pcisph"]
     """Name of the algorithm."""
@@ -122,7 +122,7 @@ class PcisphSolver(SolverTable):
 
 
 class PackageSolver(SolverTable, PackageTable):
-    """How a step is solved by a solver that an installed package registers."""
+    """A solver that an installed package registers."""
 
     group = "cortado.solvers"
     method = "build"
@@ -133,7 +133,7 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """The entries of other tables that suit a solver, or a table that will be one, where none of their keys is
+    """Return the entries of other tables that suit a solver, or a table that will be one, where none of their keys is
     given."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
@@ -143,7 +143,7 @@ def what_suits(solver: Any, container: Any) -> Suits:
 
 
 def _table_of(solver: Any) -> str:
-    """Which table a solver is, by its kind."""
+    """Return the name of a solver's table class, by its kind."""
     kind = solver.get("kind", OWN[0]) if isinstance(solver, Mapping) else getattr(solver, "kind", OWN[0])
     if kind == "pcisph":
         return "PcisphSolver"

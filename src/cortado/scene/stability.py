@@ -17,17 +17,17 @@ from cortado.scene.solvers import ProjectionSolver
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
-    """The most energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls through the whole room."""
+    """Return the most energy per mass [J/kg] of gravity (k, d) [m/s2] for fluid which falls through the whole room."""
     lower, upper = _extent(scene)
     return float((np.abs(gravity) @ (upper - lower)).max())
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """The most energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls to the foot of a solid. It
-    falls from where fluid, or a free body, is highest at the start or comes out; ``values`` of parameters replace the
-    scene's. That of the `greatest_fall` where something else raises fluid or takes the solid down: where gravity
-    changes or goes around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What values
-    say of each step of a path is not looked at."""
+    """Return the most energy per mass [J/kg] that gravity (k, d) [m/s2] gives to fluid which falls to the foot of a
+    solid. It falls from where fluid, or a free body, is highest at the start or comes out; ``values`` of parameters
+    replace the scene's. That of the `greatest_fall` where something else raises fluid or takes the solid down: where
+    gravity changes or goes around a period, the solid is free, solids go along paths, convey, or begin elsewhere. What
+    values say of each step of a path is not looked at."""
     whole = greatest_fall(scene, gravity)
     around = scene.container.periods(scene.dimension)[1] > 0.0
     stirred = greatest_speed(told(scene.solid), values) > 0.0 or any(one.surface_velocity for one in scene.solid)
@@ -41,7 +41,7 @@ def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arra
 
 
 def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
-    """The boxes around each body of fluid, each free body and the outlet: lower and upper, each (d,) [m]."""
+    """Return the boxes around each body of fluid, each free body and the outlet: lower and upper, each (d,) [m]."""
     spacing = scene.discretisation.spacing
     places = values.get("initial_positions")
     extents = [fluid.extent(spacing) for fluid in scene.fluid]
@@ -56,7 +56,7 @@ def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
 
 
 def _extent(scene: SceneTables) -> tuple[Points, Points]:
-    """The box through which fluid may fall: lower and upper, each (d,) [m]."""
+    """Return the box through which fluid may fall: lower and upper, each (d,) [m]."""
     lower, upper = _room(scene)
     if scene.emitter is None:
         return lower, upper
@@ -64,8 +64,8 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """The box around the container, or around the fluids and the solids, which fluid falls along, if there is none, or
-    around the outlet if there is only the emitter: lower and upper, each (d,) [m]."""
+    """Return the box of the container: lower and upper, each (d,) [m]. Without one it is the box around the fluids and
+    the solids, which fluid falls along, or around the outlet if there is only the emitter."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
@@ -80,9 +80,9 @@ def _room(scene: SceneTables) -> tuple[Points, Points]:
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
-"""By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
-step is taken. The rest is for fluid off the lattice and beside walls: with drops, jets that meet and dams, in the plane
-and in space, with every kernel, those steps held, and one a quarter to a half longer did not."""
+"""By the form of the viscous force, a function of its greatest rate on a lattice, and the part of a lattice's longest
+step that is taken. The rest is for fluid off the lattice and beside walls. With drops, jets that meet and dams, in the
+plane and in space, with every kernel, those steps held, and one a quarter to a half longer did not."""
 
 
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
@@ -113,7 +113,7 @@ with walls 1.25 to 2 spacings thick those of 0.4 to 0.65 of their thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """The bounds of the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
+    """Return the bounds [s] of the time steps of a scene that chooses them, whatever the speed of the fluid, by name:
     the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself
     (`gravity_limits`), so that here the scene's counts, or the weakest of a schedule, whose others bound the steps in
     which they act. So do paths of solids. Where nothing else bounds the steps, the strongest gravity and the fastest
@@ -129,25 +129,26 @@ def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str,
 
 
 def longest_step(scene: SceneTables) -> float:
-    """The time step [s]; in a scene that chooses it, what it is at most."""
+    """Return the time step [s]; in a scene that chooses it, its upper bound."""
     size = scene.solver.time_step
     return min(chosen_limits(scene).values()) if size == "auto" else size
 
 
 def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[str, float] | None:
-    """The smallest of the `stability_limits`, what it is of and the limit [s], if a time step is beyond it."""
+    """Return the smallest of the `stability_limits` that a time step is beyond, by name [s]; None if there is none."""
     return next(iter(broken_limits(scene, values, time_step)), None)
 
 
 def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
-    """The `stability_limits` that a time step is beyond, the smallest first: what each is of, and the limit [s]."""
+    """Return the `stability_limits` that a time step is beyond, smallest first: each with its name and the limit
+    [s]."""
     limits = sorted(stability_limits(scene, values).items(), key=lambda item: item[1])
     return [(name, limit) for name, limit in limits if time_step > limit * (1.0 + 1e-9)]
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """The advice where a run diverged with parameters that replace the scene's: with the limit that its time step [s]
-    breaks, if any. A time step that is chosen breaks none."""
+    """Return the advice for a run that diverged with parameters that replace the scene's: with the limit that its time
+    step [s] breaks, if any. A time step that is chosen breaks none."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limit(scene, values, time_step)
@@ -158,8 +159,7 @@ def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> s
 
 
 def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Several limits of the time step by what they are of [s], infinite where nothing is limited; h is the support
-    radius.
+    """Return several limits of the time step [s] by name, infinite where nothing is limited; h is the support radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of fluid and solids if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its
@@ -193,7 +193,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
-    """The `stability_limits` [s] that do not depend on how fast the fluid is, with the speed of some of its solids."""
+    """Return the `stability_limits` [s] that do not depend on the fluid's speed, for the speed of some solids."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
@@ -202,7 +202,7 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
 
 
 def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
-    """The `stability_limits` (k,) [s] that gravity (k, d) [m/s2] sets, each of its rows for itself."""
+    """Return the `stability_limits` (k,) [s] that gravity (k, d) [m/s2] sets, each of its rows for itself."""
     strength = np.linalg.norm(gravity, axis=1)
     with np.errstate(divide="ignore"):
         force = 0.25 * np.sqrt(scene.discretisation.support_radius / strength)
@@ -210,7 +210,7 @@ def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
 
 
 def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
-    """The `standing_limits` [s] without that of viscosity."""
+    """Return the `standing_limits` [s] without that of viscosity."""
     gravity = np.atleast_2d(values.get("gravity", _gravity(scene)))
     of_gravity = {name: float(limits.min()) for name, limits in gravity_limits(scene, gravity).items()}
     optional = {
@@ -222,8 +222,8 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """True where the viscous force is a stress that acts as velocities are at the end of a step, in a scene in which
-    these ``values`` of parameters replace its own."""
+    """Test whether the viscous force is a stress of the velocities at the end of a step, in a scene in which these
+    ``values`` of parameters replace its own."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
@@ -235,7 +235,7 @@ def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
 
 
 def _gravity(scene: SceneTables) -> Points:
-    """(d,) or (k, d) [m/s2] of the scene, at the times of its schedule if that changes it."""
+    """Return gravity (d,) or (k, d) [m/s2] of the scene, at the times of its schedule if that changes it."""
     courses = scene.schedule.courses
     if "tilt" in courses:
         return Tilt(scene.forces.gravity).gravity(np.array(courses["tilt"].values))
@@ -243,7 +243,7 @@ def _gravity(scene: SceneTables) -> Points:
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    """The largest speed with which fluid starts or comes out of the emitter [m/s]."""
+    """Return the largest speed with which fluid starts or comes out of the emitter [m/s]."""
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
@@ -256,7 +256,7 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
 
 
 def viscous_limit(scene: SceneTables, values: Arrays) -> float:
-    """The longest step at which viscosity is likely to be stable where it is explicit [s]."""
+    """Return the longest step at which viscosity is likely to be stable where it is explicit [s]."""
     if scene.forces.viscosity == "none":
         return inf
     names = {fluid.phase for fluid in scene.fluid} | ({scene.emitter.phase} if scene.emitter else set())
@@ -274,7 +274,7 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
 
 
 def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
-    """The longest step [s] of fluid, of a first speed [m/s], beside its solids; infinite beside those alone that it is
+    """Return the longest step [s] of fluid, of a first speed [m/s], beside its solids; infinite beside those that it is
     inside of, or does not come to."""
     spacing, found = scene.discretisation.spacing, [inf]
     for solid in scene.solid:
@@ -285,7 +285,7 @@ def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Ar
 
 
 def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
-    """(k,) [s] of gravity (k, d) [m/s2], infinite where it is 0."""
+    """Return the limits (k,) [s] by the depth of the fluid for gravity (k, d) [m/s2], infinite where it is 0."""
     limits = np.full(len(gravity), inf)
     acts = gravity.any(axis=1)
     if not scene.forces.pressure or not acts.any() or not scene.fluid:
@@ -305,7 +305,7 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
 
 
 def _covers_floor(scene: SceneTables, upright: Points) -> Points:
-    """(k,) whether the fluid is as wide as its container, to a spacing, along all axes but one, ``upright`` (k,)."""
+    """Return a mask (k,): fluid is as wide as the container, to a spacing, along all axes but one, ``upright`` (k,)."""
     ends = scene.container.extent()
     if ends is None:
         return np.zeros(len(upright), dtype=bool)
@@ -314,14 +314,14 @@ def _covers_floor(scene: SceneTables, upright: Points) -> Points:
 
 
 def fluid_lengths(scene: SceneTables) -> Points:
-    """(d,) [m] along each axis, of the fluid at the start, without what is empty between bodies; there is some."""
+    """Return the lengths (d,) [m] of the fluid along each axis at the start, without empty parts between bodies."""
     spacing = scene.discretisation.spacing
     extents = np.array([fluid.extent(spacing) for fluid in scene.fluid])
     return np.array([_covered(extents[:, :, axis], spacing) for axis in range(scene.dimension)])
 
 
 def _covered(ends: Points, spacing: float) -> float:
-    """The length [m] that is covered by particles between pairs of ends (m, 2) [m] along an axis."""
+    """Return the length [m] that is covered by particles between pairs of ends (m, 2) [m] along an axis."""
     total, reached = 0.0, -inf
     for lower, upper in ends[np.argsort(ends[:, 0])]:
         lower, upper = lower - 0.5 * spacing, upper + 0.5 * spacing

@@ -57,30 +57,30 @@ class FieldError:
 
 
 def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """The exception that a check raises; the path (names and indices) starts at the model that is being checked."""
+    """Make the exception that a check raises; the path (names and indices) starts at the model that is checked."""
     return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
-    """A finite number with a unit; "-" is a plain number."""
+    """Describe a field with a finite number in a unit; "-" is a plain number."""
     least = ge if gt is None else max(ge, 1.0 / GREATEST)
     return Field(strict=True, allow_inf_nan=False, gt=gt, ge=least, le=le, json_schema_extra={"unit": unit})
 
 
 def count(least: int, most: int) -> Any:
-    """A whole number."""
+    """Describe a field with a whole number between two ends."""
     return Field(strict=True, ge=least, le=most)
 
 
 def components(*names: str) -> Any:
-    """A list of components that each have a name, as many in 2-D as in 3-D: a colour."""
+    """Describe a field with a list of named components, as many in 2-D as in 3-D: a colour."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """One of the names of a registry."""
+    """A mark of a field that is one of the names of a registry."""
 
     names: Collection[str]
 
@@ -90,10 +90,10 @@ class OneOf:
 
 @dataclass(frozen=True)
 class OrWord:
-    """A number, or a word that says how it is found."""
+    """A mark of a field that is a number, or a word that says how it is found."""
 
     number: Any
-    """Of `quantity`."""
+    """The number's `quantity`."""
     word: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -124,7 +124,7 @@ Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], compo
 
 
 def without_numpy(value: Any) -> Any:
-    """The value with arrays and numbers of NumPy, also those in a list, as lists and numbers of Python."""
+    """Return a value with NumPy's arrays and numbers, also those in a list, as lists and numbers of Python."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
@@ -146,14 +146,14 @@ Turning = Annotated[
 
 
 def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
-    """A rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
+    """Check that a rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
     if value is not None and len(value) != 2 * dimension - 3:
         wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
         raise field_error(path, value, wanted)
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
-    """(d, d) of a rotation vector [rad], or in 2-D of an angle."""
+    """Return the matrix (d, d) of a rotation vector [rad], or in 2-D of an angle."""
     from scipy.spatial.transform import Rotation as Turn
 
     if len(rotation) == 1:
@@ -162,7 +162,7 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """The docstrings of fields by name, those of parents included; none of a class without a source."""
+    """Return the docstrings of fields by name, those of parents included; none of a class without a source."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
         found |= _of_module(one.__module__).get(one.__qualname__, {})
@@ -171,7 +171,7 @@ def field_docstrings(cls: type) -> dict[str, str]:
 
 @cache
 def _of_module(name: str) -> dict[str, dict[str, str]]:
-    """The docstrings of all classes of a module that are in no other class or function."""
+    """Return the docstrings of fields of all classes of a module that are in no other class or function."""
     try:
         source = inspect.getsource(modules[name])
     except (KeyError, OSError, TypeError):
@@ -190,7 +190,7 @@ def _in_body(node: ast.ClassDef) -> dict[str, str]:
 
 Schema = Mapping[str, Any]
 MOST_HOMES = 2
-"""Tables that have a key, up to which a sentence names them where the key stands in another table."""
+"""Most tables that have a key and are named in a sentence where the key stands in another table."""
 UNKNOWN = Words("unknown")
 """What was found of a key that its table does not have."""
 
@@ -205,7 +205,7 @@ def sentences(model: type[BaseModel]) -> Iterator[None]:
 
 
 def field_name(path: FieldPath) -> str:
-    """``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
+    """Write a path such as ``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -242,8 +242,8 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    """Where the key at the end of a path stands in other tables of a JSON schema, as ``forces.gravity``; nothing if it
-    stands in none or in many of them."""
+    """Return where else the key at the end of a path stands in a JSON schema, as ``forces.gravity``; nothing if it is
+    in no other table or in many."""
     key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
     found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
     words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
@@ -251,7 +251,7 @@ def _homes(whole: Schema, path: FieldPath) -> list[str]:
 
 
 def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
-    """The paths of all keys in a part of a JSON schema that is at a path itself: through lists and unions, too."""
+    """Yield the paths of all keys in a part of a JSON schema, itself at a path: through lists and unions, too."""
     if "$ref" in part:
         part = whole["$defs"][part["$ref"].rpartition("/")[2]]
     for name, field in part.get("properties", {}).items():
@@ -263,14 +263,14 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
 
 
 def _is_out_of_size(number: float, schema: Schema) -> bool:
-    """True for a number that is too large or, above 0, too small for any quantity."""
+    """Test whether a number is too large or, above 0, too small for any quantity."""
     tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
     return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """The part of a JSON schema that a location of pydantic's leads to, and the path to it. A location names the member
-    of a union too; a path does not."""
+    """Return the part of a JSON schema that a location of pydantic's leads to, and the path to it. A location names the
+    member of a union too; a path does not."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -291,12 +291,12 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
 
 
 def _whole(part: Schema) -> Schema:
-    """A table that stands where it is used, and not among those that have a name."""
+    """Return the schema of a table that stands where it is used, and not among those that have a name."""
     return part["allOf"][0] if "allOf" in part else part
 
 
 def wanted(schema: Schema, name: str = "") -> str:
-    """The words for what a value must be, from its part of a JSON schema; ``name`` is that of its field."""
+    """Describe a right value in words, from its part of a JSON schema; ``name`` is that of its field."""
     match schema:
         case {"enum": names}:
             return _any_of(names)
@@ -334,7 +334,7 @@ def _any_of(names: Iterable[str]) -> str:
 
 
 def _limits(schema: Schema) -> str:
-    """The words for what a number must be."""
+    """Describe the range of a number in words."""
     unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
     least, most = schema["minimum"], schema["maximum"]
     limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
@@ -361,7 +361,7 @@ ALSO_CALLED = {
     **{"type": ("kind", "shape"), "n": ("flow_index",), "cfl": ("courant",), "omega": ("angular_velocity",)},
     **{"angle": ("rotation",), "csv": ("file",), "path": ("file",), "fps": ("frame_rate",)},
 }
-"""Keys by what others call them."""
+"""Keys by the names that users of other programs have for them."""
 
 
 class Table(BaseModel):
@@ -396,7 +396,7 @@ class Table(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """With the docstrings of fields as their descriptions."""
+        """Return the JSON schema with the docstrings of fields as their descriptions."""
         schema = handler(core_schema)
         properties = handler.resolve_ref_schema(schema).get("properties", {})
         texts = field_docstrings(cls)
@@ -405,7 +405,7 @@ class Table(BaseModel):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """This table, at a path, with its vectors checked, and those left out filled in, for 2 or 3 dimensions."""
+        """Return this table, at a path, with vectors checked, and left-out ones filled in, for 2 or 3 dimensions."""
         filled = {}
         for name, field in type(self).model_fields.items():
             if PER_AXIS in field.metadata:
@@ -416,8 +416,7 @@ class Table(BaseModel):
         return self.model_copy(update=filled)
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raises a `field_error` for a field of these names whose components are not as many as there are
-        dimensions."""
+        """Raise a `field_error` for a field of these names that has not one component for each dimension."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
@@ -425,7 +424,7 @@ class Table(BaseModel):
 
 
 def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCustomError:
-    """The error of a vector that has another number of components than there are dimensions."""
+    """Make the error of a vector that has another number of components than there are dimensions."""
     wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
     return field_error(path, value, wanted)
 

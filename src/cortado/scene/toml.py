@@ -13,16 +13,16 @@ from cortado.errors import LONGEST, InputError, SceneError, Words, shown
 from cortado.files.disk import SCHEMA, as_path, content, reason
 
 MOST_BYTES = 1_000_000
-"""Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
+"""Most bytes of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
 MOST_PARTS = 10
-"""Of a dotted key: the time and the memory that one takes grow with the square of their number."""
+"""Most parts of a dotted key: the time and the memory that one takes grow with the square of their number."""
 
 _ASIDE = re.compile(
     r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
     r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
     re.DOTALL,
 )
-"""Comments and quoted texts, unfinished ones too."""
+"""Finds comments and quoted texts, unfinished ones too."""
 _TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
 _TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
@@ -31,8 +31,8 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(
     path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """The contents of a TOML file with overrides put in, none of them of the tables that stay ``unread``. Raises
-    `SceneError`.
+    """Read a TOML file and return its contents with overrides put in, none of them of the tables that stay ``unread``.
+    Raises `SceneError`.
 
     An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``;
     an entry with a name may be called by it, ``phase.oil.viscosity=0.1``.
@@ -58,7 +58,7 @@ def read_toml(
 
 
 def overrides_of(overrides: Sequence[str], tables: Sequence[str]) -> list[str]:
-    """The overrides, among some, that replace something in tables."""
+    """Return the overrides, among some, that replace something in tables."""
     return [one for one in overrides if isinstance(one, str) and _table_of(one) in tables]
 
 
@@ -67,7 +67,7 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """The scene file in the same folder that is called nearly as one that is not there."""
+    """Return the scene file in the same folder whose name is nearly that of one that is not there."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
@@ -78,7 +78,7 @@ def _beside(file: str) -> str | None:
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
-    """The contents of a file with overrides put in, none of them of the tables that stay ``unread``. Raises
+    """Put overrides into the contents of a file, none of them of the tables that stay ``unread``; raise
     `SceneError`."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
@@ -101,7 +101,7 @@ def _unreadable(file: str, sentence: str) -> SceneError:
 
 
 def _require_shallow(text: str, file: str) -> None:
-    """Raises `SceneError` for a key of very many parts, wherever it stands, before anything is made of it."""
+    """Raise `SceneError` for a key of very many parts, wherever it stands, before anything is made of it."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
     deep = _TOO_DEEP.search(plain)
     if deep:
@@ -113,7 +113,7 @@ def _too_deep(file: str, key: str) -> SceneError:
 
 
 def _apply(data: dict[str, Any], override: str, file: str) -> None:
-    """Put one override in."""
+    """Put one override into the contents of a file."""
     if len(override) > MOST_BYTES:
         sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
         raise SceneError(file, shown(override), sentence=sentence)
@@ -149,14 +149,14 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
 
 
 def _entry(tables: list[Any], part: str) -> int | None:
-    """Where an entry is in a list, given its index or its name; None if there is none."""
+    """Return the index of an entry in a list, given its index or its name; None if there is none."""
     if part.isdecimal():
         return int(part) if len(part) <= 9 and int(part) < len(tables) else None
     return next((k for k, table in enumerate(tables) if part in _names([table])), None)
 
 
 def _entries(tables: list[Any]) -> str:
-    """The words that say how entries of a list are addressed."""
+    """Say in words how entries of a list are addressed."""
     if not tables:
         return "left out, as the list is empty"
     names = _names(tables)
@@ -165,13 +165,13 @@ def _entries(tables: list[Any]) -> str:
 
 
 def _names(tables: list[Any]) -> list[str]:
-    """The names of entries that have one, or the kinds of forces that have no other name."""
+    """Return the names of entries that have one, or the kinds of forces that have no other name."""
     found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
     return [str(name) for name in found if name is not None]
 
 
 def _value(text: str) -> Any:
-    """A TOML value, or the text itself."""
+    """Parse a text as a TOML value, or return the text itself."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):
@@ -183,8 +183,8 @@ JsonSchema = dict[str, Any]
 
 
 def unit_of(key: str) -> str:
-    """The unit of the value of a scene that has a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where it
-    has none, or where shapes of a body have different ones."""
+    """Return the unit of the value of a scene with a dotted key, such as "Pa s" of ``phase.0.viscosity``; nothing where
+    it has none, or where shapes of a body have different ones."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         found = [choice for one in found for choice in _choices(_part(one, part))]
@@ -194,19 +194,19 @@ def unit_of(key: str) -> str:
 
 @cache
 def _schema() -> JsonSchema:
-    """The shipped one, which `Scene` is compared with in the tests."""
+    """Read the shipped JSON schema, which `Scene` is compared with in the tests."""
     read: JsonSchema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     return read
 
 
 def _part(schema: JsonSchema, part: str) -> JsonSchema:
-    """The schema of an entry of a list, by its number, or of a table."""
+    """Return the schema of an entry of a list, by its number, or of a table's field."""
     found: JsonSchema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
     return found
 
 
 def _choices(schema: JsonSchema) -> Iterator[JsonSchema]:
-    """A schema, and those of which it has one or all."""
+    """Yield a schema, and those of which it has one or all."""
     yield schema
     if "$ref" in schema:
         yield from _choices(_schema()["$defs"][schema["$ref"].rpartition("/")[2]])

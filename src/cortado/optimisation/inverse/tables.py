@@ -137,11 +137,11 @@ class MeasuredTable(Table):
     """Something that was measured."""
 
     name: Text
-    """What it is called in results; its camera's parameters begin with it, as "camera.rotation"."""
+    """Its name in results; its camera's parameters begin with it, as "camera.rotation"."""
     file: Text
-    """Beside the task's own file: where the numbers are."""
+    """File with the numbers, beside the task's own file."""
     start: Seconds = 0.0
-    """What the clock of the run shows where that of the file shows 0."""
+    """Time on the clock of the run where that of the file shows 0."""
 
 
 class VideoTable(MeasuredTable):
