@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice
 
 Work = Callable[[], str]
-"""What a command does once its arguments are understood; returns what it prints."""
+"""The work of a command once its arguments are understood; returns the text that it prints."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Task = Annotated[Positional[Path], arg(metavar="TASK.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -38,12 +38,12 @@ Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="
 Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 STEPS = 200
-"""Of a run that is not said to be longer or shorter."""
+"""Steps of a run whose length is not given."""
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Makes a function a command of a group, with an option --quiet. What it prints at the end is either what was asked
-    for, as it ``answers``, or a line about the files that it wrote."""
+    """Return a decorator that makes a function a command of a group, with an option --quiet. At its end a command
+    prints its answer, if it ``answers``, or a line about the files that it wrote."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -70,22 +70,22 @@ def _quiet(work: Work, answers: bool) -> str:
 
 @dataclass(frozen=True)
 class Program:
-    """A group of commands, and what one types to run it."""
+    """A group of commands, with the name by which one runs it."""
 
     name: str
     app: SubcommandApp
     description: str
     overview: Callable[[], str] | None = None
-    """What it prints without arguments, if not its help."""
+    """Returns the text that it prints without arguments, if not its help."""
 
     def parsed(self, arguments: Sequence[str]) -> Any:
-        """What the command returns that the arguments name; prints help and exits where they ask for it, or where they
-        are misused."""
+        """Return the work of the command that the arguments name; print help and exit where they ask for it or are
+        misused."""
         config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """The script for a shell, as tyro prints it and exits; bash completes names of files where nothing else
+        """Return the completion script for a shell, as tyro prints it; bash completes names of files where nothing else
         fits."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
@@ -95,7 +95,7 @@ class Program:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Which states of a run are frames of its trajectory."""
+    """The options that choose which states of a run are frames of its trajectory."""
 
     record_every: int | None = None
     """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""
@@ -103,13 +103,13 @@ class FrameOptions:
     """Frames of the trajectory in a second that is simulated, not of a film; in the place of --record-every."""
 
     def check(self) -> None:
-        """Raises `InputError` for --record-every that is too small, and where --fps is given besides."""
+        """Raise `InputError` for --record-every that is too small, and where --fps is given besides."""
         if self.fps is not None and self.record_every is not None:
             raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
-        """Those of options that were checked: every so many steps if nothing is said."""
+        """Return the choice of frames by checked options: every ``otherwise`` steps if none is given."""
         from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
@@ -119,20 +119,19 @@ ALL_FRAMES = FrameOptions()
 
 
 def require_at_least(least: int, value: int, option: str) -> None:
-    """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
+    """Raise `InputError` for a value that is smaller, with the option's name in the sentence."""
     if value < least:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
 
 
 def require_one_of_both(resume: bool, overwrite: bool) -> None:
-    """Raises `InputError` where a command is to go on with a run and to replace it."""
+    """Raise `InputError` where a command is to go on with a run and to replace it."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """The number of steps, `STEPS` if neither was given; None with a time [s]. Raises `InputError` for both, and for a
-    time that is none."""
+    """Return the number of steps, `STEPS` if neither was given; None with a time [s]. Raise `InputError` for both."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -143,15 +142,15 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """What was given to --set for a file, as `as_text`. Raises `SceneError` for a file that cannot be read, or for
-    overrides of what it has not: at once, as what a command imports after that takes a second."""
+    """Return the overrides of --set for a file as text. Raise `SceneError` for a file that cannot be read, or for
+    overrides of keys that it has not: at once, as the imports of a command after that take a second."""
     words = as_text(overrides)
     read_toml(file, words)
     return words
 
 
 def as_text(options: Sequence[str]) -> list[str]:
-    """What was given to --set or --only; raises `InputError` for bytes that are no text."""
+    """Return the values of --set or --only; raise `InputError` for bytes that are no text."""
     for option in options:
         try:
             option.encode()
@@ -161,5 +160,5 @@ def as_text(options: Sequence[str]) -> list[str]:
 
 
 def command_line() -> list[str]:
-    """The command as it was typed, which a run writes into its folder."""
+    """Return the command as it was typed, which a run writes into its folder."""
     return ["cortado", *sys.argv[1:]]

@@ -28,7 +28,7 @@ BROKEN_PIPE = 141
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> None:
-    """Run a command of a program; exits with its code unless that is 0."""
+    """Run a command of a program; exit with its code unless that is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user has chosen for windows
     try:
@@ -60,7 +60,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
 
 
 def _understood(program: Program, arguments: Sequence[str]) -> Work:
-    """The command that the arguments name; prints help or the version and exits where they ask for it."""
+    """Return the work of the command that the arguments name; print help or the version and exit where they ask for
+    it."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
@@ -125,11 +126,11 @@ MOVED = {
     "gradients figure": "python -m experiments figure",
     "gradients study": "python -m experiments study",
 }
-"""Commands of before, and what one types in a clone of the repository in their place."""
+"""Commands of before, and their replacements in a clone of the repository."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
-    """What tyro says in its box about the arguments of a program, as a sentence of ours."""
+    """Turn tyro's complaint in its box about the arguments of a program into a sentence of ours."""
     words = " ".join(arguments)
     for before, now in MOVED.items():
         if program == "cortado" and f"{words} ".startswith(f"{before} "):
@@ -151,7 +152,8 @@ _THREADS = ("can't start new thread",)
 
 
 def shortage(error: BaseException) -> str | None:
-    """A sentence for an error that came of a shortage, directly or as the cause of another; None for any other."""
+    """Return a sentence for an error that came of a shortage, directly or as the cause of another; None for any
+    other."""
     for cause in _causes(error):
         if isinstance(cause, MemoryError) or _says(cause, _MEMORY):
             what = f" ({cause})" if str(cause) else ""
@@ -164,7 +166,7 @@ def shortage(error: BaseException) -> str | None:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """The error, what it came of, what that came of, and so on."""
+    """Yield the error, its cause, the cause of that, and so on."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

@@ -213,7 +213,7 @@ def view(
 
 
 def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
-    """Raises `InputError` where --set replaces one of some keys of [picture]."""
+    """Raise `InputError` where --set replaces one of some keys of [picture]."""
     for override in overrides:
         name = override.partition("=")[0].strip()
         if name.removeprefix("picture.") in keys:

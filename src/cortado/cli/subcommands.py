@@ -295,7 +295,7 @@ COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
 
 
 def overview() -> str:
-    """What one can do, each with an example: what ``cortado`` alone prints."""
+    """Return the text that ``cortado`` alone prints: what one can do, each with an example."""
     lines = [f"Cortado {__version__}, a differentiable SPH fluid simulator."]
     for title, entries in _GROUPS.items():
         lines += ["", f"{title}:"]

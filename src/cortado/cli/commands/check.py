@@ -28,7 +28,7 @@ def check_scene(
     as_json: bool,
     seed: int,
 ) -> str:
-    """The certificate as text; raises `ComputationError` when an adjoint is wrong."""
+    """Compute the certificate of a scene's gradients as text; raise `ComputationError` when an adjoint is wrong."""
     if loss not in LOSSES:
         raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
@@ -48,7 +48,7 @@ def check_scene(
 
 
 def _loss(name: str, simulation: Simulation) -> Loss:
-    """How far the fluid has come from where it starts."""
+    """Make the loss of a name: how far the fluid has come from where it starts."""
     if name == "positions":
         return FinalPositions(simulation.positions)
     if name == "centre-of-mass":

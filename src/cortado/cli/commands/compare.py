@@ -24,21 +24,21 @@ from cortado.runs.trajectory import Trajectory
 IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
 """Keys of environment.json that differ between any two runs, or are compared apart."""
 SAME_TIME = 1e-9
-"""Relative: times that differ by less are the same, as so many steps of another length add up to."""
+"""Relative difference below which times are equal, as sums of steps of other lengths are."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
-"""Of the fields of a frame."""
+"""Units of the fields of a frame."""
 
 
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST_RUNS = 3
-"""Runs that an order takes."""
+"""Fewest runs that an order of convergence takes."""
 SAME_MASS = 0.005
-"""Relative: masses of fluid that differ by less are the same."""
+"""Relative difference below which masses of fluid are equal."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
-    """What is the same and what differs, as text or as JSON. Two runs that differ are no failure."""
+    """Tell what is equal and what differs in two runs, as text or as JSON. Two runs that differ are no failure."""
     found = _compared(RunFolder.open(first), RunFolder.open(second))
     return json.dumps(found, indent=2) if as_json else _in_words(found)
 
@@ -63,7 +63,7 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _is_equal(found: Mapping[str, Any]) -> bool:
-    """Whether nothing differs but where the runs were made."""
+    """Test whether two runs differ in nothing but where they were made."""
     state = found["last_state"]
     same_state = state is None or (
         "unlike" not in state
@@ -79,8 +79,7 @@ def _table(value: Any) -> dict[str, Any]:
 
 
 def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """What to say of the metrics of two runs, of which line k is at another time in each; empty where it is at the
-    same."""
+    """Return the note on metrics of two runs whose line k is at another time in each; empty for equal times."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
     same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
     if same or any(table["kind"] != "run" for table in settings):
@@ -90,7 +89,7 @@ def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -
 
 
 def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    """The first line that differs, and of every number the greatest difference over the lines that both have."""
+    """Return the first line of metrics that differs, and every number's greatest difference over the lines of both."""
     rows, others = one.read_metrics(), other.read_metrics()
     found: dict[str, Any] = {} if len(rows) == len(others) else {"lines": [len(rows), len(others)]}
     differ = [k for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
@@ -107,8 +106,8 @@ def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """How far apart positions and velocities are, of the last frames that are at the same time; None where a run has no
-    trajectory. ``times_s``: of the last frames."""
+    """Return the distances of positions and velocities in the last frames that are at one time, and their ``times_s``;
+    None where a run has no trajectory."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -139,13 +138,13 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
 
 
 def _at_one_time(one: Any, other: Any) -> Any:
-    """Whether times [s] are the same but for round-off; of arrays element by element."""
+    """Test whether times [s] are equal but for round-off; of arrays element by element."""
     return np.isclose(one, other, rtol=SAME_TIME, atol=0.0)
 
 
 def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | None:
-    """The last frame of each run, given their times (frames,) [s], that is at the time of one of the other run; the
-    first frame, from which both began, does not count."""
+    """Return the last frame of each run, given their times (frames,) [s], at a time that both have; the first frame,
+    from which both began, does not count."""
     if len(one) < 2 or len(other) < 2:
         return None
     after = np.clip(np.searchsorted(other, one), 1, len(other) - 1)
@@ -155,7 +154,7 @@ def _last_at_one_time(one: np.ndarray, other: np.ndarray) -> tuple[int, int] | N
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> dict[str, Any]:
-    """Of vectors (n, d) of the same particles."""
+    """Return the distances of vectors (n, d) of the same particles: root mean square, greatest, and its particle."""
     apart = np.linalg.norm(one - other, axis=1)
     return {
         "root_mean_square": float(np.sqrt(np.mean(apart**2))),
@@ -214,7 +213,7 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
-    """The errors, as text or as JSON; the plot is written into the run's figures."""
+    """Compare a run's sensors with measured data as text or as JSON, and plot it into the run's figures."""
     folder = RunFolder.open(run)
     readings = folder.read_sensors()
     if not readings:
@@ -238,10 +237,10 @@ def _line(one: MeasuredColumn) -> str:
 
 
 class Resolved:
-    """One of the runs."""
+    """One run of a study of convergence, with its size and its numbers."""
 
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
-        """With ``quantities`` of the user's own. Raises `InputError` for a run that has not ended well."""
+        """Read a run, with ``quantities`` of the user's own; raise `InputError` for a run that has not ended well."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but all of them must be.")
@@ -265,7 +264,7 @@ class Resolved:
         """The unit and the value of each, by name."""
 
     def size(self, key: str) -> float:
-        """The spacing [m] or the time step [s]; raises `InputError` for one that is chosen."""
+        """Return the spacing [m] or the time step [s]; raise `InputError` for one that is chosen."""
         table, name = key.split(".")
         value = self.scene[table][name]
         if not isinstance(value, float | int):
@@ -274,7 +273,7 @@ class Resolved:
 
 
 def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
-    """The table, as text or as JSON; raises `InputError` for runs that do not belong together."""
+    """Return the table of convergence, as text or as JSON; raise `InputError` for runs that do not belong together."""
     own = [OwnQuantity(one) for one in quantities]
     runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
@@ -312,7 +311,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _warn_of_masses(runs: Sequence[Resolved]) -> None:
-    """Say where runs have unlike amounts of fluid, which no order of convergence is about."""
+    """Warn where runs have unlike amounts of fluid, which no order of convergence is about."""
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
     if most.mass > (1.0 + SAME_MASS) * least.mass:
         warn(
@@ -323,7 +322,7 @@ def _warn_of_masses(runs: Sequence[Resolved]) -> None:
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """What tells the runs apart: the spacing, or else the time step. Raises `InputError` where more does."""
+    """Return the key in which runs differ: spacing, or time step. Raise `InputError` where they differ in more."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -337,7 +336,7 @@ def _varied(runs: Sequence[Resolved]) -> str:
 
 
 def _convergence_in_words(table: dict[str, Any]) -> str:
-    """A line for each number, the finest run on the right."""
+    """Write a line for each number of a table of convergence, the finest run on the right."""
     key = table["by"]
     lines = [["", *(f"run {k}" for k in range(1, len(table["runs"]) + 1)), "order", "limit", "error", ""]]
     sizes = (key, *(other for other in SIZE_UNITS if other != key and other in table))
@@ -361,6 +360,6 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
 
 
 def _aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """In columns, the first one to the left."""
+    """Align cells of lines in columns, the first one to the left."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]

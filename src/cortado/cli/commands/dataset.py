@@ -45,13 +45,13 @@ from cortado.version import __version__
 from cortado.words import counted
 
 ASKED = "dataset.json"
-"""What a data set is of, so that the same command goes on with it, and another one does not."""
+"""The file with the choices of a data set, by which the same command goes on with it, and another one does not."""
 MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True)
 class Member:
-    """How each run of a data set is computed: what a worker process is sent."""
+    """The computation of the runs of a data set, which a worker process is sent."""
 
     file: Path
     overrides: tuple[str, ...]
@@ -61,13 +61,13 @@ class Member:
     precision: str
 
     def scene(self, number: int) -> Scene:
-        """The scene of the run."""
+        """Return the scene of the run of a number."""
         return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
             steps=self.table.steps
         )
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
-        """Compute a run and write it; returns whether there is one, and what it was warned of."""
+        """Compute a run and write it; return True if there is one, and its warnings."""
         if not (self.out / LOCK).exists():
             raise InputError(
                 f"A worker does not see {self.out}, but the scene and the folder of a data set must be in a file "
@@ -89,8 +89,8 @@ class Member:
 def make_dataset(
     file: Path, runs: int, out: Path, overrides: list[str], device: str, precision: str, where: Where
 ) -> str:
-    """Compute the runs that are not there yet, and put them together; returns a sentence that says where they are.
-    Raises `ComputationError` where the disk is full, and where a purpose is left without a run."""
+    """Compute the missing runs of a data set and put all together; return a sentence that says where they are. Raise
+    `ComputationError` where the disk is full, and where a purpose is left without a run."""
     table = _table(file, overrides)
     of_scene = [one for one in overrides if one not in overrides_of(overrides, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
@@ -136,7 +136,7 @@ def make_dataset(
 
 @contextmanager
 def _saying(kept: Callable[[], str]) -> Iterator[None]:
-    """A disk that refuses, and an interruption, are said together with what is ``kept``."""
+    """Add what is ``kept`` to the message of a disk that refuses, or of an interruption."""
     try:
         with keeping(kept):
             yield
@@ -145,7 +145,7 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _finished(parts: Parts, split: Mapping[str, range]) -> tuple[dict[str, list[int]], dict[int, Any], dict[int, str]]:
-    """The numbers of the runs that there are for each purpose, what is noted of each, and why others failed; raises
+    """Return the numbers of the finished runs for each purpose, the note on each, and why others failed; raise
     `ComputationError` where a purpose has none."""
     notes = {number: parts.note(number) or {} for own in split.values() for number in own}
     failures = {number: note["failure"] for number, note in notes.items() if "failure" in note}
@@ -158,7 +158,7 @@ def _finished(parts: Parts, split: Mapping[str, range]) -> tuple[dict[str, list[
 
 
 def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping[int, Any]) -> str:
-    """Write the files of the data set, of runs by purpose with what is noted of each; returns their sizes in words."""
+    """Write the files of the data set, from runs by purpose and their notes; return their sizes in words."""
     out = member.out
     assemble(out, there)
     with unwarned():
@@ -170,7 +170,7 @@ def _put_together(member: Member, there: Mapping[str, list[int]], notes: Mapping
 
 
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
-    """The table [dataset] of a file; raises `SceneError`."""
+    """Read the table [dataset] of a file; raise `SceneError`."""
     data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
         raise SceneError(str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one")
@@ -193,8 +193,8 @@ def _checked_runs(runs: int, table: DatasetTable) -> int:
 
 
 def _asked(member: Member, runs: int) -> dict[str, Any]:
-    """What is asked for; the first scene and those with the ends of all ranges are looked at, so that a mistake is
-    found before anything is computed. Raises `SceneError`."""
+    """Return the choices of a data set. The first scene and those with the ends of all ranges are read, so that a
+    mistake is found before anything is computed. Raise `SceneError`."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -213,7 +213,8 @@ def _asked(member: Member, runs: int) -> dict[str, Any]:
 
 
 def _are_one(member: Member, *overrides: list[str]) -> bool:
-    """Whether the scenes of a run with some overrides and with others compute the same; not where one is refused."""
+    """Test whether the scenes of a run with some overrides and with others compute the same; False where one is
+    refused."""
     try:
         scenes = [load_scene(member.file, [*member.overrides, *some]).computed_json() for some in overrides]
     except SceneError:
@@ -222,14 +223,14 @@ def _are_one(member: Member, *overrides: list[str]) -> bool:
 
 
 def _scene(member: Member) -> Scene:
-    """The scene of the file, whose warnings come with the runs."""
+    """Read the scene of the file, whose warnings come with the runs."""
     with unwarned():
         return load_scene(member.file, member.overrides)
 
 
 def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
-    """Whether the data set is there; notes what is asked for in a new folder, and raises `InputError` for a folder of
-    something else."""
+    """Test whether the data set is complete; note the choices in a new folder; raise `InputError` for another
+    folder."""
     note = out / ASKED
     if note.exists():
         if other := differences(read_json(note), json.loads(json.dumps(asked))):
@@ -250,13 +251,13 @@ def _is_complete(out: Path, asked: Mapping[str, Any]) -> bool:
 
 
 def _sizes(content: Mapping[str, Any]) -> str:
-    """How many runs there are for each purpose, and how long they are."""
+    """Write the number of runs for each purpose, and their length."""
     runs = ", ".join(f"{content[f'num_trajs_{purpose}']} to {purpose}" for purpose in ("train", "valid", "test"))
     return f"{counted(content['sequence_length_train'], 'frame')} each, {runs}".replace("to valid", "to validate")
 
 
 def _warn(told: Mapping[int, list[str]], failures: Mapping[int, str], runs: int) -> None:
-    """Say once what runs were warned of, and which are left out."""
+    """Tell once the warnings of runs, and which runs are left out."""
     warned = {number: sentences for number, sentences in told.items() if sentences}
     if warned:
         first = min(warned)

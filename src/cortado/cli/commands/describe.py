@@ -36,22 +36,22 @@ from cortado.watching import Watch
 from cortado.words import counted
 
 MANY = 1_000_000
-"""Particles: so many are announced before they are made, as that takes some seconds or minutes."""
+"""Number of particles that is announced before they are made, as that takes some seconds or minutes."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
 """Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
 
 
 SAME = 1e-6
-"""Relative: a time step that is rounded to float32 is the same."""
+"""Relative difference of a time step that was rounded to float32."""
 MOST_FRAMES = 1_000_000
-"""Frames of a film; nobody looks at more."""
+"""Most frames of a film; nobody looks at more."""
 HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
 """Bytes of a trajectory file besides its frames, measured: its heads, what no step changes, what the solver notes."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """How many first steps of a scene were measured, after twice as many that were not, and how long one of them takes
-    [s], with what sensors read after each. Raises `DivergedError` of a scene that does not even bear these steps."""
+    """Return how many first steps of a scene were timed, after twice as many that were not, and the time of one [s],
+    with the readings of sensors. Raise `DivergedError` for a scene that does not even bear these steps."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -68,10 +68,11 @@ def measured_speed(simulation: Simulation) -> tuple[int, float]:
 
 
 class RunLength:
-    """Of a run that is asked for by a number of steps or by a time."""
+    """The length of a run that is asked for by a number of steps or by a time, with its frames and its film."""
 
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
-        """Of a run with so many steps, or for a time [s]. Raises `InputError` for what is neither."""
+        """Compute the length of a run with ``steps`` steps, or for a time [s]; raise `InputError` for what is
+        neither."""
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         """Whether the number of steps is an estimate."""
@@ -94,7 +95,7 @@ class RunLength:
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
     def for_machines(self) -> dict[str, Any]:
-        """By names that end in units."""
+        """Return the length by names that end in units."""
         film = {} if self.film is None else {"film_seconds": self.film.seconds, "film_speed": self.film.speed}
         return {
             "steps": self.steps,
@@ -108,7 +109,7 @@ class RunLength:
 
     @property
     def in_words(self) -> str:
-        """Steps, and seconds of motion."""
+        """Return steps, and seconds of motion, in words."""
         motion = "" if self.time is None else f", {self.time:g} s of motion"
         about = "about " if self.is_about else ""
         guess = ", if fluid gets as fast as by a fall through the whole container" if self.is_about else ""
@@ -126,7 +127,7 @@ def describe_scene(
     picture: Path | None,
     as_json: bool,
 ) -> str:
-    """As text, or as JSON; a picture of the first state is written where one is asked for."""
+    """Describe a scene as text, or as JSON; write a picture of the first state where one is asked for."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
@@ -181,15 +182,15 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _fluid_size(simulation: Simulation) -> list[float]:
-    """(d,) [m] with what waits in line in an emitter, and without its reserve."""
+    """Return the size (d,) [m] of the fluid with the particles in line in an emitter, and without its reserve."""
     emitter, spacing = simulation.scene.emitter, simulation.scene.discretisation.spacing
     shown = simulation.free_particles + (0 if emitter is None else len(emitter.particles(spacing)))
     return (np.ptp(simulation.positions[:shown], axis=0) + spacing).tolist()
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """The time step [s], its limits by what they are of [s], and by which of them it is chosen: the first step then;
-    None of one that is fixed."""
+    """Return the time step [s], its limits [s] by name, and the name of the limit by which it is chosen: the first step
+    then; None for one that is fixed."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -204,7 +205,7 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def _viscosity(scene: Scene) -> str:
-    """Which form the viscous force has, and why it acts at the start or at the end of a step."""
+    """Say which form the viscous force has, and why it acts at the start or at the end of a step."""
     form, limit = scene.forces.viscosity, viscous_limit(scene, {})
     if form != "stress" or not math.isfinite(limit):
         return str(form)
@@ -213,7 +214,7 @@ def _viscosity(scene: Scene) -> str:
 
 
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
-    """How long so many steps will take; of a scene that does not bear the first ones, what happened."""
+    """Return how long a number of steps will take; for a scene that does not bear the first ones, what happened."""
     try:
         measured, seconds = measured_speed(simulation)
     except DivergedError as error:
@@ -227,7 +228,7 @@ def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
 
 
 def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
-    """[bytes] of a run, and of a gradient."""
+    """Return the memory [bytes] of a run, and of a gradient."""
     real = simulation.precision.bytes
     if not isinstance(simulation.solver, ParticleSolver):
         return {"memory_bytes": None, "gradient_memory_bytes": None}
@@ -239,7 +240,7 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 
 
 def of_emitter(scene: Scene) -> dict[str, float | None]:
-    """When all of it is out, how fast, and the areas that its particles' cells and its opening have."""
+    """Return when an emitter is empty, its speed, and the areas of its particles' cells and of its opening."""
     emitter, spacing = scene.emitter, scene.discretisation.spacing
     if emitter is None:
         return {"emitter_runs_dry_at_s": None}
@@ -248,8 +249,7 @@ def of_emitter(scene: Scene) -> dict[str, float | None]:
 
 
 def seconds_of_picture(simulation: Simulation) -> float | None:
-    """How long one takes of the first state, with all cores that a film has; None where nothing is seen of the fluid
-    then."""
+    """Time a picture of the first state, with all cores that a film has; None where no fluid is seen then."""
     scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]
     draws = painter(scene, positions, simulation.device)
@@ -263,7 +263,7 @@ def seconds_of_picture(simulation: Simulation) -> float | None:
 
 
 def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, float]:
-    """[bytes] of a forward run, and of one with its gradient and a checkpoint of every step."""
+    """Estimate the memory [bytes] of a forward run, and of one with its gradient and a checkpoint of every step."""
     particles, walls, real = simulation.particles, len(simulation.walls), simulation.precision.bytes
     solver = simulation.solver
     assert isinstance(solver, ParticleSolver)
@@ -276,7 +276,7 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
 
 
 def _drawn(simulation: Simulation, path: Path) -> Path:
-    """The scene with its fluid where it is at the start, in the colours of its phases."""
+    """Draw the scene with its fluid where it is at the start, in the colours of its phases."""
     free = slice(simulation.free_particles)
     colours = colours_of(simulation.scene, simulation.mass_fractions, simulation.particles)
     return write_picture(path, plan(simulation.scene, simulation.positions[free], colours[free], simulation.device))
@@ -320,7 +320,7 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
 
 
 def emitter_rows(found: dict[str, Any], length: RunLength) -> list[tuple[str, str]]:
-    """When all of it is out, whether that is before the end of the run, and how fast it comes."""
+    """Return rows of a table that say when an emitter is empty, before or after the end of the run, and its speed."""
     dry = found["emitter_runs_dry_at_s"]
     if dry is None:
         return []
@@ -335,7 +335,7 @@ def emitter_rows(found: dict[str, Any], length: RunLength) -> list[tuple[str, st
 
 
 def _size(found: dict[str, Any]) -> str:
-    """Lengths and masses, by which one sees a wrong unit."""
+    """Write lengths and masses, by which one sees a wrong unit."""
     fluid, held = (
         " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
     )
@@ -361,7 +361,7 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _trajectory(length: RunLength) -> str:
-    """What is recorded, on disk."""
+    """Write how much is recorded on disk."""
     if length.frames is None:
         return "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
     return (
@@ -370,8 +370,7 @@ def _trajectory(length: RunLength) -> str:
 
 
 def _film(length: RunLength, seconds: float | None) -> str:
-    """What the film of the run shows, how long it is, and how long it takes to draw, if a picture takes so many
-    seconds."""
+    """Write what the film of the run shows, its length, and the time to draw it, if a picture takes ``seconds``."""
     if length.film is not None and seconds is not None:
         drawn = _duration(len(length.film.frames) * seconds)
         return f"{length.film}; {drawn} to draw, {seconds:.2g} s for the first state; splashes take up to twice as long"
@@ -381,7 +380,7 @@ def _film(length: RunLength, seconds: float | None) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """About how long, in the unit that one would say."""
+    """Write a time in the unit that one would say."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
             return f"about {seconds / size:.2g} {unit}"

@@ -33,7 +33,7 @@ def fit_task(
     overwrite: bool,
     command: list[str],
 ) -> str:
-    """Fit, write the run folder, and return a sentence that says where the results are."""
+    """Fit the parameters of a task, write the run folder, and return a sentence that says where the results are."""
     task = load_fit(task_file, overrides)
     experiments = [one.experiment(device, precision) for one in task.experiments]
     with locked(out):
@@ -68,7 +68,7 @@ def _profiles(task: FitTask, fitted: Fit) -> list[Profile]:
 
 
 def sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
-    """The report, in the order in which one would tell it."""
+    """Return the sections of the report of a fit, in the order in which one would tell it."""
     head = ("", "unit", "start", "found", "standard error", "95 %, from", "to", "degrees of freedom", "counted error")
     noise = ("", "unit", "frames", "numbers", "residuals", "noise", "correlation time [s]", "independent frames")
     return [
@@ -158,7 +158,7 @@ def _effort(fitted: Fit) -> str:
 
 
 def for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
-    """What came out, by names."""
+    """Return the results of a fit by names."""
     lower, upper = ({n: np.asarray(pair[k]) for n, pair in fitted.intervals().items()} for k in range(2))
     return {
         "parameters": {name: np.asarray(value) for name, value in fitted.values.items()},

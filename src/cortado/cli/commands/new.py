@@ -12,24 +12,23 @@ from cortado.files.terminal import is_quiet
 DAM = "dam"
 """The template that explains every line, in 2-D and in 3-D."""
 TEMPLATES = Path(__file__).parents[1] / "templates"
-"""Their files, each a scene whose first line says what it is and how it is run."""
+"""The folder of the templates, each a scene whose first line says what it is and how it is run."""
 IN_3D = "_3d"
-"""At the end of the name of a file of `DAM`."""
+"""Ending of the name of a file of `DAM` in 3-D."""
 SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
 """What the first line calls the file, and the line with the name that a scene takes from its file."""
 ALL = "all"
 DATA = (".csv", ".mp4")
-"""What an example may read, with its own name at the beginning: example_ANY.csv."""
+"""Endings of files that an example may read, with its own name at the beginning: example_ANY.csv."""
 
 
 def templates() -> list[str]:
-    """Their names."""
+    """Return the names of the templates."""
     return [DAM, *sorted({path.stem.removesuffix(IN_3D) for path in TEMPLATES.glob("*.toml")} - {DAM})]
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene, and beside it the schema that editors complete and check it with; nothing that is there is
-    replaced."""
+    """Write a scene, and beside it the schema by which editors complete and check it; no existing file is replaced."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -52,7 +51,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
 
 
 def scene_text(file: Path, template: str) -> tuple[str, str]:
-    """The scene of a template's file that is written to a file, and the options with which it is run."""
+    """Return the scene of a template's file for a new file, and the options with which it is run."""
     text = (TEMPLATES / f"{template}.toml").read_text(encoding="utf-8")
     name = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
     own = text.replace(SCENE_FILE, name, 1).replace(SCENE_NAME, f'name = "{name.removesuffix(".toml")}"')
@@ -60,7 +59,7 @@ def scene_text(file: Path, template: str) -> tuple[str, str]:
 
 
 def list_examples(names: list[str], folder: Path) -> str:
-    """The examples, a line each; or, where some are named, these copied into a folder, which is made."""
+    """List the examples, a line each; or copy the named ones into a folder, which is made."""
     found = {path.stem: path for path in sorted(examples_folder().iterdir()) if path.suffix in (".toml", ".py")}
     if not found:
         raise InputError(f"{examples_folder()} holds no examples: install Cortado again.")
@@ -78,7 +77,8 @@ def _chosen(names: list[str], known: list[str]) -> list[str]:
 
 
 def _copied(sources: list[Path], folder: Path) -> str:
-    """Nothing is copied unless all of it can be: a file that is there is kept. What an example reads goes with it."""
+    """Copy examples with the files that they read; nothing is copied unless all of it can be: existing files are
+    kept."""
     examples = [folder / source.name for source in sources]
     beside = (path for source in sources for path in sorted(source.parent.glob(f"{source.stem}_*")))
     sources = [*sources, *(path for path in beside if path.suffix in DATA)]
@@ -94,7 +94,7 @@ def _copied(sources: list[Path], folder: Path) -> str:
 
 
 def _command(path: Path) -> str:
-    """How an example is run."""
+    """Return the command that runs an example."""
     if path.suffix == ".py":
         return f"python {path}"
     tables = tomllib.loads(path.read_text("utf-8"))
@@ -103,7 +103,7 @@ def _command(path: Path) -> str:
 
 
 def _line(path: Path) -> str:
-    """Its name and what it says of itself, first of all."""
+    """Return an example's name and the first words of its description."""
     text = path.read_text("utf-8")
     if path.suffix == ".py":
         first = (ast.get_docstring(ast.parse(text)) or "").split("\n")[0]

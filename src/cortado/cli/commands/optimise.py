@@ -41,9 +41,9 @@ from cortado.runs.run_folder import TO_RESUME, RunFolder
 from cortado.words import counted
 
 LITTLE = 2.0
-"""How many times smaller a loss must be for a search to have come to something."""
+"""Factor by which a loss must be smaller for a search to have come to something."""
 LONG = 100
-"""Steps from which on a search that came to nothing may have had meaningless gradients."""
+"""Steps from which on a fruitless search may have had meaningless gradients."""
 
 
 def optimise_task(
@@ -58,8 +58,8 @@ def optimise_task(
     where: Where = HERE,
     pictures: bool = False,
 ) -> str:
-    """Optimise, write the run folder, shaded ``pictures`` too if wished, and return a sentence that says where the
-    results are. The samples of an ensemble are computed ``where`` is asked for."""
+    """Optimise a task, write the run folder, shaded ``pictures`` too if wished, and return a sentence that says where
+    the results are. The samples of an ensemble are computed ``where`` is asked for."""
     task = load_task(task_file, overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -73,7 +73,7 @@ def optimise_task(
 
 
 def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
-    """A new one, or the one that is there; a search goes on with other iterations and another check if so wished."""
+    """Make a run folder, or open the one that is there; a search may go on with other iterations and another check."""
     task, simulation = made.task, made.problem.simulation
     settings = search_settings(task, simulation.precision.name)
     noted: dict[str, Any] = {"kind": "optimise", "settings": settings, "device": str(simulation.device)}
@@ -83,7 +83,7 @@ def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: 
 
 
 def search_settings(task: Task, precision: str) -> dict[str, Any]:
-    """What must be the same, beside the scene, where a search goes on."""
+    """Return the settings that must be equal, beside the scene, where a search goes on."""
     return {
         "precision": precision,
         "problem": task.problem.model_dump(),
@@ -92,12 +92,12 @@ def search_settings(task: Task, precision: str) -> dict[str, Any]:
 
 
 def _kept(folder: RunFolder) -> str:
-    """Where the evaluations are; empty where there are none."""
+    """Say where the evaluations are; empty where there are none."""
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
-    """Search, judge, and write what came out; returns the sentence about it."""
+    """Search, judge, and write the results; return the sentence about them."""
     shades = pictures and _can_shade(made)
     if shades:
         begin_shaded(made)
@@ -135,7 +135,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
 
 
 def _can_shade(made: Setup) -> bool:
-    """Whether there can be shaded pictures and films; says so where a package is missing."""
+    """Test whether there can be shaded pictures and films; say so where a package is missing."""
     missing = lacking(made.task.scene)
     if missing:
         say(missing)
@@ -199,8 +199,8 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
 
 
 def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
-    """What to try where a search came to next to nothing, was misled, or may be in a wrong valley, and which of its
-    bounds it ended on."""
+    """Return advice where a search came to next to nothing, was misled, or may be in a wrong valley, and its bounds on
+    which it ended."""
     met = [name for name, pair in made.bounds.items() if _on_bound(result.parameters[name], *pair)]
     found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
     task, steps = made.task, made.task.problem.steps
@@ -225,7 +225,7 @@ def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
 
 
 def _on_bound(value: Any, lower: Any, upper: Any) -> bool:
-    """Whether a number of a parameter's coordinates is as small or as large as it may be."""
+    """Test whether a number of a parameter's coordinates is as small or as large as it may be."""
     least, most = np.asarray(-np.inf if lower is None else lower), np.asarray(np.inf if upper is None else upper)
     return bool(((value <= least) | (value >= most)).any())
 

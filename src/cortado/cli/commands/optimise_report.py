@@ -18,18 +18,18 @@ from cortado.scene.scene import scene_in_words
 Rows = list[tuple[object, ...]]
 
 MOST_ERROR = 0.3
-"""Of a parameter, relative, up to which it counts as found."""
+"""Greatest relative error of a parameter that counts as found."""
 
 
 MOST_IN_RESULT = 1000
-"""Numbers of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
+"""Most numbers of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
 VIEWED = 60
-"""States of a run that the view in the report shows at most."""
+"""Most states of a run that the view in the report shows."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How near an optimisation came to what the task asks for."""
+    """The judgement on an optimisation: how near it came to the check of its task."""
 
     first: float
     """Loss of the start."""
@@ -38,9 +38,9 @@ class Verdict:
     errors: dict[str, float]
     """By parameter: distance (L2) of the estimate from the true value, relative to its size unless that is 0."""
     psnr: float | None
-    """Of the last image [dB]; None where positions are compared."""
+    """Peak signal-to-noise ratio of the last image [dB]; None where positions are compared."""
     failures: list[str]
-    """Sentences about what was not reached."""
+    """Sentences about goals that were not reached."""
 
 
 def judge(
@@ -50,7 +50,7 @@ def judge(
     noise: float | None = None,
     first: float | None = None,
 ) -> Verdict:
-    """Hold a result against the task's [optimise.check].
+    """Judge a result by the task's [optimise.check].
 
     ``estimate``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio that was
     reached [dB]; ``first``: the loss of the start, where the history begins with another loss.
@@ -74,7 +74,7 @@ def judge(
 
 
 def found_in_words(error: float) -> str:
-    """How well a parameter is found, by its distance from the true value relative to it."""
+    """Say how well a parameter is found, by its distance from the true value relative to it."""
     if error > MOST_ERROR:
         why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
         return f"not found, {100 * error:.3g}% off: {why}"
@@ -82,14 +82,14 @@ def found_in_words(error: float) -> str:
 
 
 def distance(estimate: ArrayLike, true: ArrayLike) -> float:
-    """|estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
+    """Return |estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
     estimate, true = np.broadcast_arrays(estimate, true)
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
 def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
-    """Which number of a few is farther off than twice the error of all of them together, and how far; empty where none
-    is, or where the true ones are not known or 0."""
+    """Name the number of a few that is farther off than twice the error of all of them together, and how far; empty
+    where none is, or where the true ones are not known or 0."""
     true, names = made.true_parameter(name), component_names(made.task, name, estimate)
     if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
         return ""
@@ -99,7 +99,7 @@ def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -
 
 
 def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[str, KnotValues]) -> list[str]:
-    """One for each parameter, or for each of its knots; none for a parameter of very many numbers."""
+    """Return a line for each parameter, or for each of its knots; none for a parameter of very many numbers."""
     lines = []
     for name, value in estimate.items():
         if name in knots:
@@ -123,8 +123,8 @@ def found_rows(
     knots: Mapping[str, KnotValues],
     errors: Mapping[str, float],
 ) -> Rows:
-    """(parameter, unit, first guess, found, hidden, error) of each number that was searched, of each knot, and of
-    parameters with very many numbers; ``errors`` by parameter."""
+    """Return rows (parameter, unit, first guess, found, hidden, error) of each number that was searched, of each knot,
+    and of parameters with very many numbers; ``errors`` by parameter."""
     rows: Rows = []
     start = made.search.parameters(made.start)
     for name, value in estimate.items():
@@ -178,7 +178,8 @@ def sections(
     figures: TaskFigures,
     rows: Rows,
 ) -> list[Section]:
-    """The report, in the order in which one would tell it; ``told``: what was found, in words."""
+    """Return the sections of the report of a search, in the order in which one would tell it; ``told``: found
+    parameters in words."""
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         asked(made),
@@ -197,7 +198,7 @@ def sections(
 
 
 def _view(made: Setup, estimate: dict[str, np.ndarray]) -> str:
-    """What was found, and the target where it is a run, in motion."""
+    """Return HTML that shows the found run, and the target where it is a run, in motion."""
     steps = np.unique(np.linspace(0, made.problem.steps, VIEWED).astype(int)).tolist()
     runs = {"found": estimate}
     if made.task.problem.picture is None:
@@ -227,7 +228,7 @@ def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
 def for_machines(
     result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict, knots: Mapping[str, KnotValues]
 ) -> dict[str, Any]:
-    """What came out, by names."""
+    """Return the results of a search by names."""
     found: dict[str, Any] = {
         "evaluations": len(result.history),
         "refused": result.refused,

@@ -18,7 +18,8 @@ from cortado.runs.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Where:
-    """The options of a command; raises `InputError` for both of them, and for more processes than make sense."""
+    """The options --scheduler and --workers of a command; raises `InputError` for both of them, and for more processes
+    than make sense."""
 
     scheduler: str | None = None
     """The address of a scheduler of Dask's."""
@@ -33,13 +34,13 @@ class Where:
 
     @property
     def option(self) -> str | None:
-        """The option that was given."""
+        """Return the option that was given."""
         return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
 
     @contextmanager
     def executor(self, device: str, items: int) -> Iterator[Executor]:
-        """This process unless workers are asked for, which end with the block; on a GPU each has one of its own. There
-        are no more processes than ``items`` that are computed at a time."""
+        """Yield the executor: this process unless workers are asked for, which end with the block; on a GPU each has
+        one of its own. There are no more processes than ``items`` that are computed at a time."""
         if self.scheduler is not None:
             with Distributed(self.scheduler) as there:
                 yield there
@@ -52,12 +53,12 @@ class Where:
 
 
 HERE = Where()
-"""In this process."""
+"""Computation in this process."""
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
-    """The runs that are meant, in each folder of a sweep all of them, in the order of its table. Raises `InputError`
-    for a folder without a run."""
+    """Return the runs that are named, in each folder of a sweep all of them, in the order of its table. Raise
+    `InputError` for a folder without a run."""
     if not folders:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
     found: list[RunFolder] = []
@@ -69,10 +70,10 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
 
 
 class OwnQuantity:
-    """A function of a trajectory that returns a number."""
+    """A user's function of a trajectory that returns a number."""
 
     def __init__(self, where: str):
-        """Runs the file of ``FILE.py:FUNCTION``. Raises `InputError` for one that cannot be run, or has no such
+        """Run the file of ``FILE.py:FUNCTION``; raise `InputError` for one that cannot be run, or has no such
         function."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
@@ -86,7 +87,7 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """The number; raises `InputError` where the function fails, or returns something else."""
+        """Return the number of a trajectory; raise `InputError` where the function fails, or returns something else."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -100,5 +101,5 @@ class OwnQuantity:
 
 
 def _told(problem: Exception) -> str:
-    """Its kind and its words, on one line."""
+    """Return the kind and the words of an error, on one line."""
     return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")

@@ -24,13 +24,13 @@ from cortado.simulation import Simulation
 
 
 def picture_settings(lines: int | None, colour: str | None) -> dict[str, Any]:
-    """Keys of [picture] that are given by options, as those of `Trajectory.film`."""
+    """Return the keys of [picture] that are given by options, as those of `Trajectory.film`."""
     given = {"lines": lines, "colour": colour}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def camera_override(camera: str | None) -> list[str]:
-    """What ``--camera`` replaces in a scene, before ``--set`` does, which may add to it."""
+    """Return the override that ``--camera`` means, before those of ``--set``, which may add to it."""
     kind, _, solid = (camera or "").partition(":")
     keys = {"kind": kind, **({"solid": solid} if solid else {})}
     path = ", ".join(f"{name} = {json.dumps(value)}" for name, value in keys.items())
@@ -38,7 +38,7 @@ def camera_override(camera: str | None) -> list[str]:
 
 
 def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
-    """The scene of a run that is there, with other keys of [picture]."""
+    """Read the scene of an existing run, with other keys of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
@@ -56,7 +56,7 @@ def draw_runs(
     settings: Mapping[str, Any],
 ) -> str:
     """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; of several runs
-    side by side. Returns a sentence that says where it is."""
+    side by side. Return a sentence that says where it is."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -98,13 +98,14 @@ def _trajectory(folder: RunFolder) -> Trajectory:
 
 
 def _names(folders: Sequence[RunFolder]) -> list[str]:
-    """Of the folders, or numbers where some have one name."""
+    """Return the names of the folders, or numbers where some have one name."""
     found = [folder.path.name for folder in folders]
     return found if len(set(found)) == len(found) else [f"run {k}" for k in range(1, len(found) + 1)]
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
-    """Write every so many frames of a run that is there in a format; returns a sentence that says where they are."""
+    """Write frames ``every`` frames apart of an existing run in a format; return a sentence that says where they
+    are."""
     folder = RunFolder.open(run)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")

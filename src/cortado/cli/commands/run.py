@@ -40,13 +40,13 @@ OFTEN, SHARE = 5.0, 20.0
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What is asked of one run of a scene."""
+    """The choices for one run of a scene."""
 
     out: Path
-    """Its folder."""
+    """Folder of the run."""
     steps: int | None = None
     time: float | None = None
-    """How long it is simulated [s], in the place of the steps."""
+    """Simulated time [s], in the place of the steps."""
     overrides: Sequence[str] = ()
     device: str = "cpu"
     precision: str = "float32"
@@ -54,17 +54,17 @@ class RunRequest:
     record: Sequence[str] = ()
     """Quantities of the particles for every frame."""
     state: Path | None = None
-    """A run or a trajectory that it begins at the end of."""
+    """A run or a trajectory at whose end it begins."""
     resume: bool = False
     overwrite: bool = False
     pictures: bool = False
-    """Shaded ones, and the film."""
+    """True for shaded pictures, and the film."""
     command: Sequence[str] = ()
     report: bool = True
-    """Whether figures are drawn, and report.html is written."""
+    """True where figures are drawn, and report.html is written."""
 
     def settings(self, simulation: Simulation, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
-        """What tells one run of a scene from another."""
+        """Return the settings that tell one run of a scene from another."""
         in_time = bool(np.isfinite(rollout.step_sizes.end))
         asked = run_settings(rollout.steps, self.precision, self.frames)
         return {
@@ -75,13 +75,13 @@ class RunRequest:
 
 
 def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, Any]:
-    """What tells one run of a number of steps from another of the same scene."""
+    """Return the settings that tell one run of a number of steps from another of the same scene."""
     return {"steps": steps, "precision": precision, **frames.settings}
 
 
 @dataclass
 class RunRecording:
-    """Runs a rollout and writes its frames, what the solver noted of its steps, and what sensors read."""
+    """A run of a rollout that writes its frames, the solver's notes on steps, and the readings of sensors."""
 
     simulation: Simulation
     rollout: Rollout
@@ -92,8 +92,8 @@ class RunRecording:
     """Frames of an earlier process, from the last of which the rollout goes on."""
 
     def go_on(self) -> int:
-        """Have the rollout go on from the last frame in the folder up to which everything is known; returns the number
-        of steps before it, 0 where there is no such frame."""
+        """Let the rollout go on from the last frame in the folder up to which everything is known; return the number of
+        steps before it, 0 without such a frame."""
         if not self.folder.trajectory.exists():
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
@@ -110,7 +110,7 @@ class RunRecording:
         return step
 
     def run(self) -> State:
-        """Take the steps; returns the last state. Raises `DivergedError` with everything before written."""
+        """Take the steps, and return the last state; raise `DivergedError` with everything before written."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
@@ -153,14 +153,14 @@ class RunRecording:
 
 
 class Notes:
-    """What is known of the steps besides frames, written in time."""
+    """A writer of all that is known of the steps besides frames, in time."""
 
     def __init__(self, recording: RunRecording, writer: TrajectoryWriter):
         self._recording, self._writer = recording, writer
         self._step, self._next = recording.rollout.progress.step, time.monotonic() + OFTEN
 
     def now_and_then(self, step: int) -> None:
-        """After a step, write if it is time."""
+        """Write the notes after a step if it is time."""
         self._step = step
         if (begun := time.monotonic()) >= self._next:
             self._recording.rollout.log.read(step)
@@ -169,7 +169,7 @@ class Notes:
             self._next = ended + max(OFTEN, SHARE * (ended - begun))
 
     def write(self) -> None:
-        """What sensors read, and what the solver noted of the steps that were observed."""
+        """Write the readings of sensors, and the solver's notes on the steps that were observed."""
         rollout = self._recording.rollout
         if self._step > len(rollout.diagnostics["converged"]):  # an interrupt within a chunk of steps
             rollout.log.read(self._step)
@@ -212,7 +212,7 @@ def _kept(folder: RunFolder) -> str:
 
 
 def _last_state(path: Path) -> RestartState:
-    """The last state of a trajectory, or of the run in a folder; raises `InputError`."""
+    """Return the last state of a trajectory, or of the run in a folder; raise `InputError`."""
     file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
     found = Trajectory.load(file)
     if not len(found):
@@ -221,13 +221,13 @@ def _last_state(path: Path) -> RestartState:
 
 
 def _checksum(state: RestartState) -> str:
-    """By which one state is told from another."""
+    """Return a checksum by which one state is told from another."""
     told = repr((state.clock.steps, state.clock.time, state.clock.time_step)).encode()
     return sha256(told + b"".join(state[name].tobytes() for name in sorted(state.fields))).hexdigest()[:16]
 
 
 def _compute(recording: RunRecording, asked: RunRequest) -> None:
-    """Run, say how it went, and fill the folder, also where the run diverges."""
+    """Run a scene, say how it went, and fill the folder, also where the run diverges."""
     simulation, rollout, folder = recording.simulation, recording.rollout, recording.folder
 
     def report(told: Section) -> None:
@@ -251,7 +251,7 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
-    """How a run went, by names: of the steps that it came to, the mean of what the solver notes, and the greatest."""
+    """Return how a run went, by names: mean and greatest value of each of the solver's notes, over the steps taken."""
     noted = {name: np.asarray(values, dtype=np.float64) for name, values in rollout.diagnostics.items() if len(values)}
     return {
         "particles": simulation.particles,

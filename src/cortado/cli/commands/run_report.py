@@ -36,20 +36,20 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Of all particles but those that wait in an emitter [J], in 2-D of a layer one metre thick."""
+    """The energies of all particles but those that wait in an emitter [J], in 2-D of a layer one metre thick."""
 
     kinetic: float
     potential: float
-    """In the gravity that acts then, from the lowest place of the container, or of the origin if there is none."""
+    """Potential energy in the gravity at that time, from the lowest place of the container, or from the origin."""
 
     @property
     def total(self) -> float:
-        """[J]"""
+        """Return the sum of kinetic and potential energy [J]."""
         return self.kinetic + self.potential
 
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
-        """Of a state, in the gravity of a step, counted from 0."""
+        """Compute the energies of a state, in the gravity of a step, counted from 0."""
         names, out = ("positions", "velocities", "reference_density"), _out(simulation, state)
         fields = {name: array[out] for name, array in state.numpy(simulation.dimension, only=names).items()}
         masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
@@ -65,7 +65,7 @@ class Energy:
 
 
 class RunSummary:
-    """Of a run that has gone through all of its steps."""
+    """The summary of a run that has gone through all of its steps."""
 
     def __init__(
         self,
@@ -75,8 +75,8 @@ class RunSummary:
         seconds: float,
         readings: Mapping[str, Readings] | None = None,
     ):
-        """``last``: the state at the end; ``seconds``: that the present process took, with what was recorded;
-        ``readings``: what sensors read, by their names."""
+        """Summarise a run by its ``last`` state, the ``seconds`` that the present process took, with what was recorded,
+        and the ``readings`` of sensors, by their names."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings or {}
         self.computed = taken - rollout.progress.step
@@ -103,7 +103,7 @@ class RunSummary:
 
     @property
     def milliseconds(self) -> float:
-        """Milliseconds that a step took."""
+        """Return the milliseconds that a step took."""
         return 1e3 * self.seconds / max(self.computed, 1)
 
     @property
@@ -111,7 +111,7 @@ class RunSummary:
         return "all" if self.computed == self.steps else f"the last {self.computed}"
 
     def for_machines(self) -> dict[str, Any]:
-        """What is the same in every run, by names."""
+        """Return the numbers that are equal in every repetition of the run, by names."""
         energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
         sensors = {"sensors": summary(self.readings)} if self.readings else {}
@@ -125,7 +125,7 @@ class RunSummary:
         }
 
     def rows(self) -> list[tuple[object, ...]]:
-        """(what, value, unit) of each row of a table."""
+        """Return rows (what, value, unit) of a table."""
         energies = [
             (f"{kind} energy, {when}", f"{getattr(energy, kind):.4g}", "J")
             for when, energy in (("at the start", self.first), ("at the end", self.last))
@@ -170,13 +170,14 @@ class RunSummary:
 
 
 def _out(simulation: Simulation, state: State) -> NDArray[np.bool_]:
-    """(n,) whether each particle has left the emitter; one that waits may be within a wall, and is prescribed."""
+    """Return a mask (n,) of the particles that have left the emitter; waiting ones are prescribed, even within
+    walls."""
     emitted = state["emitted"].numpy() if simulation.scene.emitter else None
     return is_out(simulation.scene, emitted, len(simulation.positions))
 
 
 def _spilt(simulation: Simulation, state: State) -> int:
-    """How many particles that did not begin in an emitter are outside of a cup without a lid."""
+    """Return how many particles that did not begin in an emitter are outside of a cup without a lid."""
     scene, container = simulation.scene, simulation.scene.container
     if not np.isfinite(container.region(simulation.dimension).rim):
         return 0
@@ -185,13 +186,13 @@ def _spilt(simulation: Simulation, state: State) -> int:
 
 
 def simulated(rollout: Rollout) -> float:
-    """How long the fluid of a rollout was simulated in its last forward run [s]."""
+    """Return how long the fluid of a rollout was simulated in its last forward run [s]."""
     clock, size = rollout.clocks[0], float(rollout.time_steps[0])
     return clock.after(rollout.taken, size).time - clock.time
 
 
 def sizes_in_words(rollout: Rollout) -> str:
-    """How long the steps of the last forward run were."""
+    """Write how long the steps of the last forward run were."""
     chosen = rollout.step_sizes.diagnostics(rollout.taken).get("time_steps")
     if chosen is None or not len(chosen):
         return f"{float(rollout.time_steps[0]):g} s"
@@ -206,7 +207,8 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report, and shaded ``pictures`` too if wished; ``told``: what came out; ``read``: by sensors."""
+    """Write the report of a run, with shaded ``pictures`` if wished; ``told``: results in words; ``read``: by
+    sensors."""
     scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
     asked = Section("What was asked", _asked(simulation, rollout))
     view = Section("To turn and to play", view=trajectory_view(scene, trajectory))
@@ -231,7 +233,7 @@ def write_run_report(
 
 
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
-    """Plain ones, of the first, the middle and the last frame."""
+    """Draw plain pictures of the first, the middle and the last frame."""
     scene = simulation.scene
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
@@ -251,7 +253,7 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
-    """Pictures of a scene that says how it is rendered, and a video where it can be written."""
+    """Draw pictures of a scene with a table [render], and a video where it can be written."""
     renderer = simulation.renderer()
 
     def image(frame: int) -> np.ndarray:
@@ -275,7 +277,7 @@ def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
 
 
 def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
-    """The run in words."""
+    """Describe the run in words."""
     scene = simulation.scene
     step = float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
@@ -291,7 +293,7 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
 
 
 def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:
-    """Whether steps converged, and their errors of density."""
+    """Return the section on the solver: which steps converged, and their errors of density."""
     figures: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"

@@ -24,28 +24,28 @@ from cortado.scene.toml import read_toml
 from cortado.words import counted
 
 SAME_TIME = 1e-9
-"""Relative: times that differ by less are the same."""
+"""Relative difference below which times are equal."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """How each combination of a sweep is computed: what a worker process is sent."""
+    """The computation of the combinations of a sweep, which a worker process is sent."""
 
     file: Path
     """The scene or the task."""
     duration: float | None
-    """Of a scene [s]; None for a task, which says itself."""
+    """Duration of a scene's run [s]; None for a task, which says its own."""
     out: Path
     """The folder of the sweep."""
     device: str
     precision: str
     frames: FrameOptions
-    """Of runs of a scene."""
+    """Frames of runs of a scene."""
     report: bool
-    """Whether each run of a scene has figures and a report."""
+    """True where each run of a scene has figures and a report."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
-        """What came out, as in result.json; of a folder that is finished, what is there. Warnings name the folder."""
+        """Return a combination's result, as in result.json, computed if need be. Warnings name the folder."""
         if not (self.out / LOCK).exists():
             raise InputError(
                 f"A worker does not see {self.out}, but the task and the folder of a sweep must be in a file system "
@@ -60,8 +60,8 @@ class Member:
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
-        """What came out of a combination; None where it has not ended. Raises `InputError` where its scene or task is
-        wrong, or another one than that in its folder."""
+        """Return the result of a combination; None where it has not ended. Raise `InputError` where its scene or task
+        is wrong, or another one than that in its folder."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
@@ -76,12 +76,12 @@ class Member:
         return folder.read_result()
 
     def _folder(self, combination: Combination) -> RunFolder | None:
-        """The folder of a combination; None where there is no run in it."""
+        """Return the folder of a combination; None where there is no run in it."""
         path = self.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
     def steps(self, combination: Combination) -> int:
-        """How many of them come nearest to the duration; at least one."""
+        """Return the number of steps that comes nearest to the duration; at least one."""
         assert self.duration is not None
         return check_steps(max(round(self.duration / _time_step(self.file, combination)), 1))
 
@@ -108,7 +108,7 @@ class Member:
         return folder.read_result() or {"failures": ["It left no result."]}
 
     def _request(self, combination: Combination, begun: bool, words: list[str]) -> RunRequest:
-        """The run of a combination; one that was begun goes on."""
+        """Return the run of a combination; one that was begun goes on."""
         steps = self.steps(combination)
         frames = self._frames(steps)
         ((name, value),) = frames.settings.items()
@@ -119,7 +119,7 @@ class Member:
         )
 
     def _frames(self, steps: int) -> FrameChoice:
-        """About a hundred where nothing is said."""
+        """Return the choice of frames, about a hundred where none is given."""
         return self.frames.choice(max(steps // 100, 1))
 
 
@@ -136,8 +136,8 @@ def run_sweep(
     frames: FrameOptions = ALL_FRAMES,
     pictures: bool = True,
 ) -> str:
-    """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
-    some combinations failed."""
+    """Compute the missing combinations of a sweep; return a sentence that says where the table is. Raise
+    `ComputationError` where some combinations failed."""
     chosen = combinations(options, zipped)
     duration = _duration(file, chosen, steps, time)
     of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
@@ -179,16 +179,16 @@ def run_sweep(
 
 
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
-    """What came out of the combinations that have ended, by their numbers. All of them are looked at, so that a mistake
-    is found before anything is computed; warnings come when they are."""
+    """Return the results of the combinations that have ended, by their numbers. All of them are looked at, so that a
+    mistake is found before anything is computed; warnings come when they are."""
     with unwarned():
         found = {number: member.finished(one) for number, one in enumerate(chosen)}
     return {number: result for number, result in found.items() if result is not None}
 
 
 def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
-    """How long a scene is simulated [s]: so many steps of the smallest time step are, or the time itself. None for a
-    task, which is a file with the table [optimise]."""
+    """Return how long a scene is simulated [s]: ``steps`` smallest time steps, or the time itself. None for a task,
+    which is a file with the table [optimise]."""
     if "optimise" in read_toml(file):
         for name, value in (("steps", steps), ("time", time)):
             if value is not None:
@@ -205,13 +205,13 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
 
 
 def _time_step(file: Path, combination: Combination) -> float:
-    """Of a scene [s]; warnings come when it is run."""
+    """Return the time step of a combination's scene [s]; warnings come when it is run."""
     with unwarned():
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:
-    """Say where runs end at different times, as no whole number of their time steps is the duration."""
+    """Warn where runs end at different times, as no whole number of their time steps is the duration."""
     duration = member.duration
     if duration is None or not done:
         return

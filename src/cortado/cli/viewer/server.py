@@ -30,7 +30,7 @@ from cortado.errors import InputError
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
-"""By which a browser on this machine may call it."""
+"""Names by which a browser on this machine may call it."""
 ADVICE = "This window has a token in its address: open the whole address that `cortado view` has printed.\n"
 HEADERS = {
     "Referrer-Policy": "no-referrer",
@@ -39,11 +39,11 @@ HEADERS = {
 }
 """So that the token goes nowhere else, and no other page shows the window within its own."""
 Answer = Callable[[ServerConnection, Request], Response | None]
-"""What websockets calls ``process_request``: a page, or None for a websocket."""
+"""The type of websockets' ``process_request``: returns a page, or None for a websocket."""
 LARGEST_NUMBER = 1e9
-"""Of a number of the camera."""
+"""Largest number of the camera."""
 LONGEST_MESSAGE = 2**16
-"""Bytes of a message; those of viser's page have some hundreds."""
+"""Most bytes of a message; those of viser's page have some hundreds."""
 Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Direction = tuple[Number, Number, Number]
 Controls = Callable[[str], Any]
@@ -51,7 +51,7 @@ Controls = Callable[[str], Any]
 KNOWN = "1.1.1"
 """A version of viser that can be guarded."""
 FAREWELL = 0.3
-"""[s] that a page has to answer when the window closes; one that is busy does not."""
+"""Time [s] that a page has to answer when the window closes; one that is busy does not."""
 _silent = logging.getLogger(__name__)
 """Of connections that fail, which is the matter of those who made them."""
 _silent.disabled = True
@@ -64,11 +64,11 @@ class Door:
         self._token = token_hex(16)
 
     def address(self, port: int) -> str:
-        """Where a browser finds the window."""
+        """Return the address at which a browser finds the window."""
         return f"http://{HOST}:{port}/{self._token}/"
 
     def before(self, answer: Answer | None) -> Answer:
-        """An answer for those who are let in, which is given what stands behind the token; a refusal for others."""
+        """Wrap the answer behind the door: it is given to those who know the token, and a refusal to others."""
 
         def guarded(connection: ServerConnection, request: Request) -> Response | None:
             token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
@@ -84,14 +84,14 @@ class Door:
 
 
 def _is_from_here(request: Request, port: int) -> bool:
-    """Whether a request calls this machine by its own name, and comes from the page at that name or from none."""
+    """Test whether a request calls this machine by its own name, and comes from the page at that name or from none."""
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     own = [f"{name}:{port}" for name in NAMES] + (list(NAMES) if port == 80 else [])  # browsers leave out 80
     return len(hosts) == 1 and hosts[0] in own and origins in ([], [f"http://{hosts[0]}"])
 
 
 class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """Where the camera of a page is; viser calls a page connected from the first one on."""
+    """A message with the camera of a page; viser calls a page connected from the first one on."""
 
     wxyz: tuple[Number, Number, Number, Number]
     position: Direction
@@ -105,14 +105,14 @@ class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage",
 
 
 class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """What a control is set to."""
+    """A message with the value to which a control is set."""
 
     uuid: str
     updates: dict[str, Any]
 
 
 class Hearing(sockets.ServerConnection):
-    """A websocket that leaves aside what a page may not say."""
+    """A websocket that ignores messages which a page may not send."""
 
     def __init__(self, *arguments: Any, controls: Controls, **options: Any):
         super().__init__(*arguments, **options)
@@ -127,7 +127,7 @@ class Hearing(sockets.ServerConnection):
 
 
 class GuardedServer:
-    """A server of viser's on this machine, or, where ``port`` is taken, on one of the next ones."""
+    """A guarded server of viser's on this machine, or, where ``port`` is taken, on one of the next ports."""
 
     def __init__(self, port: int, label: str):
         self._door, self._guarded = Door(), False
@@ -141,11 +141,11 @@ class GuardedServer:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """Return the address at which a browser finds it."""
         return self._door.address(self.viser.get_port())
 
     def close(self) -> None:
-        """Nobody can see it from now on."""
+        """Stop the server: nobody can see it from now on."""
         with redirect_stdout(StringIO()):
             self.viser.stop()
 
@@ -167,8 +167,8 @@ class GuardedServer:
 
 @contextmanager
 def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Within it a server of websockets is made by ``serve``, which is given the usual way: viser has no options for it,
-    and a guard that came later would leave the first moments open."""
+    """Make websockets' servers within by ``serve``, which is given the usual way. Viser has no options for it, and a
+    guard that came later would leave the first moments open."""
     usual = sockets.serve
     sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
     try:
@@ -182,7 +182,7 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def judged(message: bytes | str, controls: Controls) -> bytes | None:
-    """A message as viser may read it, written again so that both read the same; None for one to be left aside."""
+    """Return a message as viser may read it, written again so that both read it alike; None for one to be ignored."""
     with suppress(msgspec.MsgspecError, RecursionError, TypeError):
         said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
         if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
@@ -191,7 +191,7 @@ def judged(message: bytes | str, controls: Controls) -> bytes | None:
 
 
 def _can_be(said: Update, controls: Controls) -> bool:
-    """Whether the page lets its user set a control to this value."""
+    """Test whether the page lets its user set a control to this value."""
     control, value = controls(said.uuid), said.updates["value"]
     if control is None or control.disabled or not control.visible:
         return False
@@ -208,7 +208,7 @@ def _can_be(said: Update, controls: Controls) -> bool:
 
 
 def _is_between(slider: Any, value: Any) -> bool:
-    """Whether a number is within a slider's ends, which the page rounds to the digits that it shows."""
+    """Test whether a number is within a slider's ends, which the page rounds to the digits that it shows."""
     if isinstance(value, bool) or not isinstance(value, type(slider.value) | int):
         return False
     slack = 0.5 * 10.0**-slider.precision if isinstance(slider.value, float) else 0

@@ -48,26 +48,26 @@ from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 STRIDE = 1.0 / 100.0
-"""[s] of fluid between two pictures, about."""
+"""About how much time [s] of the fluid lies between two pictures."""
 SHORTEST_PAUSE = 1.0 / 40.0
-"""[s] from one picture to the next at least, so that one sees the fluid move."""
+"""Shortest time [s] from one picture to the next, so that one sees the fluid move."""
 LEAN = 2.0
-"""How far sliders of gravity go, in sizes of the scene's gravity."""
+"""Ends of the sliders of gravity, in sizes of the scene's gravity."""
 AXES = "xyz"
 FRAMES = 60
-"""Of a run, at most about."""
+"""About how many frames of a run there are at most."""
 MOST_ROWS = 12
-"""Numbers of a parameter that the table shows; of one with more, how far it went."""
+"""Most numbers of a parameter that the table shows; of one with more, how far it went."""
 OF_STEPS = {*names(Role.RUN), *names(Role.VIEW)} - {"rest_density"}
 """Parameters that a run from a state in between takes; the state has the others."""
 
 
 SHORTEST_PLAY = 4.0
-"""[s] that a run takes to play at speed 1, or as long as it lasted if that is longer."""
+"""Time [s] that a run takes to play at speed 1, or as long as it lasted if that is longer."""
 
 
 class RecordedView:
-    """Shows the frames of a run."""
+    """A view that shows the frames of a run."""
 
     def __init__(
         self,
@@ -77,7 +77,8 @@ class RecordedView:
         port: int,
         units: Mapping[str, str] = HEIGHT_UNITS,
     ):
-        """``simulation``: of the scene, asked for when something has to be computed; ``units`` as of `Window`."""
+        """Open a view; ``simulation`` makes that of the scene when something has to be computed, ``units`` as of
+        `Window`."""
         self.scene, self._simulation = scene, simulation
         own = own_fields(trajectory[0].others, trajectory.particles)
         large = sized(scene, solid_motions(scene, trajectory.others))
@@ -94,13 +95,13 @@ class RecordedView:
     def replace(
         self, trajectory: Trajectory, controls: Mapping[str, Any] | None = None, pulls: Sequence[np.ndarray] = ()
     ) -> None:
-        """Show another run of the same scene with as many frames, made under ``controls``. ``pulls`` (frames, n, d) of
+        """Show another run of the same scene and number of frames, made under ``controls``. ``pulls`` (frames, n, d) of
         its own loss; without them the loss is the height of the centre of mass."""
         self.trajectory, self._controls, self._pulls = trajectory, controls or {}, pulls
         self.show(self.slider.value)
 
     def tick(self) -> None:
-        """Show what is due now."""
+        """Show the frame that is due now."""
         now = time.monotonic()
         passed, self._former = now - self._former, now
         last = len(self.trajectory) - 1
@@ -116,7 +117,7 @@ class RecordedView:
         time.sleep(1.0 / 30.0)
 
     def show(self, k: int) -> None:
-        """Frame k."""
+        """Show frame k."""
         frame, self._frame = self.trajectory[k], k
         self._time.content = f"t = {frame.time:.4g} s"
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
@@ -130,7 +131,7 @@ class RecordedView:
         self.window.show(Shown(frame.positions, colours, quantities, pull))
 
     def _controls_at(self, k: int) -> dict[str, Any]:
-        """The controls of the step after frame k."""
+        """Return the controls of the step after frame k."""
         step = self.trajectory.steps[k]
         return {
             name: value[min(step, len(value) - 1)] if name in OVER_TIME and np.ndim(value) == 2 else value
@@ -139,7 +140,7 @@ class RecordedView:
 
 
 class LiveView:
-    """Runs a scene, a few steps at a time, from where it is."""
+    """A view that runs a scene, a few steps at a time, from where it is."""
 
     def __init__(self, simulation: Simulation, port: int):
         scene, self.simulation = simulation.scene, simulation
@@ -161,7 +162,7 @@ class LiveView:
         self._begin()
 
     def tick(self) -> None:
-        """A few steps, with gravity and the nozzle as the sliders are now; none while it stands still."""
+        """Take a few steps, with gravity and the nozzle as the sliders are now; none while it stands still."""
         if self._wish_to_begin:
             self._begin()
         if not self.running.value:
@@ -180,7 +181,7 @@ class LiveView:
         time.sleep(max(SHORTEST_PAUSE - (time.monotonic() - begun), 0.0))
 
     def _begin(self) -> None:
-        """Shows the first state."""
+        """Show the first state, with the sliders where the scene has them."""
         self._wish_to_begin = False
         self._nozzle = None if self.simulation.scene.emitter is None else np.array(self.simulation.scene.emitter.outlet)
         for sliders, values in ((self.gravity, self.simulation.scene.forces.gravity), (self.nozzle, self._nozzle)):
@@ -205,11 +206,12 @@ class LiveView:
         self.window.show(Shown(state["positions"], colours, quantities, pull))
 
     def _gravity(self) -> np.ndarray:
-        """(d,) as the sliders are."""
+        """Return gravity (d,) as the sliders are."""
         return np.array([slider.value for slider in self.gravity])
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Gravity, and a path of the nozzle from where it is to where it shall be."""
+        """Return the controls of the next steps: gravity, and a path of the nozzle from where it is to where it shall
+        be."""
         controls = {"gravity": self._gravity()}
         if self._nozzle is not None:
             wished = np.array([slider.value for slider in self.nozzle])
@@ -219,7 +221,7 @@ class LiveView:
         return controls
 
     def _sliders(self, title: str, unit: str, values: Any, ends: Any) -> list[Any]:
-        """One for each component, between ends (2, d)."""
+        """Make a slider for each component, between ends (2, d)."""
         gui, found = self.window.server.gui, []
         for axis, value, least, greatest in zip(AXES, values, *ends, strict=False):
             step = float(f"{(greatest - least) / 200.0:.1g}")
@@ -233,7 +235,7 @@ class LiveView:
         return np.stack([-most, most])
 
     def _reach(self) -> np.ndarray:
-        """Where a nozzle may be: above the container, at its height."""
+        """Return the ends of the places where a nozzle may be: above the container, at its height."""
         scene = self.simulation.scene
         if scene.emitter is None:
             return np.zeros((2, 0))
@@ -248,7 +250,7 @@ class LiveView:
 
 
 class TaskView:
-    """Shows the run with the present parameters of a search, and goes on with the search one step at a time."""
+    """A view that shows the run with the present parameters of a search, and takes the search's steps one at a time."""
 
     def __init__(self, made: Setup, port: int):
         self.made, simulation = made, made.problem.simulation
@@ -288,7 +290,7 @@ class TaskView:
         self.played.tick()
 
     def step(self) -> None:
-        """The next step of the search that `cortado optimise` makes, and the run with the new parameters."""
+        """Take the next step of the search that `cortado optimise` makes, and show the run with the new parameters."""
         made, before, begun = self.made, self._coordinates, time.monotonic()
         found = optimise(
             made.search,
@@ -318,7 +320,7 @@ class TaskView:
         return self.made.problem.run(self.made.search.parameters(coordinates), self._every)
 
     def _judged(self, coordinates: Arrays) -> tuple[float, list[np.ndarray]]:
-        """The loss, and its pull (n, d) on the particles of each frame, by the estimator that the search uses; of an
+        """Return the loss, and its pull (n, d) on the particles of each frame, by the search's estimator; of an
         ensemble the mean."""
         made, dimension = self.made, self.made.problem.simulation.dimension
         steps = made.problem.steps
@@ -335,13 +337,13 @@ class TaskView:
         return loss, [totals[step] / samples[step] for step in sorted(totals)]
 
     def _controls(self) -> dict[str, Any]:
-        """What steps of the present run depend on."""
+        """Return the parameters on which steps of the present run depend."""
         parameters = self.made.search.parameters(self._coordinates)
         return {name: value for name, value in parameters.items() if name in OF_STEPS}
 
     def _show_target(self) -> None:
-        """Grey points where particles shall be in the end; or pictures beside one another, as they shall look and as
-        they do."""
+        """Show grey points where particles shall be in the end; or pictures beside one another, the target and the
+        run's."""
         step, target = max(self.made.targets.items())
         gui = self.window.server.gui
         if self.made.renderer is None:
@@ -361,13 +363,13 @@ class TaskView:
         self._image.image = to_srgb(self.made.image(states[step]))
 
     def _tell(self, sentence: str, before: Arrays) -> None:
-        """A sentence, and a table of the parameters before and now."""
+        """Show a sentence, and a table of the parameters before and now."""
         rows = table(("", "unit", "before", "now", "hidden"), self._rows(before))
         style = "font-size: .8em; padding: 0 .8em; font-variant-numeric: tabular-nums"
         self.told.content = in_words(sentence) + f'<div style="{style}">{rows}</div>'
 
     def _rows(self, before: Arrays) -> list[tuple[str, ...]]:
-        """Of each number that is searched, and of a parameter with very many of them one row."""
+        """Return a row for each number that is searched, and one for a parameter with very many of them."""
         rows: list[tuple[str, ...]] = []
         search, task = self.made.search, self.made.task
         old, new = search.parameters(before), search.parameters(self._coordinates)
@@ -391,7 +393,7 @@ class TaskView:
 
 
 def _written(values: np.ndarray) -> list[str]:
-    """Numbers in words, 0 for round-off; nothing for what is not a number."""
+    """Write numbers in words, 0 for round-off; nothing for one that is not a number."""
     least = 1e-9 * np.abs(values).max()
     return ["" if np.isnan(a) else f"{a if abs(a) > least else 0.0:.4g}" for a in values.ravel()]
 
@@ -414,7 +416,7 @@ def view(path: Path, overrides: list[str], device: str, precision: str | None, p
 def opened(
     path: Path, overrides: list[str], device: str, precision: str | None, port: int
 ) -> LiveView | RecordedView | TaskView:
-    """The view of a run folder, of a task file, or of a scene file."""
+    """Open the view of a run folder, of a task file, or of a scene file."""
     if not path.exists():
         raise InputError(f"{path} does not exist, but must be the folder of a run, or the file of a scene or a task.")
     if not path.is_dir():

@@ -29,29 +29,29 @@ from cortado.solvers.particles import ParticleSolver
 
 PULL = "pull of the loss"
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
-"""Of what every state has."""
+"""Units of the quantities that every state has."""
 HEIGHT_UNITS = {**UNITS, PULL: "m/m"}
-"""The same, where the loss is the height of the centre of mass."""
+"""Units of these quantities, and of the pull where the loss is the height of the centre of mass."""
 AHEAD = 1.0 / 50.0
-"""[s] from a state to the one whose height is the loss."""
+"""Time [s] from a state to the one whose height is the loss."""
 RADIUS = 0.4
-"""Of a particle that is drawn, in spacings."""
+"""Radius of a particle that is drawn, in spacings."""
 DISTANCE = 1.7
-"""Of the camera at the start, in radii of what is shown."""
+"""Distance of the camera at the start, in radii of the contents."""
 PALETTE = "cividis"
 BRIGHTEST, BRIGHTEST_PULL = 99.5, 90.0
 """Percentiles at the upper end of the colours, so that a few particles do not darken all the others; the pulls of a
 splash differ by orders of magnitude."""
 MOST_ARROWS = 1500
-"""Of more particles, every k-th has an arrow."""
+"""Most arrows; of more particles, every k-th has one."""
 LONGEST_ARROW = 2.5
-"""Of pulls that are as large as the colours go or larger, in spacings."""
+"""Length of arrows of pulls that are as large as the colours go or larger, in spacings."""
 BESIDE_ARROWS = 0.4
-"""Of the size of particles, where they would hide arrows."""
+"""Factor of the size of particles, where they would hide arrows."""
 ARROWS = (170, 30, 15)
-"""sRGB"""
+"""sRGB colour of arrows."""
 LINES = (130, 125, 118)
-"""sRGB, of the container and of solids"""
+"""sRGB colour of the container and of solids."""
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
 
 Quantity = Callable[[], np.ndarray]
@@ -60,7 +60,7 @@ Quantity = Callable[[], np.ndarray]
 
 @dataclass(frozen=True)
 class Shown:
-    """Particles at a moment."""
+    """The particles that a window shows at a moment, with the quantities that may colour them."""
 
     positions: Points
     """(n, d) [m]"""
@@ -73,11 +73,11 @@ class Shown:
 
 
 class Window:
-    """A page of viser's; y is up, whatever the axes of the scene."""
+    """A window in the browser, a page of viser's; y is up, whatever the axes of the scene."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
-        """``units``: of the quantities that colours may show, by their names, `PULL` among them; "phase" is there
-        without."""
+        """Open a window with ``units`` of the quantities that colours may show, by name, `PULL` among them, and
+        "phase"."""
         try:
             import viser  # noqa: F401  for the sentence
 
@@ -107,11 +107,11 @@ class Window:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it, with the token that lets it in."""
+        """Return the address at which a browser finds it, with the token that lets it in."""
         return self._guarded.address
 
     def close(self) -> None:
-        """Nobody can see it from now on."""
+        """Close the window: nobody can see it from now on."""
         self._guarded.close()
 
     def show(self, shown: Shown) -> None:
@@ -121,13 +121,13 @@ class Window:
         self._draw()
 
     def place_solids(self, scene: Scene) -> None:
-        """Show the solids where a scene has them, which is otherwise the same."""
+        """Show the solids where a scene has them, which is otherwise unchanged."""
         with self.server.atomic():
             for frame, solid in zip(self._solids, shown_solids(scene), strict=False):
                 frame.position, frame.wxyz = self._space(solid.position), _quaternion(self._turn @ solid.turn)
 
     def add_still(self, name: str, positions: Points) -> Any:
-        """Grey points at positions (n, d) [m] that stay where they are, hidden at first."""
+        """Add grey points at positions (n, d) [m] that stay where they are, hidden at first."""
         size = 0.6 * RADIUS * self.scene.discretisation.spacing
         style = {"point_size": size, "point_shape": "circle", "precision": "float32", "visible": False}
         return self.server.scene.add_point_cloud(name, self._space(positions), (150, 146, 140), **style)
@@ -155,7 +155,7 @@ class Window:
         self._cloud.points, self._cloud.colors, self._cloud.point_size = points, colours, size
 
     def _draw_arrows(self, ends: np.ndarray | None) -> None:
-        """From (k, 2, 3) ends; none without."""
+        """Draw arrows from their ends (k, 2, 3); none without."""
         if ends is None:
             self.arrows_legend.content = "" if not self.arrows.value else self.arrows_legend.content
             if self._arrows is not None:
@@ -169,7 +169,7 @@ class Window:
         self._arrows.points, self._arrows.visible = ends, True
 
     def _colours(self, shown: Shown) -> np.ndarray:
-        """(n, 3) sRGB; the legend says from where to where they go, or why there are none."""
+        """Return sRGB colours (n, 3); the legend says their range, or why there are none."""
         from matplotlib import colormaps
 
         name, own = self.colour.value, to_srgb(shown.colours[None])[0]
@@ -187,7 +187,8 @@ class Window:
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
 
     def _arrows_of(self, shown: Shown) -> np.ndarray | None:
-        """(k, 2, 3) ends of arrows from particles; None, with the reason in the legend, where there is no pull."""
+        """Return ends (k, 2, 3) of arrows from particles; None, with the reason in the legend, where there is no
+        pull."""
         try:
             pull = shown.pull()
         except CortadoError as error:
@@ -203,7 +204,7 @@ class Window:
         return self._space(np.stack([starts, starts + scaled[chosen]], axis=1))
 
     def _space(self, points: Points) -> np.ndarray:
-        """(..., 3) float32, of points (..., d), with y up."""
+        """Return points (..., d) as (..., 3) float32, with y up."""
         return _padded(np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32))
 
     def _draw_container(self) -> None:
@@ -212,7 +213,7 @@ class Window:
             self.server.scene.add_line_segments("/container", lines, LINES, **THIN)
 
     def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
-        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; returns the frame that has its pose."""
+        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; return the frame that has its pose."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
         frame = self.server.scene.add_frame(name, show_axes=False, **pose)
         self.server.scene.add_line_segments(f"{name}/edges", _padded(own_lines(solid)), LINES, **THIN)
@@ -235,25 +236,25 @@ class Window:
 
 
 def _padded(points: np.ndarray) -> np.ndarray:
-    """(..., 3) float32, of points (..., d)."""
+    """Return points (..., d) as (..., 3) float32."""
     found = np.asarray(points, dtype=np.float32)
     return np.pad(found, [(0, 0)] * (found.ndim - 1) + [(0, 3 - found.shape[-1])])
 
 
 def _quaternion(turn: Points) -> np.ndarray:
-    """(4,) w, x, y and z, of a rotation matrix (d, d)."""
+    """Return the quaternion w, x, y and z (4,) of a rotation matrix (d, d)."""
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(turn_in_space(turn)).as_quat(), 1)
 
 
 def _upper_end(values: np.ndarray, percentile: float) -> float:
-    """A percentile of (n,) values that is one of them."""
+    """Return a percentile of values (n,) that is one of them."""
     return float(np.percentile(values, percentile, method="higher"))
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
-    """HTML of a bar with the colours, and the numbers at its ends."""
+    """Return HTML of a bar with the colours, and the numbers at its ends."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
@@ -267,14 +268,14 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
 
 
 def in_words(words: str) -> str:
-    """HTML of plain words."""
+    """Return HTML of plain words."""
     return f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{escape(words)}</p>'
 
 
 def quantities_of(
     velocities: np.ndarray, simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
 ) -> dict[str, Quantity]:
-    """By name what is known of particles with velocities (n, d) [m/s] in a state, under ``controls`` as of
+    """Return by name the quantities of particles with velocities (n, d) [m/s] in a state, under ``controls`` as of
     `Simulation.run`. All but the speed raise `InputError` where the solver does not know them."""
     return {
         "speed": lambda: np.linalg.norm(velocities, axis=1),
@@ -286,19 +287,19 @@ def quantities_of(
 
 
 def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Quantity]:
-    """By name those of a state's further fields, such as ones that parts keep, that have a number or a vector for each
+    """Return by name a state's further fields, such as ones that parts keep, that have a number or a vector for each
     particle."""
     own = {name: array for name, array in fields.items() if name not in ADJOINT_FIELDS and array.ndim in (1, 2)}
     return {name: partial(sizes_of, array) for name, array in own.items() if len(array) == particles}
 
 
 def sizes_of(values: np.ndarray) -> np.ndarray:
-    """(n,) numbers as they are, or the lengths of vectors (n, k)."""
+    """Return numbers (n,) as they are, or the lengths of vectors (n, k)."""
     return values if values.ndim == 1 else np.linalg.norm(values, axis=-1)
 
 
 def densities(rollout: Rollout) -> np.ndarray:
-    """(n,) of the first state of a rollout [kg/m3]."""
+    """Return the densities (n,) of the first state of a rollout [kg/m3]."""
     solver = rollout.solver
     if not isinstance(solver, ParticleSolver):
         raise InputError("The solver of this scene has no densities of particles to show.")
@@ -308,7 +309,8 @@ def densities(rollout: Rollout) -> np.ndarray:
 def pull_on_height(
     simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
 ) -> Callable[[], np.ndarray]:
-    """Computes, once, the pull (n, d) [m/m] of a loss that is the height of the centre of mass `AHEAD` of a state."""
+    """Return a function that computes, once, the pull (n, d) [m/m] of a loss that is the height of the centre of mass
+    `AHEAD` of a state."""
 
     @cache
     def pull() -> np.ndarray:
@@ -321,7 +323,8 @@ def pull_on_height(
 
 
 def pull_of(simulation: Simulation, rollout: Rollout, loss: Loss) -> np.ndarray:
-    """(n, d) minus the exact derivative of a loss of a rollout's last state with respect to its first positions."""
+    """Return minus the exact derivative (n, d) of a loss of a rollout's last state with respect to its first
+    positions."""
     colours = np.array([phase.colour for phase in simulation.scene.phase])
     end = Snapshot(rollout.forward().copy(), simulation.dimension, colours)
     bar = simulation.solver.new_state()
@@ -331,7 +334,7 @@ def pull_of(simulation: Simulation, rollout: Rollout, loss: Loss) -> np.ndarray:
 
 
 def upwards(scene: Scene) -> np.ndarray:
-    """(d,) against the scene's gravity; along y where there is none."""
+    """Return the unit vector (d,) against the scene's gravity; along y where there is none."""
     gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
     size = float(np.linalg.norm(gravity))
     return -gravity / size if size else np.eye(len(gravity))[1]
