@@ -235,7 +235,7 @@ def test_a_run_says_when_its_emitter_runs_dry():
     for made, name in ((supplied(duration=0.2), "duration"), (jet(emitter=slot, fluid=[], container=room), "length")):
         assert made.lasting(1.0) is made
         with pytest.warns(CortadoWarning, match=f"runs dry at .*: a longer emitter.{name} gives it more"):
-            Simulation(made).run(time=0.252)
+            Simulation(made, precision="float64").run(time=0.252)
 
 
 def test_a_run_goes_on_with_the_reserve_of_the_run_before():

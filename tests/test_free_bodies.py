@@ -15,7 +15,7 @@ from cortado.solvers.contact_kernels import STIFFNESS
 from finite_differences import central_difference
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
-from scenes import pool, thrown
+from scenes import box, pool, thrown
 
 RAFT = {
     "name": "raft",
@@ -282,7 +282,7 @@ def test_bodies_touch_across_a_period():
 @pytest.mark.parametrize(
     ("made", "loss"),
     [
-        (lambda: plane(RAFT), CentreOfMass([0.5, 0.3])),
+        (lambda: plane(RAFT, container=box([0.0, 0.0], [1.0, 1.0], slip="no")), CentreOfMass([0.5, 0.3])),
         (lambda: space(BRICK), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
         (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
         (touching_across, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
