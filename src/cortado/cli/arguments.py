@@ -95,7 +95,7 @@ class Program:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """The options that choose which states of a run are frames of its trajectory."""
+    """Which states of a run are frames of its trajectory."""
 
     record_every: int | None = None
     """Steps from one frame of the trajectory to the next; if left out 1, or in a sweep a 100th of all steps."""

@@ -12,8 +12,7 @@ import numpy as np
 from cortado.discretise.smoothing import SmoothingKernel
 
 SKIN = 0.03
-"""How far neighbour lists reach beyond the support radius, relative to it: density is also taken at predicted
-positions."""
+"""Reach of neighbour lists beyond the support radius, relative to it: density is also taken at predicted positions."""
 SLACK = 1e-4
 """How far the lattice stays below the rest density, relative.
 
@@ -21,7 +20,7 @@ At the rest density exactly, every particle of a block that starts as a lattice 
 round-off would choose the pressure's derivative, and no finite difference could confirm it.
 """
 RATE_LIMIT = 1.5
-"""`greatest_rate` at most, as the iteration converges below 2; the margin is for particles off the lattice."""
+"""Bound on `greatest_rate`, as the iteration converges below 2; the margin is for particles off the lattice."""
 DIFFUSION_SAFETY = 0.5
 """Part of the lattice's limit on a step of diffusion that is taken; the rest is for particles off the lattice
 (eigenvalues were at most 1.08 times those of the lattice on random particles) and for fractions that stray out of [0,
@@ -29,19 +28,20 @@ DIFFUSION_SAFETY = 0.5
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
-    """Separations (m, d) [m] between a lattice point and all points within the support, itself included."""
+    """Return separations (m, d) [m] between a lattice point and all points within the support, itself included."""
     reach = range(-int(support / spacing) - 1, int(support / spacing) + 2)
     offsets = spacing * np.array(list(itertools.product(reach, repeat=dimension)), dtype=np.float64)
     return offsets[np.linalg.norm(offsets, axis=1) < support]
 
 
 def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
-    """(count^d, d) wave vectors [rad/m] of one octant, up to the shortest waves on the lattice."""
+    """Return wave vectors (count^d, d) [rad/m] of one octant, up to the shortest waves on the lattice."""
     return np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, count), repeat=dimension)))
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with the mass rho_0 V_0 the lattice has the rest density less the slack."""
+    """Return V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with a mass rho_0 V_0 the lattice has the rest density less
+    slack."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
@@ -49,15 +49,15 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
 def _filled(
     kernel: SmoothingKernel, spacing: float, support: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """The `lattice_offsets` (m, d) [m], the gradients of W there (m, d) [1 / m^(d + 1)], and the volume V [m^d] with
-    which the lattice has the rest density exactly."""
+    """Return the `lattice_offsets` (m, d) [m], the gradients of W there (m, d) [1 / m^(d + 1)], and the volume V [m^d]
+    with which the lattice has the rest density exactly."""
     offsets = lattice_offsets(spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
     return offsets, kernel.gradient(offsets, support), volume
 
 
 def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """k = delta dt^2 [m2] (Solenthaler and Pajarola 2009):
+    """Return PCISPH's stiffness k = delta dt^2 [m2] (Solenthaler and Pajarola 2009):
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 
@@ -72,7 +72,7 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
 @cache
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """The factor by which one pressure iteration with the delta of a filled neighbourhood overcorrects the worst
+    """Return the factor by which one pressure iteration with the delta of a filled neighbourhood overcorrects the worst
     pressure wave on the lattice [-].
 
     A pressure wave exp(i k . x) moves the particles so that their density answers with delta times |S(k)|^2 / (2 sum_j
@@ -86,20 +86,20 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
-    """(m,) F = x . G / (|x|^2 + 0.01 h^2) [1 / m^(d + 2)], the factor of second derivatives by differences, at
+    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)], the factor of second derivatives by differences, at
     separations (m, d) [m]."""
     squares = (separations**2).sum(axis=1)
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
 
 def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of `cortado.solvers.pcisph.steps`."""
+    """Return sum_j G_j . G_j [1 / m^(2 d + 2)], the scale of the relaxation beside walls (`solvers.pcisph.steps`)."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
 @cache
 def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """The factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice.
+    """Return the factor [-] that makes the Laplacian 2 V sum_j (u_i - u_j) F_ij exact for a parabola on the lattice.
 
     Without it second derivatives are 1 to 8 % small at any resolution, mostly by the 0.01 h^2 of F.
     """
@@ -109,14 +109,14 @@ def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, suppor
 
 @cache
 def circulation_factor(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """mu = -(V / d) sum_j x_j . G_j of the lattice [-]: there the sum of V v_ij x G_ij is mu times the curl of v."""
+    """Return mu = -(V / d) sum_j x_j . G_j of the lattice [-]: the sum of V v_ij x G_ij is mu times the curl of v."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     return float(-volume * (offsets * gradients).sum() / dimension)
 
 
 @cache
 def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """The size of the greatest eigenvalue [1 / m2] of the corrected Laplacian on the lattice."""
+    """Return the size of the greatest eigenvalue [1 / m2] of the corrected Laplacian on the lattice."""
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     correction = lattice_laplacian_correction(kernel, spacing, support, dimension)
     weights = -2.0 * volume * correction * shear_factor(kernel, offsets, support)
@@ -125,7 +125,7 @@ def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dime
 
 @cache
 def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """The greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force as a map of velocities,
+    """Return the greatest eigenvalue [1 / m2] on the lattice of the pairwise viscous force on velocities,
 
     2 (d + 2) V sum_j F_ij x_ij x_ij^T / |x_ij|^2 (v_i - v_j):
 
@@ -142,16 +142,16 @@ def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 @cache
 def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """C = 4 / (3 m_2) of `cortado.sph.stress_kernels` [-], with the second moment m_2 = V sum_j (-a_j) x_j^2 along an
-    axis of the lattice, grad W = a x."""
+    """Return the damping C = 4 / (3 m_2) of `cortado.sph.stress_kernels` [-], with the second moment m_2 = V sum_j
+    (-a_j) x_j^2 along an axis of the lattice, grad W = a x."""
     return 4.0 / (3.0 * circulation_factor(kernel, spacing, support, dimension))
 
 
 @cache
 def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """The greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`), in a
-    wave of compression: of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) with g = sum_j s_j x_j sin(k . x_j)
-    / m_2."""
+    """Return the greatest eigenvalue [1 / m2] on the lattice of viscosity as a stress (`cortado.sph.stress_kernels`),
+    in a wave of compression: of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) with g = sum_j s_j x_j sin(k .
+    x_j) / m_2."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     others = np.any(offsets != 0.0, axis=1)
     offsets, gradients = offsets[others], gradients[others]
@@ -173,7 +173,7 @@ def diffusion_limit(
     curvature: float,
     density_ratio: float,
 ) -> float:
-    """The longest explicit step [s] of Cahn-Hilliard diffusion, infinite without mobility:
+    """Return the longest explicit step [s] of Cahn-Hilliard diffusion, infinite without mobility:
 
     dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian,
 

@@ -13,24 +13,25 @@ from cortado.discretise.shapes import Numbers, Points, Which, grid, launch_on_cp
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments
 
 LEAF = 8
-"""Triangles at most in a leaf."""
+"""Most triangles in a leaf."""
 BITS = 10
-"""Of each coordinate, by which points that are asked about are sorted: what is near in space is near in memory."""
+"""Bits of each coordinate by which points are sorted: points near in space are near in memory."""
 SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
-"""Shifts and masks that bring so many bits three places apart."""
+"""Shifts and masks that bring the bits three places apart."""
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """Triangles, halved again and again across the longest side of the box around their middles.
+    """A tree of triangles, halved again and again across the longest side of their middles' box. Nodes are numbered as
+    `cortado.discretise.tree_kernels` says.
 
     `cortado.discretise.tree_kernels` says how nodes are numbered.
     """
 
     corners: Points
-    """(k, 3, 3) of the triangles, those of a leaf one after the other [m]"""
+    """(k, 3, 3) corners of the triangles, those of a leaf one after the other [m]"""
     order: Numbers
-    """(k,) which of the triangles that were given each of them is"""
+    """(k,) number of each triangle among the given ones"""
     starts: NDArray[np.int32]
     """(leaves + 1,) the first triangle of each leaf, and one behind the last"""
     boxes: Points
@@ -38,7 +39,7 @@ class TriangleTree:
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
-        """The tree of one triangle or more, by their corners (k, 3, 3) [m]."""
+        """Build the tree of one triangle or more, by their corners (k, 3, 3) [m]."""
         count, middles = len(corners), corners.mean(axis=1)
         levels = max(int(np.ceil(np.log2(count / LEAF))), 0)
         order = np.arange(count)
@@ -57,12 +58,12 @@ class TriangleTree:
         return cls(ordered, order, starts.astype(np.int32), np.concatenate([np.zeros((1, 6)), *boxes[::-1]]))
 
     def moved(self, scale: float, shift: Points) -> "TriangleTree":
-        """The tree with coordinates multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        """Return the tree with coordinates multiplied by a scale greater than 0 and then moved (3,) [m]."""
         corners, boxes = scale * self.corners + shift, scale * self.boxes + np.tile(shift, 2)
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """(n, 3) the nearest points of the triangles [m], and (n,) how far away they are [m], for points (n, 3) [m];
+        """Return the nearest points (n, 3) of the triangles [m], and their distances (n,) [m], for points (n, 3) [m];
         the points themselves and ``reach`` [m] where nothing is nearer than that."""
         order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)  # these take long enough
         nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
@@ -72,14 +73,15 @@ class TriangleTree:
         return found, away
 
     def windings(self, points: Points) -> NDArray[np.int32]:
-        """(n,) how often the triangles go around points (n, 3) [m]; they must be closed."""
+        """Return how often (n,) the triangles go around points (n, 3) [m]; they must be closed."""
         found = np.empty(len(points), dtype=np.int32)
         self.ask("find_windings", points, windings=found)
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """(m, 2) the pairs of triangles that cross: an edge of one goes through the other, further than a tolerance [m]
-        to both sides. Triangles do not cross at vertices that they have in common, by the ``names`` (k, 3) of these."""
+        """Return the pairs (m, 2) of triangles that cross: an edge of one goes through the other, further than a
+        tolerance [m] to both sides. Triangles do not cross at vertices that they have in common, by the ``names`` (k,
+        3) of these."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -93,7 +95,7 @@ class TriangleTree:
         return np.sort(self.order[pairs], axis=1)
 
     def beside(self, other: "TriangleTree", reach: float) -> Numbers:
-        """(m, 2) the pairs of a triangle of this tree and a triangle of another whose boxes are no further apart than a
+        """Return the pairs (m, 2) of a triangle of this tree and one of another whose boxes are no further apart than a
         reach [m] along any axis."""
         pairs = np.ones((1, 2), dtype=np.int64)
         leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
@@ -134,18 +136,18 @@ class TriangleTree:
 
 
 def _starts(count: int, level: int) -> Numbers:
-    """(2^level + 1,) the first triangle of each node of a level, and the number of all."""
+    """Return the first triangle of each node of a level, and the number of all, (2^level + 1,)."""
     return (np.arange(2**level + 1) * count) >> level
 
 
 def _near(first: Points, second: Points, reach: float) -> Which:
-    """(n,) whether boxes (n, 6) are no further apart than a reach along any axis."""
+    """Test (n,) which boxes (n, 6) are no further apart than a reach along any axis."""
     apart = np.maximum(first[:, :3] - second[:, 3:], second[:, :3] - first[:, 3:])
     return np.asarray((apart <= reach).all(axis=1))
 
 
 def _along_a_curve(points: Points) -> Numbers:
-    """(n,) the order of points (n, 3) along a space-filling curve (Morton 1966)."""
+    """Return the order (n,) of points (n, 3) along a space-filling curve (Morton 1966)."""
     if len(points) < 2:
         return np.arange(len(points))
     lower, sides = points.min(axis=0), np.ptp(points, axis=0)
@@ -156,17 +158,17 @@ def _along_a_curve(points: Points) -> Numbers:
 
 
 LYING = 10.0
-"""In the distance at which one looks at what is beside a triangle: triangles nearer than that lie on it."""
+"""In distances at which one looks beside a triangle: nearer triangles lie on it."""
 THIN = 1e-15
-"""Of the width of a triangle: what is thinner is left out of it."""
+"""Part of the width of a triangle below which a piece is left out."""
 
 
 def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
-    """The surface of a union of closed parts, in pieces (n, 3, 3) [m] of their triangles, cut where parts meet, with
-    the weight (n,) of each in integrals over the surface: 0 where both sides of it are inside or outside, less than 1
-    where several triangles lie on each other.
+    """Return the surface of a union of closed parts, in pieces (n, 3, 3) [m] of their triangles, cut where parts meet,
+    with the weight (n,) of each in integrals over the surface: 0 where both sides of it are inside or outside, less
+    than 1 where several triangles lie on each other.
 
     Args:
         corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
@@ -193,8 +195,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Pieces (n, 3, 3) of a triangle (3, 3), none of which others (m, 3, 3) cross, and how many triangles (n,), itself
-    included, lie no further from the middle of each than ``reach``."""
+    """Cut a triangle (3, 3) into pieces (n, 3, 3), none of which others (m, 3, 3) cross, and count the triangles (n,),
+    itself included, that lie no further from the middle of each than ``reach``."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)
@@ -216,12 +218,12 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
 
 
 def _sides(triangles: Points) -> Points:
-    """(3 n, 2, 2) the sides of triangles (n, 3, 3), seen from above."""
+    """Return the sides (3 n, 2, 2) of triangles (n, 3, 3), seen from above."""
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)[..., :2].reshape(-1, 2, 2)
 
 
 def _through(triangles: Points) -> Points:
-    """(m, 2, 2) where triangles (n, 3, 3) cross the plane at height 0."""
+    """Return the segments (m, 2, 2) where triangles (n, 3, 3) cross the plane at height 0."""
     heights, following = triangles[..., 2], np.roll(triangles, -1, axis=1)
     crossed = (heights > 0.0) != (following[..., 2] > 0.0)
     along = (heights / np.where(crossed, heights - following[..., 2], 1.0))[..., None]
@@ -229,7 +231,7 @@ def _through(triangles: Points) -> Points:
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
-    """(n,) whether points (n, 2) are in a triangle (3, 3), seen from above, and (n,) how high it is there."""
+    """Test (n,) which points (n, 2) are in a triangle (3, 3), seen from above, and return its height (n,) there."""
     a, b, c = triangle
     across = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
     if across == 0.0:
@@ -241,8 +243,8 @@ def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
 
 
 def _pieces(segments: Points, lower: float, upper: float) -> Points:
-    """(n, 3, 2) triangles, counterclockwise, between segments (s, 2, 2) in columns from one place to another along the
-    first axis: a new one begins where a segment begins or ends, or where two cross."""
+    """Return triangles (n, 3, 2), counterclockwise, between segments (s, 2, 2) in columns from one place to another
+    along the first axis: a new one begins where a segment begins or ends, or where two cross."""
     order = np.argsort(segments[:, :, 0], axis=1)[..., None]
     (start, below), (end, above) = np.moveaxis(np.take_along_axis(segments, order, axis=1), (1, 2), (0, 1))
     leans = end > start
@@ -275,9 +277,9 @@ def _pieces(segments: Points, lower: float, upper: float) -> Points:
 LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
 """Steps along two axes of a sequence that fills a square evenly: powers of 1 / p, p^3 = p + 1."""
 BESIDE = 1e-12
-"""Of the length of a mesh: how far from a triangle one looks at whether both sides of it are inside."""
+"""Part of the length of a mesh: how far from a triangle one looks whether both sides of it are inside."""
 SEEN = 1e-3
-"""Of the distance of points of a surface: how far outside of it one looks for another part of the solid."""
+"""Part of the distance of points of a surface: how far outside of it one looks for another part of the solid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,13 +300,13 @@ class Mesh(Solid):
     """The trees of the parts, if they are known."""
 
     def moved(self, scale: float, shift: Points) -> "Mesh":
-        """The solid multiplied by a scale greater than 0 and then moved (3,) [m]."""
+        """Return the solid multiplied by a scale greater than 0 and then moved (3,) [m]."""
         trees = [tree.moved(scale, shift) for tree in self._trees]
         return Mesh(scale * self.vertices + shift, self.triangles, self.parts, trees)
 
     @cached_property
     def corners(self) -> Points:
-        """(k, 3, 3) the corners of all triangles [m]."""
+        """Return the corners (k, 3, 3) of all triangles [m]."""
         return self.vertices[self.triangles]
 
     @property
@@ -323,15 +325,15 @@ class Mesh(Solid):
         return self._ends
 
     def distance(self, points: Points) -> Points:
-        """`Solid.distance`, to round-off; where parts overlap, the depth beneath the surface of one of them, which is
-        less."""
+        """Return the `Solid.distance` to round-off; where parts overlap, the depth beneath the surface of one of them,
+        which is less."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
         return self._looked_up(points, reach)[1]
 
     def holds(self, points: Points) -> Which:
-        """(n,) whether points (n, 3) [m] are inside."""
+        """Test (n,) which points (n, 3) [m] are inside."""
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
@@ -347,7 +349,7 @@ class Mesh(Solid):
         return Faces(self.vertices, self.triangles)
 
     def _looked_up(self, points: Points, reach: float) -> tuple[Points, Points]:
-        """(n, 3) the nearest points of the surface, and (n,) the distances, no larger than a reach [m]."""
+        """Return the nearest points (n, 3) of the surface, and the distances (n,), no larger than a reach [m]."""
         found, best = np.empty_like(points), np.full(len(points), np.inf)
         for tree in self._trees:
             places, away = tree.nearest(points, reach)
@@ -357,7 +359,9 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """`Solid.own_feet`.
+        """Return `Solid.own_feet`, points at equal intervals of the area along the triangles, in an order of neighbours
+        in space. In a triangle that has several, these are a sequence of low discrepancy (Roberts 2018, R2), folded
+        into it.
 
         Along the triangles, in an order in which those near each other in space follow one another, a point stands at
         equal intervals of the area; in a triangle that has several, these are a sequence of low discrepancy (Roberts
@@ -395,12 +399,12 @@ class Mesh(Solid):
         return enclosed_moments(*outer_surface(self.corners, np.concatenate(pairs), self.holds, reach))
 
     def normals(self) -> Points:
-        """(k, 3) unit vectors outwards from each triangle; 0 where it has no area."""
+        """Return unit vectors (k, 3) outwards from each triangle; 0 where it has no area."""
         across = self._across
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 
     def areas(self) -> Points:
-        """(k,) of each triangle [m2]."""
+        """Return the area (k,) of each triangle [m2]."""
         return 0.5 * np.linalg.norm(self._across, axis=1)
 
     @cached_property

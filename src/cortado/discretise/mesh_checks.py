@@ -10,16 +10,16 @@ from cortado.errors import InputError
 from cortado.words import counted
 
 SAME = 1e-6
-"""Of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32 rounds
-them."""
+"""Part of the length of a mesh: vertices that are no further apart are one where edges are open otherwise, as float32
+rounds them."""
 COARSE, TOLD = 0.02, 1e-3
 """Of the length of a mesh: coordinates that a file rounds to more are refused, and told of."""
 ASIDE = 1e-6
-"""Of the length of a mesh: how far from a surface one looks at what is beside it."""
+"""Part of the length of a mesh: how far from a surface one looks at its sides."""
 CROSSED = 1e-7
-"""Of the length of a mesh: what goes through a triangle by less only touches it."""
+"""Part of the length of a mesh by which a triangle goes through another one at least; less is a touch."""
 LOOKED_AT = 8192
-"""Triangles about whose sides one asks."""
+"""Most triangles whose sides are looked at."""
 SAME_WAY = 1e-6
 """Angle [rad] between triangles that lie on each other, where two bodies touch."""
 TOGETHER = 1e-3
@@ -51,7 +51,7 @@ class Edges:
 
     @classmethod
     def of(cls, triangles: Numbers) -> "Edges":
-        """The edges of triangles (k, 3)."""
+        """Find the edges of triangles (k, 3)."""
         sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1)
         ends = np.sort(sides, axis=-1)
         span = int(triangles.max(initial=0)) + 1
@@ -61,15 +61,15 @@ class Edges:
 
     @property
     def counts(self) -> Numbers:
-        """(e,) how many triangles meet at each edge."""
+        """Return the number (e,) of triangles that meet at each edge."""
         return np.bincount(self.names.ravel(), minlength=len(self.ends))
 
     def close(self) -> Which:
-        """(e,) whether triangles close at an edge: as many go along it one way as the other."""
+        """Test (e,) whether triangles close at each edge: as many go along it one way as the other."""
         return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
 
     def check(self, vertices: Points, what: str) -> None:
-        """Raises `InputError`, a sentence that calls the mesh ``what``, where the triangles do not close."""
+        """Raise `InputError`, a sentence that calls the mesh ``what``, where the triangles do not close."""
         unbalanced, counts = ~self.close(), self.counts
         for wrong, edge, sentence in (
             (unbalanced & (counts > 2), "edge", MEETING),
@@ -81,17 +81,17 @@ class Edges:
                 raise InputError(sentence.format(what=what, edges=counted(int(wrong.sum()), edge), place=place))
 
     def place(self, edge: int, vertices: Points) -> str:
-        """The middle of an edge, in words."""
+        """Return the middle of an edge, in words."""
         return place_in_file(vertices[self.ends[edge]].mean(axis=0))
 
 
 def place_in_file(place: Points) -> str:
-    """A point in words, for a sentence."""
+    """Write a point in words, for a sentence."""
     return f"({', '.join(f'{value:.7g}' for value in place)}) in the file"
 
 
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
-    """Triangles (k, 3) between vertices (m, 3) that are at different places, or further apart than a tolerance.
+    """Return triangles (k, 3) between vertices (m, 3) at different places, or further apart than a tolerance.
 
     Left out are those that have a vertex twice, what comes once more, and pairs that are back to back, as where two
     bodies touch.
@@ -108,7 +108,7 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _distinct(vertices: Points) -> tuple[Points, Numbers]:
-    """Vertices at different places, and which of them each of those that are given is."""
+    """Return vertices at different places, and the number of each given vertex among them."""
     order = np.lexsort(vertices.T)
     new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
     names = np.empty(len(vertices), dtype=np.int64)
@@ -117,7 +117,7 @@ def _distinct(vertices: Points) -> tuple[Points, Numbers]:
 
 
 def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[Points, Numbers]:
-    """The vertices and names of `_distinct` with one vertex in the place of several no further apart than a
+    """Return vertices and names of `_distinct` with one vertex in the place of several no further apart than a
     tolerance."""
     from scipy.spatial import cKDTree
 
@@ -126,7 +126,7 @@ def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """(count,) the connected component of each of so many nodes, with links (m, 2) between them."""
+    """Return the connected component (count,) of each of ``count`` nodes, with links (m, 2) between them."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -135,7 +135,7 @@ def _connected(links: Numbers, count: int) -> Numbers:
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """(k,) numbers from 0 on of the bodies that triangles (k, 3) of a closed mesh belong to.
+    """Number the bodies of a closed mesh from 0 on, and return the number (k,) of each of its triangles (k, 3).
 
     Triangles that follow one another at an edge with the solid between them are of one body. Raises `InputError`, a
     sentence that calls the mesh ``what``, at an edge from which its surface goes on in more than two directions;
@@ -161,7 +161,7 @@ def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, w
 
 
 def _angles(edge: Points, opposite: Points) -> Points:
-    """(m,) the angles around an edge (2, 3) at which points (m, 3) are seen, right-handed."""
+    """Return the angles (m,) around an edge (2, 3) at which points (m, 3) are seen, right-handed."""
     along = (edge[1] - edge[0]) / np.linalg.norm(edge[1] - edge[0])
     across = np.eye(3)[np.argmin(np.abs(along))]
     right = np.cross(along, across)
@@ -169,8 +169,8 @@ def _angles(edge: Points, opposite: Points) -> Points:
 
 
 def _directions(angles: Points, ways: Numbers) -> int:
-    """The number of directions in which a surface goes on from an edge that triangles share, at angles [rad] and with
-    ways (m,). Triangles that lie on each other and go opposite ways cancel."""
+    """Return the number of directions in which a surface goes on from an edge that triangles share, at angles [rad] and
+    with ways (m,). Triangles that lie on each other and go opposite ways cancel."""
     order = np.argsort(angles)
     angles, ways = angles[order], ways[order]
     groups = np.cumsum(np.diff(angles, prepend=angles[0]) > TOGETHER)
@@ -179,8 +179,8 @@ def _directions(angles: Points, ways: Numbers) -> int:
 
 
 def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
-    """(m / 2, 2) the pairs of triangles around an edge (m,) that bound the same solid wedge: one at which it begins and
-    the next at which one ``ends`` (m,); where two lie on each other, one ends before one begins."""
+    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same solid wedge: one at which it
+    begins and the next at which one ``ends`` (m,); where two lie on each other, one ends before one begins."""
     turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
     order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
     begun, ended, pairs = list[int](), list[int](), []
@@ -196,8 +196,8 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Bodies that overlap in parts within each of which none do: the triangles of each part, none if the mesh is one
-    part that does not cross itself; a triangle at which a body crosses itself, and one of a body inside another, or
+    """Sort bodies that overlap into parts within each of which none do: the triangles of each part, none if the mesh is
+    one part that does not cross itself; a triangle at which a body crosses itself, and one of a body inside another, or
     None.
 
     Args:
@@ -241,8 +241,8 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """(bodies,) the body that each belongs to: a cavity to the least of those around it, all others to themselves.
-    ``around`` (bodies, s): how often each goes around places beside the bodies ``seen`` (s,)."""
+    """Return the body to which each body belongs, (bodies,): a cavity to the least of those around it, all others to
+    themselves. ``around`` (bodies, s): how often each goes around places beside the bodies ``seen`` (s,)."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
         holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
@@ -253,7 +253,7 @@ def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
 
 
 def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
-    """Numbers in as few groups as are found, the largest first, so that none has met another of its group."""
+    """Put numbers into as few groups as are found, the largest first, so that none has met another of its group."""
     groups: list[list[int]] = []
     for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
         free = next((group for group in groups if not met[number, group].any()), None)
@@ -265,29 +265,29 @@ def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
 
 
 def _volume(corners: Points) -> float:
-    """The volume within a closed surface of triangles (k, 3, 3) [m3], negative if its normals point inwards."""
+    """Return the volume within a closed surface of triangles (k, 3, 3) [m3], negative if its normals point inwards."""
     a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6.0)
 
 
 @dataclass(frozen=True, eq=False)
 class FoundMesh:
-    """The solid in a file of triangles."""
+    """The solid in a file of triangles, with notes about the file."""
 
     mesh: Mesh
-    """In the file's unit of length, about an origin of its own."""
+    """The mesh in the file's unit of length, about an origin of its own."""
     origin: Points
-    """(3,) where that is in the file: near the middle of a mesh that is far from the origin of the file, and 0 of all
-    others."""
+    """(3,) place of that origin in the file: near the middle of a mesh that is far from the origin of the file, and 0
+    of all others."""
     notes: tuple[str, ...]
     """Sentences about what is probably not meant."""
     left_out: int
-    """Triangles without area, or that came twice."""
+    """Number of triangles without area, or that came twice."""
 
 
 def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
-    """The solid that triangles (k, 3) between vertices (m, 3) enclose; raises `InputError`, a sentence that calls the
-    mesh ``what``. In the file coordinates are whole multiples of a ``rounding``, if that is not 0."""
+    """Make the solid that triangles (k, 3) between vertices (m, 3) enclose; raise `InputError`, a sentence that calls
+    the mesh ``what``. In the file coordinates are whole multiples of a ``rounding``, if that is not 0."""
     used = vertices[triangles.ravel()]
     if not np.isfinite(used).all():
         wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -327,8 +327,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
 def _solid_parts(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
 ) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """The parts of a closed mesh, with the tree of its triangles, whose bodies have labels (k,), and notes about it;
-    raises `InputError` where it is inside out. ``origin`` (3,) is the place of the mesh in the file."""
+    """Return the parts of a closed mesh, whose bodies have labels (k,), and notes about it; raise `InputError` where it
+    is inside out. ``origin`` (3,) is the place of the mesh in the file."""
     size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
@@ -356,8 +356,8 @@ def _solid_parts(
 
 
 def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    """The sentence of `_solid_parts`, given the body of each triangle that was ``seen``, and ``corners`` (3, 3) of one
-    that is wrong."""
+    """Return the sentence of `_solid_parts`, given the body of each triangle that was ``seen``, and ``corners`` (3, 3)
+    of one that is wrong."""
     if wrong.all():
         return (
             f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "

@@ -18,22 +18,22 @@ from cortado.errors import InputError, Words, shown, warn
 from cortado.files.disk import reason, regular_file
 
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
-"""How a file of triangles may end."""
+"""Endings of files of triangles."""
 MOST_BYTES = 2**30
-"""Of a file."""
+"""Most bytes of a file."""
 LEAST_THICKNESS = 0.5
 """In spacings. In the plane, water 16 spacings deep on one side or on both goes through walls 0.2 spacings thick within
 0.2 s; those 0.3 thick hold it for 1 s, with either solver."""
 SHARE = 0.01
 """Part of the surface that may be too thin without a word."""
 ALONG = 0.9
-"""Cosine between the normals of both sides of a sheet, one of them turned round, at least; of a wedge it is less."""
+"""Least cosine between the normals of both sides of a sheet, one of them turned round; of a wedge it is less."""
 TOO_LARGE = 100.0
-"""Times the length of the container, or 100 spacings without one: a mesh that is longer has another unit of length."""
+"""Times the length of the container, or 100 spacings without one, above which a mesh has another unit of length."""
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
 """Points of a surface at which its thickness is measured, in so many steps, the last of which is halved so often."""
 BEYOND = 1e-3
-"""Of the steps' length: how far behind a solid one looks back at it."""
+"""Part of the steps' length: how far behind a solid one looks back at it."""
 
 
 def read_mesh(
@@ -43,8 +43,8 @@ def read_mesh(
     support: float | None = None,
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
-    """The solid in a file, beside particles a spacing [m] apart that see each other up to a support [m]; or a body of
-    fluid, which may be of any thickness.
+    """Read the solid in a file, beside particles a spacing [m] apart that see each other up to a support [m]; or a body
+    of fluid, which may be of any thickness.
 
     Raises `InputError`, a sentence that names the file and says what is wrong, where, and what to do; warns with
     `CortadoWarning` of what is probably not meant.
@@ -66,7 +66,7 @@ def read_mesh(
 
 
 def mesh_in_file(path: str) -> FoundMesh:
-    """The solid in a file, in its own unit of length, checked by itself; raises `InputError`."""
+    """Read the solid in a file, in its own unit of length, checked by itself; raise `InputError`."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     try:
@@ -80,14 +80,14 @@ def mesh_in_file(path: str) -> FoundMesh:
 
 @lru_cache(maxsize=8)
 def _found(path: str, changed: int, size: int) -> FoundMesh:
-    """The solid in a version of a file, which is known by the time of its last change and its size; read once."""
+    """Read a version of a file, which is known by the time of its last change and its size, once."""
     vertices, triangles, rounding = read_triangles(path)
     return found_mesh(vertices, triangles, repr(path), rounding)
 
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
-    """The vertices (m, 3) and the triangles (k, 3), at least one, of all bodies of a file, where its scene puts them,
-    in its unit of length; and the step to which the file rounds coordinates, 0 if they are not float32. Raises
+    """Read the vertices (m, 3) and the triangles (k, 3), at least one, of all bodies of a file, where its scene puts
+    them, in its unit of length; and the step to which the file rounds coordinates, 0 if they are not float32. Raises
     `InputError`."""
     rounding, is_single = 0.0, _is_single(path)
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
@@ -113,7 +113,7 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
 
 
 def _is_single(path: str) -> bool:
-    """True for a file that has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
+    """Test whether a file has its coordinates as float32: a binary STL, glTF, or a PLY that does not say double."""
     suffix = Path(path).suffix.lower()
     if suffix in (".stl", ".ply"):
         with open(path, "rb") as file:
@@ -138,7 +138,7 @@ def _scene(path: str) -> Any:
 
 
 def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
-    """Raises `InputError`, a sentence that calls the mesh ``what``, where it is far too large or too small."""
+    """Raise `InputError`, a sentence that calls the mesh ``what``, where it is far too large or too small."""
     length = float(np.ptp(mesh.extent(), axis=0).max())
     room = None if container is None else float(np.ptp(container, axis=0).max())
     beside = 100.0 * spacing if room is None else room
@@ -162,27 +162,27 @@ class Thickness:
     points: Points
     """(n, 3) [m]"""
     lengths: Points
-    """(n,) from each straight down to where the solid ends [m]; infinite beyond the reach of the search"""
+    """(n,) lengths from each straight down to the end of the solid [m]; infinite beyond the reach of the search"""
     is_sheet: np.ndarray
-    """(n,) whether the surface where the solid ends is nearly parallel to that at the point"""
+    """(n,) true where the surface at the end of the solid is nearly parallel to that at the point"""
 
     def share(self, which: np.ndarray) -> float:
-        """The part of the surface for which some points (n,) stand."""
+        """Return the part of the surface for which some points (n,) stand."""
         return float(np.count_nonzero(which) / max(len(which), 1))
 
     def place(self, which: np.ndarray) -> str:
-        """The thinnest of some points, in words."""
+        """Write the thinnest of some points, in words."""
         thinnest = self.points[which][np.argmin(self.lengths[which])]
         return f"({', '.join(f'{value:g}' for value in thinnest)}) m"
 
     @property
     def thinnest(self) -> float:
-        """The thickness of sheets [m] that all but `SHARE` of the surface exceeds; infinite without sheets."""
+        """Return the thickness of sheets [m] that all but `SHARE` of the surface exceeds; infinite without sheets."""
         return float(np.quantile(np.where(self.is_sheet, self.lengths, np.inf), SHARE, method="higher"))
 
 
 def thickness_of(mesh: Mesh, reach: float) -> Thickness:
-    """The thickness of a mesh where it is less than a reach [m]."""
+    """Measure the thickness of a mesh where it is less than a reach [m]."""
     points, outward = mesh.own_feet(float(np.sqrt(mesh.areas().sum() / PROBES)))
     depths = reach * (np.arange(STEPS) + 1.0) / STEPS
     inside = np.array([mesh.holds(points - depth * outward) for depth in depths])
@@ -197,8 +197,8 @@ def thickness_of(mesh: Mesh, reach: float) -> Thickness:
 
 
 def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
-    """Sentences about a mesh that is thin beside the support [m]; raises `InputError` where it cannot keep fluid out.
-    ``origin`` (3,): that of the mesh in the file, times the scale [m]."""
+    """Yield sentences about a mesh that is thin beside the support [m]; raise `InputError` where it cannot keep fluid
+    out. ``origin`` (3,): that of the mesh in the file, times the scale [m]."""
     found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
     found = replace(found, points=origin + found.points)
     sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet

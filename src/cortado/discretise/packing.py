@@ -21,7 +21,7 @@ from cortado.files.terminal import timed_note
 
 Int32s = NDArray[np.int32]
 MOST_CELLS = 2_000_000
-"""Of a grid: what is further apart shares them."""
+"""Most cells of a grid: points that are further apart share them."""
 NO_LIMIT = 2**31 - 1
 
 
@@ -34,27 +34,27 @@ class PointsAround:
     points: Points
     """(m, d) [m]"""
     weights: Points
-    """(m,) what each counts for in the density, a particle being 1 [-]"""
+    """(m,) weight of each in the density, a particle being 1 [-]"""
     air: tuple[int, int]
     """Number of the first point of air, which blind particles do not see, and of the first one behind the last."""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
     reach: float
-    """How far particles look [m]."""
+    """Distance up to which particles look [m]."""
 
     def near(self, particles: Points) -> Which:
-        """(n,) whether there is a point within the reach of particles (n, d) [m]."""
+        """Test (n,) whether there is a point within the reach of particles (n, d) [m]."""
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """(n,) the weighted sum of the kernels of the points [1 / m^d] at particles (n, d) [m], of which those that are
-        ``blind`` (n,) see no air; the reach is the support."""
+        """Return the weighted sums (n,) of the points' kernels [1 / m^d] at particles (n, d) [m], of which those that
+        are ``blind`` (n,) see no air; the reach is the support."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
-        """Neighbour lists of the first n points, at ``particles`` (n, d) [m], each with the points of higher numbers
-        within the reach: where the list of each begins (n,) and ends (n,), and numbers of points, with gaps between
-        the lists."""
+        """Return neighbour lists of the first n points, at ``particles`` (n, d) [m], each with the points of higher
+        numbers within the reach: where the list of each begins (n,) and ends (n,), and numbers of points, with gaps
+        between the lists."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -65,7 +65,7 @@ class PointsAround:
             room = int(counts.max())
 
     def _looked(self, particles: Points, blind: Which, **given: Any) -> dict[str, Any]:
-        """The outputs of the kernel ``look_around``, by name."""
+        """Return the outputs of the kernel ``look_around``, by name."""
         count = len(particles)
         given = {"are_own": False, "most": NO_LIMIT, "starts": np.zeros(count + 1, dtype=np.int32), **given}
         found = {"others": np.zeros(1, dtype=np.int32), "counts": np.zeros(count, dtype=np.int32), **given}
@@ -78,17 +78,17 @@ class PointsAround:
 
     @property
     def volume(self) -> float:
-        """Volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
+        """Return the volume of a particle [m^d], with which the sum of kernels on the lattice gives its density."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @property
     def own_weight(self) -> float:
-        """The kernel of a particle at its own place [1 / m^d]."""
+        """Return the kernel of a particle at its own place [1 / m^d]."""
         return float(self.lattice.weights(np.zeros((1, self.lattice.dimension)))[0])
 
     @cached_property
     def kernels(self) -> Any:
-        """The `packing_kernels` for the lattice's smoothing kernel."""
+        """Make the `packing_kernels` for the lattice's smoothing kernel."""
         from cortado.device.warp_start import start_warp
 
         start_warp()
@@ -98,12 +98,12 @@ class PointsAround:
 
     @cached_property
     def in_space(self) -> Points:
-        """(m, 3) the points as kernels see them [m]."""
+        """Return the points (m, 3) as kernels see them [m]."""
         return in_space(self.points)
 
     @cached_property
     def on_cpu(self) -> Any:
-        """The points as the struct ``Around`` of kernels."""
+        """Return the points as the struct ``Around`` of kernels."""
         around, dimension = self.kernels.around(), self.lattice.dimension
         around.x, around.weights = shared(self.in_space), shared(self.weights)
         around.air, around.behind_air = self.air
@@ -115,7 +115,7 @@ class PointsAround:
 
     @cached_property
     def _by_cell(self) -> tuple[Any, Any]:
-        """The points in the order of cells as wide as the reach, and the grid of these."""
+        """Return the points in the order of cells as wide as the reach, and the grid of these."""
         from cortado.device.grid import Grid
 
         ends = self.points.min(axis=0), self.points.max(axis=0)
@@ -131,12 +131,12 @@ class PointsAround:
 
 
 def in_space(points: Points) -> Points:
-    """(..., 3) points (..., d), with 0 along an axis that there is not."""
+    """Return points (..., d) as (..., 3), with 0 along a missing axis."""
     return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
 
 
 def starts_of(counts: Numbers | Int32s) -> Int32s:
-    """(n + 1,) where each of lists of these lengths (n,) begins, one behind the other, and the end."""
+    """Return the starts (n + 1,) of lists of these lengths (n,), one behind the other, and the end."""
     return np.append(0, np.cumsum(counts)).astype(np.int32)
 
 
@@ -144,47 +144,47 @@ HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
 """Of a packed particle's density beside that of the lattice, relative. It is not above, or pressure would drive the
 particles apart in the first step."""
 ROUNDS = 6
-"""Of least squares, until those that move are chosen anew."""
+"""Rounds of least squares, until the particles that move are chosen anew."""
 LISTED = 0.6
-"""[spacings] beyond the support up to which pairs are kept for the rounds to come."""
+"""Distance [spacings] beyond the support up to which pairs are kept for the rounds to come."""
 NEAR = 0.9
-"""[spacings]: pairs of particles that are nearer push each other apart."""
+"""Distance [spacings] below which pairs of particles push each other apart."""
 PUSH = 0.1
-"""What a pair that is too near by a spacing counts, beside a density that is wrong by its whole."""
+"""Weight of a pair that is too near by a spacing, beside a density that is wrong by its whole."""
 FARTHEST = 0.15
-"""[spacings] that a particle moves in a round at most, as the equations are linear only nearby."""
+"""Greatest move [spacings] of a particle in a round, as the equations are linear only nearby."""
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 """Of the linear least squares: among solutions that are nearly as good, the one that moves particles least."""
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """(n,) by how much densities are above that of the lattice, relative, given sums of kernels (n,) [1 / m^d]; 0 for
-    particles that stay where it is below."""
+    """Return by how much (n,) densities are above that of the lattice, relative, given sums of kernels (n,) [1 / m^d];
+    0 for particles that stay where it is below."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Densities, and distances of pairs that are close, to first order in the moves of particles: products of their
-    derivatives at some places, without a matrix."""
+    """A linearisation of densities, and of distances of close pairs, to first order in the moves of particles: products
+    of their derivatives at some places, without a matrix."""
 
     kernels: Any
     equations: Any
     """The derivatives, as kernels see them."""
     sums: Points
-    """(n,) of kernels at the particles [1 / m^d]"""
+    """(n,) sums of kernels at the particles [1 / m^d]"""
     distances: Points
-    """(m,) of pairs that are close [m]"""
+    """(m,) distances of pairs that are close [m]"""
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
-        """By how much the sums (n,) [1 / m^d] and the distances (m,) [m] change with moves (n, 3) [m]."""
+        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] by moves (n, 3) [m]."""
         changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
         self._launch(self.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
         return changes, approaches
 
     def multiply_back(self, changes: Points, approaches: Points) -> Points:
-        """(n, 3) the product with the transpose."""
+        """Return the product (n, 3) with the transpose of the derivatives."""
         moves = np.zeros((len(changes), 3))
         self._launch(self.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
         return moves
@@ -194,8 +194,8 @@ class Linearised:
 
 
 class Relaxation:
-    """Least squares for the places of particles, the first n of the points around, of which some are ``free`` (n,) to
-    move. Those that stay (n,) do not see air. Pairs are listed once, as no particle moves further than it looks."""
+    """The least squares for the places of particles, the first n of the points around, of which some are ``free`` (n,)
+    to move. Those that stay (n,) do not see air. Pairs are listed once, as no particle moves further than it looks."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -203,7 +203,7 @@ class Relaxation:
         self._given = {"around": around.on_cpu, "free": free, "starts": starts, "ends": ends, "listed": listed}
 
     def relaxed(self) -> Points:
-        """Particles (n, d) [m] after `ROUNDS` of least squares for those that are free, or fewer."""
+        """Return particles (n, d) [m] after `ROUNDS` of least squares for the free ones, or fewer."""
         spacing, places = self._around.lattice.spacing, self._around.in_space[: len(self._free)]
         first, dimension = places.copy(), self._around.points.shape[1]
         for _ in range(ROUNDS):
@@ -215,7 +215,7 @@ class Relaxation:
         return places[:, :dimension].copy()
 
     def _solved(self) -> Points:
-        """(n, 3) moves [spacings] from where the particles are now."""
+        """Return moves (n, 3) [spacings] from where the particles are now."""
         from scipy.sparse.linalg import LinearOperator, lsmr
 
         spacing, count = self._around.lattice.spacing, len(self._free)
@@ -240,7 +240,7 @@ class Relaxation:
         return np.asarray(found.reshape(-1, 3))
 
     def linearised(self, close: float) -> Linearised:
-        """The derivatives where the particles are now, and those of distances that are less than ``close`` [m]."""
+        """Return the derivatives where the particles are now, and those of distances below ``close`` [m]."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         sums, distances = np.full(count, self._around.own_weight), np.empty(most)
         close_starts = np.zeros(count + 1, dtype=np.int32)
@@ -270,7 +270,7 @@ BESIDE, MOST_OUT = 10.0, 40
 ROUND_OFF = 1e-9
 """By how much, relative, particles of a lattice may be further away than they are."""
 MANY = 20_000
-"""Particles: a line announces the packing of so many, as it takes some seconds or minutes."""
+"""Number of particles whose packing a line announces, as it takes some seconds or minutes."""
 GRAINS = 2.0**13
 """Particles move by whole numbers of this part of a spacing, so that round-off, which differs between machines, does
 not show in where they are."""
@@ -278,34 +278,34 @@ not show in where they are."""
 
 @dataclass(frozen=True)
 class Packing:
-    """Packs particles among fixed points of air and of walls."""
+    """A packing of particles among fixed points of air and of walls."""
 
     lattice: RestLattice
     """The lattice of the fluid at rest."""
     fixed: Points
     """(m, d) points of air and of walls [m]"""
     weights: Points
-    """(m,) what each counts for in the density, a particle being 1 [-]"""
+    """(m,) weight of each in the density, a particle being 1 [-]"""
     air: int
-    """How many of the fixed points, the first ones, are air."""
+    """Number of the fixed points, the first ones, that are air."""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Places at rest (m, d) [m] of particles (n, d) [m], of which some stay where they are, ``stays`` (n,), and the
-        numbers (m,) of those that there is room for. The last few answers are kept."""
+        """Return places at rest (m, d) [m] of particles (n, d) [m], of which some stay where they are, ``stays`` (n,),
+        and the numbers (m,) of those for which there is room. The last few answers are kept."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
         found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """(m,) by how much the densities of ``some`` of particles (n, d) [m] are above that of the lattice, relative; 0
-        for those that stay (n,), around which no air is counted, where they are below it."""
+        """Return by how much (m,) the densities of ``some`` of particles (n, d) [m] are above the lattice's, relative.
+        It is 0 for those that stay (n,), around which no air is counted, where they are below it."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Compute what `packed` returns. No particle moves that has the rest density already; while some are
+        """Compute the result of `packed`. No particle moves that has the rest density already; while some are
         compressed, as in wedges or where a small body was rounded up to a whole particle, those that are most are left
         out."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
@@ -319,7 +319,7 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """The numbers (m,) of particles (n, d) [m] that are compressed, and not less than any beside them."""
+        """Return the numbers (m,) of particles (n, d) [m] that are compressed, and not less than any beside them."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support
@@ -329,7 +329,7 @@ class Packing:
         return np.delete(over, np.unique(less))
 
     def _at_rest(self, particles: Points, stays: Which) -> Points:
-        """Places at rest (n, d) [m] of all particles (n, d) [m]."""
+        """Return places at rest (n, d) [m] of all particles (n, d) [m]."""
         found = particles
         for _ in range(MOST_LOOKS):
             wrong = self._wrong(found, stays)
@@ -339,8 +339,8 @@ class Packing:
         return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Particles (n, d) [m] after those near the ones that are ``wrong`` (n,) were moved. Nothing further away is
-        looked at meanwhile, as there may be very much of it."""
+        """Return particles (n, d) [m] after those near the ones that are ``wrong`` (n,) were moved. Nothing further
+        away is looked at meanwhile, as there may be very much of it."""
         support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)
@@ -363,27 +363,27 @@ class Packing:
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
-        """(n,) which particles are at most ``reach`` [m] from one of some of them."""
+        """Test (n,) which particles are at most ``reach`` [m] from one of some of them."""
         others = particles[some]
         weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
         found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
         return found.near(particles)
 
     def _around(self, particles: Points, reach: float) -> PointsAround:
-        """The surroundings of particles (n, d) [m] up to ``reach`` [m]: one another, and what is fixed."""
+        """Return the surroundings of particles (n, d) [m] up to ``reach`` [m]: one another, and the fixed points."""
         count = len(particles)
         points, weights = np.concatenate([particles, self.fixed]), np.append(np.ones(count), self.weights)
         return PointsAround(self.lattice, points, weights, (count, count + self.air), self.lengths, reach)
 
     def _among(self, others: Points) -> "Packing":
-        """This packing with further fixed particles (m, d) [m]."""
+        """Return this packing with further fixed particles (m, d) [m]."""
         weights = np.append(self.weights, np.ones(len(others)))
         return replace(self, fixed=np.concatenate([self.fixed, others]), weights=weights)
 
 
 @lru_cache(maxsize=8)
 def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, Numbers]:
-    """See `Packing.packed`: simulations of one scene are made more than once."""
+    """Pack particles as `Packing.packed` says, and keep the result: one scene is simulated more than once."""
     *numbers, stays = arrays
     fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
     packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)

@@ -25,16 +25,16 @@ cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.
 
 @wp.struct
 class Around:
-    """Points that particles see, and what they are in the density."""
+    """The points that particles see in a packing, with their weights in the density."""
 
     x: wp.array(dtype=vector)
     """[m]"""
     weights: wp.array(dtype=real)
-    """What each counts for, a particle being 1 [-]."""
+    """Weight of each in the density, a particle being 1 [-]."""
     air: wp.int32
-    """The first of those that some particles do not see."""
+    """Number of the first point that some particles do not see."""
     behind_air: wp.int32
-    """One behind the last of them."""
+    """One behind the last of these points."""
     is_periodic: wp.bool
     period: vector
     """[m], 0 along an axis without one"""
@@ -53,31 +53,31 @@ class Placed:
     x: wp.array(dtype=vector)
     """[m]"""
     numbers: wp.array(dtype=wp.int32)
-    """Which points they are."""
+    """Numbers of the points."""
 
 
 @wp.struct
 class Equations:
-    """Derivatives of densities, and of the distances of pairs that are too near each other. Both are by lists of pairs
-    of which one may move at least; those with particle i as the first begin at ``starts[i]``."""
+    """The derivatives of densities, and of the distances of pairs that are too near each other. Both are by lists of
+    pairs of which one may move at least; those with particle i as the first begin at ``starts[i]``."""
 
     starts: wp.array(dtype=wp.int32)
     others: wp.array(dtype=wp.int32)
-    """The second of each pair within the support."""
+    """Second particle of each pair within the support."""
     gradients: wp.array(dtype=vector)
     """The derivative of the sum of kernels of either by their separation [1 / m^(d + 1)]."""
     own: wp.array(dtype=vector)
-    """That of a particle's sum by its own place, for what is fixed [1 / m^(d + 1)]."""
+    """Derivative of a particle's sum by its own place, for fixed points [1 / m^(d + 1)]."""
     close_starts: wp.array(dtype=wp.int32)
     close_others: wp.array(dtype=wp.int32)
-    """The second of each pair that is too near."""
+    """Second particle of each pair that is too near."""
     directions: wp.array(dtype=vector)
     """Unit vectors from it to the first."""
 
 
 @wp.func
 def separation(x_i: vector, x_j: vector, around: Around) -> vector:
-    """The separation x_i - x_j of the nearest image [m]."""
+    """Return the separation x_i - x_j of the nearest image [m]."""
     x_ij = x_i - x_j
     if around.is_periodic:
         s = wp.cw_mul(x_ij, around.frequency)
@@ -87,7 +87,7 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @dataclass(frozen=True)
 class PackingKernels:
-    """See `packing_kernels`."""
+    """The Warp kernels of a packing, made by `packing_kernels`."""
 
     look_around: Any
     linearise: Any
@@ -101,7 +101,7 @@ class PackingKernels:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
-    """The kernels for a smoothing kernel."""
+    """Make the kernels of a packing for a smoothing kernel."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -123,9 +123,9 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         sums: wp.array(dtype=real),
         others: wp.array(dtype=wp.int32),
     ):
-        """How many of what is ``around`` are within reach of particles at x, no more than ``most``; which they are, as
-        far as there is room from ``starts`` on; and the sum of their weighted kernels. ``blind`` particles do not see
-        air; where they ``are_own``, particle i is the i-th of what is around, and not within its own reach."""
+        """Count the points ``around`` within reach of particles at x, up to ``most``; list them, as far as there is
+        room from ``starts`` on; and sum up their weighted kernels. ``blind`` particles do not see air; where they
+        ``are_own``, particle i is the i-th of the points, and not within its own reach."""
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -163,9 +163,9 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         # out
         distances: wp.array(dtype=real),
     ):
-        """Adds up the weighted kernels of what is ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
-        particles before it, each particle appends its own to the equations, if one of them is free; and how far apart
-        those are that are nearer than ``close`` [m]."""
+        """Add up the weighted kernels of points ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
+        particles before it, each particle appends its own to the equations, if one of them is free; and the distances
+        of pairs nearer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)
@@ -208,7 +208,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         changes: wp.array(dtype=real),
         approaches: wp.array(dtype=real),
     ):
-        """Adds by how much sums of kernels and distances change with the particles' moves."""
+        """Add the changes of sums of kernels and distances by the particles' moves."""
         i = wp.tid()
         move = moves[i]
         change = wp.dot(equations.own[i], move)
@@ -229,7 +229,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         # in and out
         moves: wp.array(dtype=vector),
     ):
-        """Adds the product with the transpose."""
+        """Add the product of changes and approaches with the transposed derivatives to the moves."""
         i = wp.tid()
         change = changes[i]
         move = change * equations.own[i]

@@ -20,7 +20,7 @@ from cortado.discretise.solid import (
 )
 
 FACING = 0.9
-"""Cosine between the normals of two sides of a polygon, one of them turned round, at least, where it is a sheet."""
+"""Least cosine between the normals of two sides of a polygon, one of them turned round, where it is a sheet."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Round(Solid):
-    """All points no further than a radius from a segment about the origin: a capsule, or a sphere (in 2-D a disc) where
-    the segment has no length."""
+    """A round solid, all points no further than a radius from a segment about the origin: a capsule, or a sphere (in
+    2-D a disc) where the segment has no length."""
 
     half: Points
     """(d,) from the middle of the segment to its end [m]"""
@@ -88,7 +88,7 @@ class Round(Solid):
         return upright.moved(_standing(along), np.zeros(len(along)))
 
     def moments(self) -> Moments:
-        """A rod and two half balls at its ends."""
+        """Return the moments of a rod and two half balls at its ends."""
         dimension, length, r = len(self.half), float(np.linalg.norm(self.half)), self.radius
         disc, ball = (2.0 * r, np.pi * r**2) if dimension == 2 else (np.pi * r**2, 4.0 / 3.0 * np.pi * r**3)
         rod = 2.0 * length * disc
@@ -100,7 +100,7 @@ class Round(Solid):
         return Moments(rod + ball, np.zeros(dimension), second)
 
     def _within(self, points: Points) -> Points:
-        """(n, d) the nearest points of the segment."""
+        """Return the nearest points (n, d) of the segment."""
         square = float(self.half @ self.half)
         along = np.clip(points @ self.half / square, -1.0, 1.0) if square > 0.0 else np.zeros(len(points))
         return np.asarray(along[:, None] * self.half)
@@ -137,19 +137,19 @@ class Revolved(Solid):
         return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
 
     def _flat(self, points: Points) -> Points:
-        """(n, 2) distance from the axis, and height [m]."""
+        """Return distance from the axis, and height, (n, 2) [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
 
 
 @dataclass(frozen=True)
 class HalfSpace(Solid):
-    """All that is below a plane; pictures show the part of it in a box."""
+    """A half space, all that is below a plane; pictures show the part of it in a box."""
 
     normal: Points
     """(d,) unit vector upwards"""
     height: float
-    """Of the plane along it [m]."""
+    """Height of the plane along it [m]."""
     lower: Points
     """(d,) [m]"""
     upper: Points
@@ -212,8 +212,8 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """The least thickness between sides that are nearly parallel, and share no corner [m]; infinite where no two
-        face each other."""
+        """Return the least thickness between sides that are nearly parallel, and share no corner [m]; infinite where no
+        two face each other."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]
@@ -234,7 +234,7 @@ class Polygon(Solid):
         return found
 
     def _holds(self, points: Points) -> Which:
-        """(n,) by the number of sides that a ray along the first axis crosses."""
+        """Test (n,) which points are inside, by the number of sides that a ray along the first axis crosses."""
         inside = np.zeros(len(points), dtype=bool)
         for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
             if y_0 == y_1:
@@ -245,20 +245,20 @@ class Polygon(Solid):
 
 
 def _standing(direction: Points) -> Points:
-    """(d, d) the rotation matrix that turns the last axis to a unit vector (d,)."""
+    """Return the rotation matrix (d, d) that turns the last axis to a unit vector (d,)."""
     frame = np.stack([*across(direction), direction], axis=1)
     frame[:, 0] *= np.linalg.det(frame)
     return frame
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """The lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid; its last cells may reach beyond the end
-    of the box by less than half a spacing."""
+    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid; its last cells may reach beyond
+    the end of the box by less than half a spacing."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 
 
 def points_inside(solid: Solid, spacing: float) -> Points:
-    """(n, d) [m] the points of the lattice in the box around a solid that are inside of it."""
+    """Return the points (n, d) [m] of the lattice in the box around a solid that are inside of it."""
     points = block_around(solid, spacing).points()
     return np.asarray(points[solid.distance_up_to(points, spacing) < 0.0])

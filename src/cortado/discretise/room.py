@@ -12,7 +12,7 @@ from cortado.discretise.shapes import Points, apart, wrapped
 from cortado.discretise.solid import Placed, Solid
 
 TOLERANCE = 0.5
-"""In spacings: how far outside of its container a particle may be. Walls bring back what is less far; light fluid among
+"""In spacings: how far outside of its container a particle may be. Walls bring nearer ones back; light fluid among
 heavier is pressed there at times."""
 
 
@@ -30,45 +30,45 @@ class Region:
     """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder, and
     all 1 for a sphere, whose middle ``base`` then is"""
     radius: float = np.inf
-    """Of the cylinder or the sphere [m]."""
+    """Radius of the cylinder or the sphere [m]."""
     rim: float = np.inf
-    """Where the open end of a cylinder is along its axis [m], infinite if it has a lid."""
+    """Height of the open end of a cylinder along its axis [m], infinite if it has a lid."""
 
     @classmethod
     def between(cls, lower: Points, upper: Points) -> "Region":
-        """A box between corners (d,) [m]."""
+        """Return the region of a box between corners (d,) [m]."""
         return cls(lower, upper, np.zeros(len(lower)), np.zeros(len(lower)))
 
     @classmethod
     def everywhere(cls, dimension: int) -> "Region":
-        """All of space."""
+        """Return the region of all of space."""
         return cls.between(np.full(dimension, -np.inf), np.full(dimension, np.inf))
 
     @classmethod
     def ball(cls, centre: Points, radius: float) -> "Region":
-        """A sphere, or a disc in 2-D, about a centre (d,) [m], with a radius [m]."""
+        """Return the region of a sphere, or a disc in 2-D, about a centre (d,) [m], with a radius [m]."""
         everywhere = cls.everywhere(len(centre))
         return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """A cylinder that stands on the middle of its base (d,) [m] along an axis of space."""
+        """Return the region of a cylinder that stands on the middle of its base (d,) [m] along an axis of space."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """(n,) distances [m] of points (n, d) [m] from the region, negative inside; beyond an edge or a corner that
-        from the nearer face, which is less."""
+        """Return distances (n,) [m] of points (n, d) [m] from the region, negative inside; beyond an edge or a corner
+        that from the nearer face, which is less."""
         from_faces = np.full(len(points), -np.inf)
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # as short rows take NumPy long
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """For each side at a finite place, the function of points (n, d) [m] that gives their distances (n,) from it,
-        positive inside [m]."""
+        """Yield for each side at a finite place the function of points (n, d) [m] that gives their distances (n,) from
+        it, positive inside [m]."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -77,7 +77,7 @@ class Region:
             yield lambda points: np.asarray(self.radius - self._from_axis(points))
 
     def nearest(self, points: Points) -> Points:
-        """(n, d) [m] the points of the region nearest to points (n, d) [m]."""
+        """Return the points (n, d) [m] of the region nearest to points (n, d) [m]."""
         boxed = np.clip(points, self.lower, self.upper)
         across = (boxed - self.base) * self.across
         from_axis = np.linalg.norm(across, axis=1, keepdims=True)
@@ -85,14 +85,14 @@ class Region:
         return np.asarray(boxed - inwards * across)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        """Test (n,) which points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
         found = self._from_axis(points) <= self.radius + tolerance
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             found &= (x >= lower - tolerance) & (x <= upper + tolerance)
         return np.asarray(found)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
+        """Return the part (n,) of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
         region; along a cylinder's side the cell counts as turned with it."""
         half, found = 0.5 * spacing, np.ones(len(points))
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
@@ -101,8 +101,8 @@ class Region:
         return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
 
     def _from_axis(self, points: Points) -> Points:
-        """(n,) distances [m] of points (n, d) [m] from the axis of the cylinder or the middle of the sphere; 0 without
-        either."""
+        """Return distances (n,) [m] of points (n, d) [m] from the axis of the cylinder or the middle of the sphere; 0
+        without either."""
         squares = np.zeros(len(points))
         for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
             if is_across:
@@ -110,19 +110,19 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """(n,) whether particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]: over the rim
-        of an open cup they may go, and one that was outside already has not gone through."""
+        """Test (n,) which particles went through a wall from ``before`` (n, d) [m] to ``after`` (n, d) [m]: over the
+        rim of an open cup they may go, and one that was outside already has not gone through."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
     def is_below_rim(self, points: Points) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are lower than the rim of an open cup; all are without one."""
+        """Test (n,) which points (n, d) [m] are lower than the rim of an open cup; all are without one."""
         if not np.isfinite(self.rim):
             return np.ones(len(points), dtype=bool)
         return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
-        """The region without sides along axes with a period; ``periods`` (d,) [m] are 0 along the others."""
+        """Return the region without sides along axes with a period; ``periods`` (d,) [m] are 0 along the others."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
 
@@ -132,7 +132,7 @@ def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
 
 
 ALONG = 1e-3
-"""Directions whose angle [rad] is smaller than this count as the same: images along them are not told apart."""
+"""Angle [rad] below which directions count as one: images along them are not told apart."""
 
 
 @dataclass(frozen=True)
@@ -140,35 +140,35 @@ class Domain:
     """One period of a scene. Positions go on beyond its ends, and a place sees all images of particles."""
 
     lower: tuple[float, ...]
-    """(d,) where it begins [m]; 0 along an axis that is not periodic."""
+    """(d,) beginning of the period [m]; 0 along an axis that is not periodic."""
     lengths: tuple[float, ...]
-    """(d,) how long it is [m]; 0 along an axis that is not periodic."""
+    """(d,) length of the period [m]; 0 along an axis that is not periodic."""
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
-        """A domain from where it begins (d,) [m] and its lengths (d,) [m], 0 along axes without a period."""
+        """Make the domain of a period that begins at (d,) [m] with lengths (d,) [m], 0 along axes without one."""
         axes = lengths > 0.0
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
     def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
-        """The lower ends [m], the lengths [m] and the inverse lengths [1/m], as Warp vectors."""
+        """Return the lower ends [m], the lengths [m] and the inverse lengths [1/m], as Warp vectors."""
         rest = (0.0,) * (3 - len(self.lengths))
         frequency = (1.0 / length if length else 0.0 for length in self.lengths)
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
 
     def wrapped(self, points: Points) -> Points:
-        """The images of points (..., d) [m] that are within the period; along other axes as they are."""
+        """Return the images of points (..., d) [m] that are within the period; along other axes as they are."""
         lower = np.array(self.lower)
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
 
     def shortest(self, ways: Points) -> Points:
-        """Ways (n, d) [m] to the nearest images, from those (n, d) [m] to any image."""
+        """Return ways (n, d) [m] to the nearest images, from those (n, d) [m] to any image."""
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
-        """The images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower corner
-        where none is; and whether they are in it (n,). An end that is infinite is that of the period, if there is one;
-        a region that is longer than the period is the period."""
+        """Return the images of points (n, d) [m] that are in a region between corners (d,) [m], or behind its lower
+        corner where none is, and a mask (n,) of those in it. An end that is infinite is that of the period, if there is
+        one; a region that is longer than the period is the period."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
         end = np.where(np.isfinite(upper), upper, begin + lengths)
@@ -180,9 +180,9 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """The ways (n, k) from a place (d,) to all images of points (n, d) within a reach [m], as ``seen`` shows them:
-        a linear function of ways (n, d), such as what is left of them across a direction. Every array has one image of
-        each point.
+        """Return the ways (n, k) from a place (d,) to all images of points (n, d) within a reach [m], as ``seen`` shows
+        them: a linear function of ways (n, d), such as their part across a direction. Every array has one image of each
+        point.
 
         Images that ``seen`` does not tell apart count once: as those within the period.
         """
@@ -199,12 +199,12 @@ class Domain:
 
 
 WITHOUT_PERIODS = Domain((), ())
-"""Nothing repeats."""
+"""The domain in which nothing repeats."""
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """(m, k) from image to image, along as many periodic axes as are independent when they are seen as ``axes`` (d, k):
-    first along those that are seen best."""
+    """Return vectors (m, k) from image to image, along as many periodic axes as are independent when they are seen as
+    ``axes`` (d, k): first along those that are seen best."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)
@@ -219,7 +219,7 @@ def _independent(axes: Points, lengths: Points) -> Points:
 
 @dataclass(frozen=True)
 class Room:
-    """A region less the solids in it, which come again with every period."""
+    """The room of fluid: a region less the solids in it, which come again with every period."""
 
     region: Region
     solids: Sequence[Solid]
@@ -228,36 +228,36 @@ class Room:
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """(n,) distances [m] of points (n, d) [m] from the nearest solid, negative inside one; infinite without any. A
-        distance of a size not less than a reach [m] may be any other such number of its sign."""
+        """Return distances (n,) [m] of points (n, d) [m] from the nearest solid, negative inside one; infinite without
+        any. A distance of a size not less than a reach [m] may be any other such number of its sign."""
         if not self.solids:
             return np.full(len(points), np.inf)
         images = [points + shift for shift in self.shifts()]
         return np.min([solid.distance_up_to(image, reach) for image in images for solid in self.solids], axis=0)
 
     def distance(self, points: Points, reach: float = np.inf) -> Points:
-        """(n,) distances [m] of points (n, d) [m] from the room, negative inside, with a reach as of `from_solids`."""
+        """Return distances (n,) [m] of points (n, d) [m] from the room, negative inside, up to a reach [m]."""
         return np.maximum(self.region.distance(points), -self.from_solids(points, reach))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        """Test (n,) which points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
         return self.region.contains(points, tolerance) & (self.from_solids(points, abs(tolerance)) >= -tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the room;
-        along the surfaces of solids the cell counts as turned with them."""
+        """Return the part (n,) of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
+        room; along the surfaces of solids the cell counts as turned with them."""
         within = self.region.cell_shares(points, spacing)
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
-        """A solid and its copies a period away."""
+        """Return a solid and its copies a period away."""
         turn = np.eye(self.dimension)
         return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
 
     def shifts(self) -> list[Points]:
-        """(d,) shifts of images [m], the first of them 0."""
+        """Return the shifts (d,) of images [m], the first of them 0."""
         return [np.array(shift) for shift in product(*((0.0, -a, a) if a else (0.0,) for a in self.periods))]

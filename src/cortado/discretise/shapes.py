@@ -25,25 +25,25 @@ ROUND_OFF = 1e-6
 """Share of a spacing by which a length may fall short of a whole number of cells: 0.25 / 0.05 holds 5."""
 
 NEARBY = 4
-"""By how many cells along an axis the points of a stretched lattice may differ from what fits."""
+"""Number of cells along an axis by which the points of a stretched lattice may differ from those that fit."""
 EXCESS = 0.003
-"""By which part the points of a stretched lattice may differ in number from what its volume holds."""
+"""Part by which the points of a stretched lattice may differ in number from those that its volume holds."""
 MOST_STRETCHED = 0.03
 """Logarithm of how much a lattice is stretched along an axis: up to there the density is that of the rest lattice
 within 1 %, beside walls too."""
 
 
 class Rows:
-    """Base of dataclasses whose fields are arrays with one first axis."""
+    """A base of dataclasses whose fields are arrays with one first axis."""
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of several, one behind the other."""
+        """Join the rows of several, one behind the other."""
         names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 
     def some(self, which: Any) -> Self:
-        """The rows that an index of arrays takes: a slice, numbers or a mask (n,)."""
+        """Return the rows that an index of arrays takes: a slice, numbers or a mask (n,)."""
         return type(self)(*(getattr(self, field.name)[which] for field in fields(self)))  # type: ignore[arg-type]
 
     def __len__(self) -> int:
@@ -51,8 +51,8 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Bounds (n,) of where a condition on numbers (n,) ceases to hold, that holds at ``low`` (n,) and not at ``high``
-    (n,): nearer ones, halved so many times."""
+    """Return bounds (n,) of where a condition on numbers (n,) ceases to hold, which holds at ``low`` (n,) and not at
+    ``high`` (n,), after a number of halvings."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -73,35 +73,35 @@ class Block:
 
     @cached_property
     def size(self) -> float:
-        """The number of points."""
+        """Return the number of points."""
         return float(np.prod(self.counts))
 
     @cached_property
     def extent(self) -> tuple[Points, Points]:
-        """The first and the last point, each (d,) [m]."""
+        """Return the first and the last point, each (d,) [m]."""
         return self.first, self.first + (self.counts - 1.0) * self.spacings
 
     def grown(self, cells: int) -> "Block":
-        """This lattice with so many cells more on every side."""
+        """Return this lattice with ``cells`` cells more on every side."""
         return Block(self.first - cells * self.spacings, self.counts + 2 * cells, self.spacings)
 
     def points(self) -> Points:
-        """(n, d) [m], the last axis fastest."""
+        """Return the points (n, d) [m], the last axis fastest."""
         axes = zip(self.first, self.spacings, self.counts, strict=True)
         return grid([x + spacing * np.arange(int(n)) for x, spacing, n in axes])
 
 
 def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """The points ``lower + (i + 1/2) spacing`` whose cells lie within the box; lower and upper (d,) [m]."""
+    """Return the points ``lower + (i + 1/2) spacing`` whose cells lie within the box; lower and upper (d,) [m]."""
     first = np.asarray(lower, dtype=np.float64)
     counts = whole_cells(np.asarray(upper, dtype=np.float64) - first, spacing)
     return Block(first + 0.5 * spacing, counts, np.full(len(first), spacing))
 
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """The points ``lower + (i + 1/2) spacing`` of a box whose sides are whole numbers of cells; lower and upper (d,)
-    [m]. In another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be
-    as many as its volume holds, within `EXCESS`; where no lattice has both, they are those whose cells lie within."""
+    """Return points ``lower + (i + 1/2) spacing`` of a box whose sides are whole cells; lower and upper (d,) [m]. In
+    another box they are stretched along some axes and narrowed along others, by `MOST_STRETCHED` at most, to be as many
+    as its volume holds, within `EXCESS`; where no lattice has both, they are those whose cells lie within."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -118,26 +118,26 @@ def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
-    """A lattice that is symmetric about a centre (d,) [m] and reaches as far as half lengths (d,) [m] allow."""
+    """Return a lattice that is symmetric about a centre (d,) [m] and reaches as far as half lengths (d,) [m] allow."""
     counts = whole_cells(2.0 * np.asarray(half, dtype=np.float64), spacing)
     first = np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing
     return Block(first, counts, np.full(len(first), spacing))
 
 
 def disc_cells(radius: float, spacing: float, dimension: int) -> Points:
-    """(dimension,) the cells of the lattice around a disc about the origin, at least one along each axis, as floats."""
+    """Return the cells (dimension,) of the lattice around a disc about the origin, as floats, at least one each."""
     return np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0))
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
-    """(n, dimension) [m] a symmetric lattice in a disc about the origin, or on a line in one dimension: at least 1."""
+    """Return a symmetric lattice (n, dimension) [m] in a disc about the origin, or on a line: at least one point."""
     counts = disc_cells(radius, spacing, dimension)
     points = Block(-0.5 * (counts - 1.0) * spacing, counts, np.full(dimension, spacing)).points()
     return points[np.linalg.norm(points, axis=1) <= radius]
 
 
 def across(direction: ArrayLike) -> Points:
-    """(d - 1, d) unit vectors, perpendicular to a unit vector (d,) and to one another.
+    """Return unit vectors (d - 1, d), perpendicular to a unit vector (d,) and to one another.
 
     They begin as the axes of space that the direction is least along, so that one along an axis gives the others.
     """
@@ -150,30 +150,30 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """(d,) [m] near the middle of points (n, d) [m] that are far from the origin beside how far they spread, and 0 of
-    all others: whole multiples of a power of two, so that taking it off rounds nothing."""
+    """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from the origin beside how far they
+    spread, and 0 of all others: whole multiples of a power of two, so that taking it off rounds nothing."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
 
 
 def whole_cells(lengths: Points, spacing: float) -> Points:
-    """The numbers of cells that fit into lengths [m], any shape."""
+    """Return the numbers of cells that fit into lengths [m], any shape."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 
 def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """(n, d): every combination of the values of the axes, the last axis fastest."""
+    """Return every combination (n, d) of the values of the axes, the last axis fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def corners(lower: Points, upper: Points) -> Points:
-    """(2^d, d) the corners of a box."""
+    """Return the corners (2^d, d) of a box."""
     return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)
 
 
 CHUNK = 8192
-"""How many points look for their neighbours at a time: bounds the memory."""
+"""Number of points that look for their neighbours at a time: bounds the memory."""
 
 Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
@@ -181,7 +181,7 @@ Pairs = tuple[Numbers, Numbers, Points]
 
 
 def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 0.0, lengths: ArrayLike = 0.0) -> Pairs:
-    """All pairs of one of ``some`` and one of the ``others`` that are at most ``reach`` [m] apart.
+    """Find all pairs of one of ``some`` and one of the ``others`` that are at most ``reach`` [m] apart.
 
     Args:
         some: (n, d) [m].
@@ -208,8 +208,8 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
 
 def pairs_among(points: Points, reach: float, lower: ArrayLike, lengths: ArrayLike) -> tuple[Numbers, Numbers]:
-    """The first and the second point (m,), i < j, of all pairs among points (n, d) [m]; the arguments are those of
-    `pairs_within`, which finds both orders and each point with itself."""
+    """Return the first and the second point (m,), i < j, of all pairs among points (n, d) [m]; the arguments are those
+    of `pairs_within`, which finds both orders and each point with itself."""
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), points.shape[1:])
@@ -219,7 +219,7 @@ def pairs_among(points: Points, reach: float, lower: ArrayLike, lengths: ArrayLi
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
-    """Separations (m, d) [m] of pairs with the nearest image, where ``lengths`` (d,) [m] are those of the period."""
+    """Return separations (m, d) [m] of pairs with the nearest image, for a period's ``lengths`` (d,) [m]."""
     lengths = np.asarray(lengths, dtype=np.float64)
     if not lengths.any():
         return separations
@@ -227,8 +227,8 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
 
 
 def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
-    """Numbers of the ``others`` (m, d) [m] that are in the box around ``some`` (n, d) [m] and ``reach`` [m] further; of
-    all of them where there is a period, or nothing to be near to."""
+    """Return numbers of the ``others`` (m, d) [m] that are in the box around ``some`` (n, d) [m] and ``reach`` [m]
+    further; of all of them where there is a period, or nothing to be near to."""
     if lengths.any() or not len(some):
         return np.arange(len(others))
     beyond = reach * (1.0 + 1e-9)
@@ -237,7 +237,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numb
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
-    """(..., d) positions within [0, length) on periodic axes; round-off may put a remainder on the length itself."""
+    """Return positions (..., d) within [0, length) on periodic axes; round-off may not leave a length itself."""
     if not lengths.any():
         return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)
@@ -246,15 +246,15 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
-bursts."""
+"""Bound on the mean of (n - 1)+ of the first particles, where n is the number density: a lattice that is squeezed by
+more bursts."""
 MOST_DENSITY = 1.5
 """Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
 1.4."""
 NOTED_COMPRESSION = 0.03
 """Average compression that is warned of; a lattice whose points are disturbed by a tenth of a spacing has 0.02."""
 NOTED_DENSITY = 0.5
-"""Where no particle has more, there is no fluid to speak of."""
+"""Greatest number density below which there is no fluid to speak of."""
 AT_ONE_PLACE = 1e-3
 """In spacings: particles that are nearer to each other are at one place."""
 
@@ -268,8 +268,8 @@ def check_crowding(
     spacing: float,
     period: Period,
 ) -> str | None:
-    """A warning of particles that are crowded or hardly touch each other, where they may be meant to; None of others.
-    Raises `InputError` where they would burst.
+    """Return a warning of particles that are crowded or hardly touch each other, where this may be meant; None of
+    others. Raise `InputError` where they would burst.
 
     Args:
         what: they in words, in the plural.
@@ -302,7 +302,7 @@ def check_crowding(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raises `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place. The
+    """Raise `InputError`, a sentence that begins with ``what``, where two particles (n, d) [m] are at one place. The
     period begins at a corner (d,) and has lengths (d,) [m], 0 along axes without one."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
@@ -316,7 +316,7 @@ def check_apart(what: str, positions: Points, spacing: float, period: Period) ->
 
 
 def nearest(positions: Points) -> NDArray:
-    """(n,) the distance [m] from each of two or more particles (n, d) [m] to the nearest other one."""
+    """Return the distance (n,) [m] from each of two or more particles (n, d) [m] to the nearest other one."""
     from scipy.spatial import cKDTree
 
     return cKDTree(positions).query(positions, k=2)[0][:, 1]
@@ -348,7 +348,7 @@ def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments:
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """A Warp array in the memory of a NumPy array; one of more than one axis has vectors along the last one."""
+    """Return a Warp array in the memory of a NumPy array; one of more than one axis has vectors along the last one."""
     import warp as wp
 
     types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i), "bool": (wp.bool, None)}

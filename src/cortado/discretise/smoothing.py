@@ -32,20 +32,20 @@ class SmoothingKernel:
     """f(q) = w'(q) / q."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled by its name."""
+        """Pickle the kernel by its name."""
         return smoothing_kernel, (self.name,)
 
     def normalisation(self, dimension: int, support: float) -> float:
-        """sigma [1 / m^d] for a support radius [m]."""
+        """Return the normalisation sigma [1 / m^d] for a support radius [m]."""
         return self.normalisations[dimension - 2] / support**dimension
 
     def weight(self, distance: np.ndarray, dimension: int, support: float) -> np.ndarray:
-        """W [1 / m^d] at distances [m], any shape."""
+        """Return W [1 / m^d] at distances [m], any shape."""
         q = np.minimum(np.asarray(distance, dtype=np.float64) / support, 1.0)
         return self.normalisation(dimension, support) * self.value(q)
 
     def gradient(self, separation: np.ndarray, support: float) -> np.ndarray:
-        """grad W [1 / m^(d+1)] at separations (n, d) [m]."""
+        """Return the gradient of W [1 / m^(d+1)] at separations (n, d) [m]."""
         q = np.minimum(np.linalg.norm(separation, axis=-1, keepdims=True) / support, 1.0)
         return self.normalisation(separation.shape[-1], support) / support**2 * self.gradient_factor(q) * separation
 
@@ -72,7 +72,7 @@ KERNELS = {kernel.name: kernel for kernel in (CUBIC_SPLINE, WENDLAND_C2, WENDLAN
 
 
 def smoothing_kernel(name: str) -> SmoothingKernel:
-    """The kernel of that name; raises `InputError` where there is none."""
+    """Return the smoothing kernel of a name; raise `InputError` where there is none."""
     if name not in KERNELS:
         raise InputError(f"kernel is {name!r}, but must be one of {', '.join(KERNELS)}.")
     return KERNELS[name]

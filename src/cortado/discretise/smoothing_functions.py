@@ -113,7 +113,7 @@ class SmoothingFunctions:
 
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SmoothingFunctions:
-    """Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change``, ``slope_gradient`` and
+    """Make Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change``, ``slope_gradient`` and
     ``gradient``.
 
     Each takes 1 / h, h being the support radius [m], and the normalisation sigma [1 / m^d]. A tape can differentiate
@@ -127,7 +127,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """q^2. tiny guards coincident particles: there 1 / q is finite and s = 0, so that the second term of the
+        """Return q^2. tiny guards coincident particles: there 1 / q is finite and s = 0, so that the second term of the
         Hessian is 0 and H = W''(0) I, as it should be."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 

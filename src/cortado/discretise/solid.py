@@ -21,16 +21,16 @@ class Faces:
     """(k, d) numbers of the vertices of each face, in 3-D counterclockwise as seen from outside"""
 
     def moved(self, turn: Points, position: Points) -> "Faces":
-        """The faces turned by a matrix (d, d) and then moved (d,) [m]."""
+        """Return the faces turned by a matrix (d, d) and then moved (d,) [m]."""
         return Faces(self.vertices @ turn.T + position, self.corners)
 
     def reversed(self) -> "Faces":
-        """The faces of the outside."""
+        """Return the faces of the outside."""
         return Faces(self.vertices, self.corners[:, ::-1])
 
 
 def box_faces(half: Points) -> Faces:
-    """The faces of a box about the origin with half its sides (d,) [m]."""
+    """Return the faces of a box about the origin with half its sides (d,) [m]."""
     if len(half) == 2:
         return polygon_faces(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
@@ -39,8 +39,8 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """The faces of the part of a box, between corners (d,) [m], that is below a plane with a unit normal (d,) at a
-    height along it [m]."""
+    """Return the faces of the part of a box, between corners (d,) [m], that is below a plane with a unit normal (d,) at
+    a height along it [m]."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -58,7 +58,7 @@ def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -
 
 
 def polygon_faces(corners: Points) -> Faces:
-    """The edges of a polygon (m, 2) [m], given either way round."""
+    """Return the edges of a polygon (m, 2) [m], given either way round."""
     following = np.roll(corners, -1, axis=0)
     (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
     area = (x * y_next - x_next * y).sum()
@@ -68,15 +68,15 @@ def polygon_faces(corners: Points) -> Faces:
 
 
 def arc(centre: Points, radius: float, start: float, end: float, fine: float) -> Points:
-    """(m, 2) [m] points of an arc from one angle to another [rad], about ``fine`` [m] apart."""
+    """Return points (m, 2) [m] of an arc from one angle to another [rad], about ``fine`` [m] apart."""
     count = max(int(np.ceil(abs(end - start) * radius / fine)), 4)
     angles = np.linspace(start, end, count + 1)
     return centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """The faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. Its profile is its cut with
-    a plane through the axis, the same on both sides."""
+    """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. Its profile is its
+    cut with a plane through the axis, the same on both sides."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -98,20 +98,20 @@ def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
 
 
 def outer_edges(profile: Faces) -> Points:
-    """(k, 2, 2) [m] starts and ends of the edges of a profile, cut off at the axis."""
+    """Return starts and ends (k, 2, 2) [m] of the edges of a profile, cut off at the axis."""
     edges = profile.vertices[profile.corners]
     return np.array([[_cut(start, end), _cut(end, start)] for start, end in edges if max(start[0], end[0]) > 0.0])
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """(2,) the start of an edge, or where the edge crosses the axis if it starts beyond."""
+    """Return the start (2,) of an edge, or where the edge crosses the axis if it starts beyond."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
 
 
 NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
-"""Of Gauss's quadrature with three points from 0 to 1, exact for polynomials of degree 5."""
+"""Nodes of Gauss's quadrature with three points from 0 to 1, exact for polynomials of degree 5."""
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
@@ -128,9 +128,9 @@ class Moments:
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """The moments of what edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, counterclockwise as seen from outside and
-    each with a weight (k,), by integrals over the surface (Mirtich 1996): they are bases of cones about a place near
-    by."""
+    """Return the moments of a body that edges (k, 2, 2) or triangles (k, 3, 3) [m] enclose, counterclockwise as seen
+    from outside and each with a weight (k,), by integrals over the surface (Mirtich 1996): they are bases of cones
+    about a place near by."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin
@@ -143,14 +143,14 @@ def enclosed_moments(corners: Points, weights: Points) -> Moments:
 
 
 def revolved_moments(edges: Points, axis: int) -> Moments:
-    """The moments of a solid of revolution about an axis of space, by the edges (k, 2, 2) [m] of its profile on one
-    side of the axis, distance from it and height, counterclockwise; those on the axis may be left out."""
+    """Return the moments of a solid of revolution about an axis of space, by the edges (k, 2, 2) [m] of its profile on
+    one side of the axis, distance from it and height, counterclockwise; those on the axis may be left out."""
     height = edges[..., 1].mean()
     start, end = edges[:, 0], edges[:, 1]
     x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
 
     def integral(p: int, q: int) -> float:
-        """The integral of x^p (y - height)^q over the profile, by Green's theorem."""
+        """Return the integral of x^p (y - height)^q over the profile, by Green's theorem."""
         return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
 
     volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[axis]
@@ -165,45 +165,45 @@ class Solid(ABC):
 
     @property
     def is_bounded(self) -> bool:
-        """False for a solid without an end, which its box does not hold."""
+        """Return False for a solid without an end, which its box does not hold."""
         return True
 
     @abstractmethod
     def extent(self) -> tuple[Points, Points]:
-        """The box around it: lower and upper, each (d,) [m]."""
+        """Return the box around it: lower and upper, each (d,) [m]."""
 
     @abstractmethod
     def distance(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are from the surface, negative inside [m]."""
+        """Return the distances (n,) of points (n, d) [m] from the surface, negative inside [m]."""
 
     @abstractmethod
     def nearest(self, points: Points) -> Points:
-        """(n, d) [m] the points of the surface that are nearest to points (n, d) [m]."""
+        """Return the points (n, d) [m] of the surface that are nearest to points (n, d) [m]."""
 
     @abstractmethod
     def faces(self, fine: float) -> Faces:
-        """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
+        """Return its surface in flat faces, some ``fine`` [m] wide where it is round."""
 
     def moments(self) -> Moments:
-        """Its volume, centroid and second moments, to round-off; solids that may move freely have them."""
+        """Return its volume, centroid and second moments, to round-off; solids that may move freely have them."""
         raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
-        """The `faces` for pictures: of an unbounded solid those within the box around it."""
+        """Return the `faces` for pictures: of an unbounded solid those within the box around it."""
         return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        """(n,) the `distance` [m] of points (n, d) [m] where its size is less than a reach [m]; elsewhere any number of
-        the same sign that is at least as large as the reach. Solids with many faces find it sooner."""
+        """Return the `distance` (n,) [m] of points (n, d) [m] where its size is less than a reach [m]; elsewhere any
+        number of the same sign that is at least as large as the reach. Solids with many faces find it sooner."""
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Points of the surface (n, d) [m], each for an area of fine^(d - 1) [m^(d - 1)], and unit vectors (n, d)
-        outwards; None of a solid that has no quicker way to them than a lattice around it."""
+        """Return points of the surface (n, d) [m], each for an area of fine^(d - 1) [m^(d - 1)], and unit vectors (n,
+        d) outwards; None of a solid that has no quicker way to them than a lattice around it."""
         return None
 
     def outward(self, points: Points) -> Points:
-        """(n, d) unit vectors away from the solid at points (n, d) [m] that are not on its surface."""
+        """Return unit vectors (n, d) away from the solid at points (n, d) [m] that are not on its surface."""
         across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
         return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
 
@@ -214,7 +214,7 @@ class Placed(Solid):
 
     solid: Solid
     position: Points
-    """(d,) where its origin is [m]"""
+    """(d,) place of its origin [m]"""
     turn: Points
     """(d, d) the rotation matrix"""
 
@@ -291,7 +291,7 @@ class Mass:
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
-        """The mass of a solid, by its moments."""
+        """Compute the mass of a solid, by its moments."""
         moments = solid.moments()
         about = np.trace(moments.second) * np.eye(3)
         if len(moments.centre) == 2:
@@ -299,5 +299,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """This mass with volumes counted in units of so many m^d."""
+        """Return this mass with volumes counted in units of ``unit`` m^d."""
         return Mass(self.volume / unit, self.inertia / unit)

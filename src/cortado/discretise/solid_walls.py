@@ -18,9 +18,9 @@ from cortado.discretise.solid import Solid
 from cortado.discretise.walls import Places, RestLattice, WallLayers
 
 Near = Callable[[Points, float], Which]
-"""Whether points (n, d) [m] are less than a length [m] from something."""
+"""Tells which points (n, d) [m] are less than a length [m] from something."""
 FINE = 3
-"""Points of a surface along a spacing, among which those that stay are chosen."""
+"""Number of points of a surface along a spacing, among which those that stay are chosen."""
 CELLS = (3, 4)
 """Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine; the last
 of them is even."""
@@ -30,18 +30,18 @@ than the second."""
 FIRST, GROWTH = 0.05, 1.7
 """The part of points that is looked at at first, and how many more each time."""
 ROUNDS = {2: 40, 3: 4}
-"""In which each point moves to the middle of what is nearest to it, by the number of dimensions."""
+"""Rounds in which each point moves to the middle of its nearest candidates, by the number of dimensions."""
 OFF_FACES = (0.31, 0.17, 0.23)
-"""Of a cell: how far fine lattices are off the faces of solids that are aligned with them."""
+"""Shift of fine lattices off the faces of solids that are aligned with them, in cells."""
 HALVINGS = 20
 MOST = 2_000_000
-"""Points that are looked at at a time: bounds the memory."""
+"""Number of points that are looked at at a time: bounds the memory."""
 SEED = 1
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points, each with the area around it."""
+    """Points of a surface, each with the area around it."""
 
     points: Points
     """(n, d) [m]"""
@@ -50,7 +50,7 @@ class SurfacePoints:
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """Points about a spacing [m] apart, ``depth`` [m] beneath the surface of a solid, above it where negative.
+    """Return points about a spacing [m] apart, ``depth`` [m] beneath the surface of a solid, above it where negative.
 
     Where a solid is thinner than twice the depth, they are in its middle.
     """
@@ -63,7 +63,9 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """Some of the points (n, d) [m] that are ``fine`` [m] apart on a surface, about a spacing [m] apart.
+    """Choose points about a spacing [m] apart from points (n, d) [m] ``fine`` [m] apart on a surface. First as many are
+    taken as can be so that no two are too near each other. Then each is moved to the middle of its nearest candidates
+    (Lloyd 1982), and to a candidate. At last any that are too near another are left out, and gaps are filled.
 
     First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
     to it (Lloyd 1982), and to a candidate; then any that are too near another are left out, and gaps are filled.
@@ -88,9 +90,9 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Points of a surface (n, d) [m], about ``fine`` [m] apart, each with as much of its area, and unit vectors (n, d)
-    away from the solid; of a surface that a lattice finds only those that are near something, where ``is_near`` says
-    so."""
+    """Return points of a surface (n, d) [m], about ``fine`` [m] apart, each with as much of its area, and unit vectors
+    (n, d) away from the solid. Where a lattice finds the surface, only points near something come, as ``is_near``
+    says."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
@@ -117,8 +119,8 @@ def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tupl
 
 
 def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
-    """(n,) depths beneath feet (n, d) [m], up to a depth [m], at which no other part of the surface is nearer than the
-    foot."""
+    """Return depths (n,) beneath feet (n, d) [m], up to a depth [m], at which no other part of the surface is nearer
+    than the foot."""
     if depth <= 0.0:
         return np.full(len(feet), depth)
     found, tolerance = np.full(len(feet), depth), 1e-3 * depth
@@ -132,9 +134,9 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
 
 
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
-    """Points (n, d) of a lattice, ``fine`` [m] apart, in parts, with all of those that are no further than ``reach``
-    [m] from a thing within the box between two corners. Cells of the box, and parts of these, are kept as far as their
-    middles are near the thing, by ``is_near``."""
+    """Yield points (n, d) of a lattice, ``fine`` [m] apart, in parts, with all of those that are no further than
+    ``reach`` [m] from a thing within the box between two corners. Cells of the box, and parts of these, are kept as far
+    as their middles are near the thing, by ``is_near``."""
     dimension, size = len(lower), int(np.prod(CELLS)) * fine
     cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
     *coarse, last = CELLS
@@ -153,14 +155,14 @@ def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_ne
 
 
 def _divided(cells: Points, size: float, parts: int) -> Points:
-    """(n, d) middles [m] of the parts, so many along each axis, of cells of a size [m] with middles (m, d) [m]."""
+    """Return middles (n, d) [m] of ``parts`` parts along each axis of cells of a size [m] with middles (m, d) [m]."""
     along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
     inside = np.array(list(product(along, repeat=cells.shape[1])))
     return (cells[:, None] + inside).reshape(-1, cells.shape[1])
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
-    """Numbers of points (n, d) [m]: those chosen already, and the numbers in an ``order`` that are further than
+    """Return numbers of points (n, d) [m]: those chosen already, and the numbers in an ``order`` that are further than
     ``apart`` [m] from them and from all chosen before."""
     size = int(FIRST * len(order)) + 1
     while len(order):
@@ -173,8 +175,8 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """Distances (n,) from points (n, d) [m] to the nearest of some (m, d) [m], infinite from a reach [m] on, and the
-    numbers (n,) of these."""
+    """Return distances (n,) from points (n, d) [m] to the nearest of some (m, d) [m], infinite from a reach [m] on, and
+    the numbers (n,) of these."""
     from scipy.spatial import cKDTree
 
     distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=usable_cores())
@@ -182,7 +184,7 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
 
 
 def _first_of_all_near(points: Points, apart: float) -> Which:
-    """(n,) the points (n, d) [m] that stay if each in turn stays unless one that does is nearer than ``apart`` [m]."""
+    """Test (n,) which points (n, d) [m] stay if each in turn stays unless a nearer one than ``apart`` [m] does."""
     from scipy.spatial import cKDTree
 
     first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T
@@ -217,7 +219,7 @@ class ContainerWalls:
 
     points: WallPoints
     solids: Sequence[Solid]
-    """They close the container."""
+    """The solids that close the container."""
     room: Room
     """Where fluid may be, outside of solids at rest."""
     spacing: float
@@ -227,18 +229,18 @@ class ContainerWalls:
 
     @property
     def _clear(self) -> float:
-        """Distance from solids to the feet of wall particles that keep their places, at least [m]."""
+        """Return the least distance from solids to the feet of wall particles that keep their places [m]."""
         return 2.0 * self.support + self.spacing
 
     @cached_property
     def stay(self) -> Which:
-        """(b,) which wall particles keep their places."""
+        """Test (b,) which wall particles keep their places."""
         feet = self.points.positions + self.points.feet
         return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
-        """(n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place, or
-        above the rim of the container."""
+        """Test (n,) which points (n, d) [m] beneath surfaces are in the cell of a wall particle that keeps its place,
+        or above the rim of the container."""
         from scipy.spatial import cKDTree
 
         kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)
@@ -248,20 +250,20 @@ class ContainerWalls:
         return kept
 
     def is_near(self, points: Points, furthest: float) -> Which:
-        """(n,) which points (n, d) [m] are less than a length [m] from the surface where particles do not keep their
-        places, whose cells are cut there, or from solids; a few more are."""
+        """Test (n,) which points (n, d) [m] are less than a length [m] from the surface where particles do not keep
+        their places, whose cells are cut there, or from solids; a few more are."""
         near = self._clear + 2.0 * self.spacing + furthest
         return np.asarray(self.room.from_solids(points, near) < near)
 
 
 DENSITY = 0.75
-"""In spacings: how far wall particles are apart."""
+"""In spacings: distance between wall particles."""
 MARGIN = 0.01
 """In spacings: a part of a surface that is no further within its room touches a wall or another solid."""
 TOLERANCE = 0.05
 """In spacings: by how much less deep points may be beneath one surface than beneath another."""
 EDGE = 0.4
-"""In spacings: edges are less far from fine points of the surface."""
+"""In spacings: bound on the distance of edges from fine points of the surface."""
 EXPOSED_HALVINGS, EXPOSED_ROUNDS, DIGITS = 12, 30, 4
 
 
@@ -277,15 +279,15 @@ class ExposedSurface:
     owner: Numbers
     """(n,) index into `solids` of the one that each belongs to"""
     solids: Sequence[Solid]
-    """Those that close the container, then the others."""
+    """The solids that close the container, then the others."""
     container: ContainerWalls
     lower: Points
     """(d,) where the period begins [m]"""
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """The exposed surface of solids, and of the container near them, up to a support beyond the ends of a period
-        that begins at ``lower`` (d,) [m]. Each point stands for a part that is a `FINE`th of a spacing long and
+        """Find the exposed surface of solids, and of the container near them, up to a support beyond the ends of a
+        period that begins at ``lower`` (d,) [m]. Each point stands for a part that is a `FINE`th of a spacing long and
         wide."""
         room, spacing, fine = container.room, container.spacing, container.spacing / FINE
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
@@ -297,12 +299,12 @@ class ExposedSurface:
 
     @property
     def room(self) -> Room:
-        """Where fluid may be."""
+        """Return the room where fluid may be."""
         return self.container.room
 
     @property
     def spacing(self) -> float:
-        """The spacing of particles [m]."""
+        """Return the spacing of particles [m]."""
         return self.container.spacing
 
     @cached_property
@@ -312,10 +314,10 @@ class ExposedSurface:
         return cKDTree(self.feet)
 
     def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-        """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
-        as its part of the layer is. Where it is less deep it has less, so that it counts the same for the first row of
-        fluid. None counts as deeper than its layer, as those may seem whose foot is hidden where parts of a solid
-        overlap."""
+        """Make wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat
+        wall as its part of the layer is. Where it is less deep it has less, so that it counts the same for the first
+        row of fluid. None counts as deeper than its layer, as those may seem whose foot is hidden where parts of a
+        solid overlap."""
         parts, first_row = [], 0.5 * self.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
@@ -329,19 +331,19 @@ class ExposedSurface:
         return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> Numbers:
-        """(b,) index into `solids` of the one that each wall particle belongs to."""
+        """Return the index (b,) into `solids` of the one that each wall particle belongs to."""
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Points about a spacing apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner, except
-        where the container keeps its walls."""
+        """Return points about a spacing apart, ``depth`` [m] beneath the surface, or in the middle of thinner parts,
+        except where the container keeps its walls."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
         points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
         found = evenly_chosen(points, self.spacing / FINE, DENSITY * self.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
-        """(n, d) [m] fine points at a depth."""
+        """Return fine points (n, d) [m] at a depth."""
         fine, found = self.spacing / FINE, []
         if not len(self.feet):
             return self.feet
@@ -367,8 +369,8 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """(n, d) [m] the points of the surface, on a solid or where two of them meet, that are nearest to points (n, d)
-        [m] beneath it; ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
+        """Return the points (n, d) [m] of the surface, on a solid or where two of them meet, that are nearest to points
+        (n, d) [m] beneath it; ``nearest`` (n,) are the nearest of the fine points, ``reach`` (n,) [m] away."""
         fine = self.spacing / FINE
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -387,8 +389,8 @@ class ExposedSurface:
         return found
 
     def _edges(self, feet: Points, owner: Numbers) -> Points:
-        """(n, d) [m] points near feet (n, d) [m] where the solid of each foot, ``owner`` (n,), meets the next one: the
-        feet, moved to one surface and the other in turn."""
+        """Return points (n, d) [m] near feet (n, d) [m] where the solid of each foot, ``owner`` (n,), meets the next
+        one: the feet, moved to one surface and the other in turn."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
         distances[owner, np.arange(len(feet))] = np.inf
         other, found = np.argmin(distances, axis=0), feet.copy()
@@ -401,40 +403,41 @@ class ExposedSurface:
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
-        """(n, d) [m] points beneath those feet of which another part of the surface is nearer than a depth [m]: as deep
-        as the foot is the nearest point."""
+        """Return points (n, d) [m] beneath those feet of which another part of the surface is nearer than a depth [m]:
+        as deep as the foot is the nearest point."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
         return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
-        """(n,) whether the nearest part of the surface to points at depths (n,) [m] beneath some feet is the foot."""
+        """Test (n,) whether a foot is the surface nearest to the point at a depth (n,) [m] beneath it."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
         return np.asarray(distances > depths - TOLERANCE * self.spacing)
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
-    """(n,) whether points (n, d) [m] are no more than ``reach`` [m] outside of periods that begin at ``lower``."""
+    """Test (n,) which points (n, d) [m] are no more than ``reach`` [m] outside of periods that begin at ``lower``."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> Which:
-    """(n,) whether fluid in a room can touch points of surfaces (n, d) [m], from which unit vectors (n, d) point."""
+    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from them, a room's fluid can
+    touch."""
     return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
-    """Places half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice that is turned as
-    the surface is may rest."""
+    """Return places half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice that is
+    turned as the surface is may rest."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
     return Places(points, _frames(solid.outward(points)))
 
 
 def _frames(normals: Points) -> Points:
-    """(n, d, d) axes, a unit vector a row, of which the first are unit vectors (n, d)."""
+    """Return axes (n, d, d), a unit vector a row, of which the first are unit vectors (n, d)."""
     if normals.shape[1] == 2:
         return np.stack([normals, normals[:, ::-1] * np.array([-1.0, 1.0])], axis=1)
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]

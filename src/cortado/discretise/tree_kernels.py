@@ -9,17 +9,17 @@ import warp as wp
 from cortado.device.modules import kernel_module
 
 DEPTH = 32
-"""Nodes that may wait on the way down, more than a tree has levels."""
+"""Number of nodes that may wait on the way down, more than a tree has levels."""
 real, vector = wp.float64, wp.vec3d
 box = wp.types.vector(length=6, dtype=wp.float64)
-"""Lower and upper corner."""
+"""The type of a box: its lower and upper corner."""
 waiting_nodes, waiting_squares = wp.types.vector(length=DEPTH, dtype=wp.int32), wp.types.vector(DEPTH, wp.float64)
 _module = kernel_module("triangle_tree")
 
 
 @wp.func
 def square_from_box(p: vector, b: box) -> real:
-    """The square of the distance from a box, 0 within."""
+    """Return the square of the distance from a box, 0 within."""
     square = real(0.0)
     for k in range(3):
         beyond = wp.max(wp.max(b[k] - p[k], p[k] - b[k + 3]), real(0.0))
@@ -29,7 +29,7 @@ def square_from_box(p: vector, b: box) -> real:
 
 @wp.func
 def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
-    """The nearest point of a triangle (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
+    """Return the nearest point of a triangle (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
     zero = real(0.0)
     ab = b - a
     ac = c - a
@@ -70,8 +70,8 @@ def find_nearest(
     nearest: wp.array(dtype=vector),
     squares: wp.array(dtype=real),
 ):
-    """The nearest point of the triangles, and the square of its distance; the point itself and ``reach`` squared where
-    none is nearer than that."""
+    """Find the nearest point of the triangles, and the square of its distance; the point itself and ``reach`` squared
+    where none is nearer than that."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -117,8 +117,8 @@ def find_nearest(
 
 @wp.func
 def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
-    """1 where an edge that rises along the second axis is ahead of a point on the first one, -1 where one that falls
-    is, 0 elsewhere. Both triangles of an edge find the same but for the sign, whatever is rounded."""
+    """Return 1 where an edge that rises along the second axis is ahead of a point on the first one, -1 where one that
+    falls is, 0 elsewhere. Both triangles of an edge find the same but for the sign, whatever is rounded."""
     upwards = int(1)
     low = a
     high = b
@@ -135,7 +135,7 @@ def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
 
 @wp.func
 def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
-    """1 where a ray from a point along the last axis leaves through a triangle, -1 where it enters, 0 elsewhere."""
+    """Return 1 where a ray along the last axis leaves through a triangle, -1 where it enters, 0 elsewhere."""
     around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
     if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
         return int(0)
@@ -157,7 +157,7 @@ def find_windings(
     # out
     windings: wp.array(dtype=wp.int32),
 ):
-    """The winding numbers of closed surfaces about points: 1 within one whose normals point outwards, 0 outside."""
+    """Compute winding numbers of closed surfaces about points: 1 within one with outward normals, 0 outside."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -181,7 +181,7 @@ def find_windings(
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """True for a segment that goes through the inside of a triangle, and further than a tolerance to both sides."""
+    """Test whether a segment goes through the inside of a triangle, and further than a tolerance to both sides."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -207,7 +207,7 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """True where an edge of triangle s that has no vertex of triangle t goes through t."""
+    """Test whether an edge of triangle s that has no vertex of triangle t goes through t."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3
@@ -233,8 +233,8 @@ def find_crossings(
     counts: wp.array(dtype=wp.int32),
     others: wp.array(dtype=wp.int32),
 ):
-    """The triangles behind one that cross it, written to ``others`` from ``places`` on as far as there is room; all
-    have ``names`` of vertices. ``points`` are not looked at."""
+    """Find the triangles behind one that cross it, written to ``others`` from ``places`` on as far as there is room;
+    all have ``names`` of vertices. ``points`` are not looked at."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))

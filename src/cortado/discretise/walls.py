@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """The number of cells that fill a length [m] best, at least 1."""
+    """Return the number of cells that fill a length [m] best, at least 1."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """(n, d) one layer around a box, ``depth`` outside of it: faces, edges and corners, each point once.
+    """Return one layer (n, d) around a box, ``depth`` outside of it: faces, edges and corners, each point once.
 
     Along a face the points continue the lattice inside; an axis whose length is no multiple of the spacing is stretched
     a little between its walls. A periodic axis has no wall. Axis by axis: outside on this axis, inside on those before
@@ -38,7 +38,7 @@ def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: f
 
 
 def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """(n, 3) the walls of an upright cup whose base is centred on the origin, the third axis along its height.
+    """Return the walls (n, 3) of an upright cup whose base is centred on the origin, the third axis along its height.
 
     The side: rings ``depth`` outside of the radius, about a spacing apart along and across. The base, and the lid if
     there is one: the lattice that fluid in the cup has, ``depth`` outside, and a ring that continues the side.
@@ -51,24 +51,24 @@ def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: fl
 
 
 def ring(radius: float, spacing: float) -> Points:
-    """(n, 2) points on a circle, about a spacing apart."""
+    """Return points (n, 2) on a circle, about a spacing apart."""
     count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
     angles = 2.0 * np.pi * np.arange(count) / count
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
 def _cells(lower: float, upper: float, count: int) -> Points:
-    """(count,) the centres of equal cells between two ends."""
+    """Return the centres (count,) of equal cells between two ends."""
     return lower + (upper - lower) * (np.arange(count) + 0.5) / count
 
 
 def stacked(flat: Points, levels: Points) -> Points:
-    """(levels n, 3) a plane set of points (n, 2) repeated at every level."""
+    """Return a plane set of points (n, 2) repeated at every level, (levels n, 3)."""
     return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])
 
 
 OVERLAP = 0.8
-"""How far from the side of a cup, over the reach, fluid on the base may rest upright."""
+"""Distance from the side of a cup, over the reach, up to which fluid on the base may rest upright."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,13 @@ class Places(Rows):
 
     @classmethod
     def upright(cls, points: Points) -> "Places":
-        """Places (n, d) [m] on lattices along the axes of space."""
+        """Return places (n, d) [m] on lattices along the axes of space."""
         dimension = points.shape[1]
         return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Places less than ``reach`` [m] from a wall of a box, the first of them half a spacing from it.
+    """Return places less than ``reach`` [m] from a wall of a box, the first of them half a spacing from it.
 
     Axis by axis: near a wall on this axis, far from all on those before it, anywhere on those after it.
     """
@@ -103,8 +103,8 @@ def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: 
 
 
 def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
-    """Places less than ``reach`` [m] from a wall of an upright cup whose base is centred on the origin, the third axis
-    along its height.
+    """Return places less than ``reach`` [m] from a wall of an upright cup whose base is centred on the origin, the
+    third axis along its height.
 
     Along the side the lattices are turned as the side is; on the base, up to where the side is hardly seen, they are
     those of fluid in the cup. The uppermost part of an open cup, which may overflow, has none.
@@ -124,7 +124,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 
 
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
-    """Places along an axis: from each wall on, a spacing apart, or evenly along a period."""
+    """Return places along an axis: from each wall on, a spacing apart, or evenly along a period."""
     count = nearest_cells(upper - lower, spacing)
     cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
@@ -133,7 +133,7 @@ def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Poin
 
 
 ENDS = 6.0
-"""In supports: what is this far from an edge has the same weight as what is further, to 1e-6 of it and better."""
+"""In supports: wall particles this far from an edge have the weight of further ones, to 1e-6 of it and better."""
 WHOLE = 1e-9
 """In cells: by how much a side may be off a whole number of them."""
 
@@ -141,9 +141,9 @@ WHOLE = 1e-9
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """A shorter box with wall particles of the same weights as a box between corners (d,) [m], as these repeat far from
-    edges and corners: its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of the long
-    box to those of the shorter one.
+    """Make a shorter box with wall particles of the same weights as a box between corners (d,) [m], as these repeat far
+    from edges and corners: its upper corner (d,) [m], and a function that takes points (n, d) [m] of the walls of the
+    long box to those of the shorter one.
 
     Cells of a spacing [m], beside fluid with a support [m], are left out in the middle of long sides, of those that are
     a whole number of cells.
@@ -183,31 +183,31 @@ class RestLattice:
 
     @cached_property
     def offsets(self) -> Points:
-        """(m, d) the `lattice_offsets` [m]."""
+        """Return the `lattice_offsets` (m, d) [m]."""
         return lattice_offsets(self.spacing, self.support, self.dimension)
 
     def weights(self, separations: Points) -> Points:
-        """(m,) W [1 / m^d] at separations (m, d) [m]."""
+        """Return W (m,) [1 / m^d] at separations (m, d) [m]."""
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """(m, 1 + d) W, and the gradient of W times the spacing, at separations (m, d) [m], both over the sum of W on
-        the lattice [-]."""
+        """Return W, and the gradient of W times the spacing, (m, 1 + d), at separations (m, d) [m], both over the sum
+        of W on the lattice [-]."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
 
     def _to_plane(self, distance: float) -> Points:
-        """(m, d) separations [m] from the points of a lattice plane at a distance [m], along the first axis."""
+        """Return separations (m, d) [m] from the points of a lattice plane at a distance [m], along the first axis."""
         flat = np.unique(self.offsets[:, 1:], axis=0)
         return np.hstack([np.full((len(flat), 1), distance), flat])
 
     def plane_weight(self, distance: float) -> float:
-        """The sum of W [1 / m^d] over a lattice plane at a distance [m]."""
+        """Return the sum of W [1 / m^d] over a lattice plane at a distance [m]."""
         return float(self.weights(self._to_plane(distance)).sum())
 
     def plane_slope(self, distance: float) -> float:
-        """The derivative of `plane_weight` by the distance [1 / m^(d + 1)]."""
+        """Return the derivative of `plane_weight` by the distance [1 / m^(d + 1)]."""
         return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
 
 
@@ -222,7 +222,7 @@ class WallLayers:
 
 
 def wall_layers(lattice: RestLattice) -> WallLayers:
-    """The layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
+    """Find the layers that meet these conditions at a flat wall, with fluid on the lattice from half a spacing on:
 
     - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
     - a uniform pressure pushes no particle of the first layer: what a wall adds to the density of a particle is steep
@@ -242,7 +242,7 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
         return np.array([SHALLOW * spacing, deepest] if two else [deepest])
 
     def weights(deepest: float) -> np.ndarray:
-        """With them the first layers of the fluid, as many as the wall has, have the rest density."""
+        """Return weights with which the first layers of the fluid, as many as the wall has, have the rest density."""
         layers = depths(deepest)
         seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
         return np.linalg.solve(np.array(seen), missing[: len(layers)])
@@ -261,22 +261,23 @@ STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
 stays that of a flat wall."""
 UNEVEN_STIFFNESS = 0.06
-"""The same where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes there."""
+"""This resistance where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes
+there."""
 LEAST, ROUNDS = 0.6, 4
 """Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
 less are set to it, and the others found anew."""
 BALANCE = 0.02
-"""What the push of a uniform pressure counts beside an error of the density. Densities alone hardly say how steep two
+"""Weight of the push of a uniform pressure beside an error of the density. Densities alone hardly say how steep two
 layers are: round a cup they would make them so shallow that fluid passes. At 0.1 corners would be too dense."""
 RAISED = 3.0
 """In spacings: how far along the first axis of a place, away from a solid, one looks how much room there is."""
 CHUNK = 4096
-"""How many places are looked at at a time: bounds the memory."""
+"""Number of places that are looked at at a time: bounds the memory."""
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room) -> Points:
-    """(n, 1 + d) the part of the `RestLattice.sums` over a lattice at each of the places that lies outside of a room.
-    A lattice point is outside by as much as its cell is."""
+    """Return the part (n, 1 + d) of the `RestLattice.sums` over a lattice at each of the places that lies outside of a
+    room. A lattice point is outside by as much as its cell is."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
@@ -305,7 +306,7 @@ def wall_weights(
     fit: Fit,
     known: int = 0,
 ) -> Points:
-    """(b,) weights of wall particles in the density [-], a fluid particle being 1.
+    """Compute the weights (b,) of wall particles in the density [-], a fluid particle being 1.
 
     With them the lattice has the rest density at all places, and a uniform pressure pushes no particle less than a
     spacing from a wall. Both hold as nearly as can be, in the sense of least squares: along faces, edges and corners,
@@ -340,8 +341,8 @@ def wall_weights(
 def _demands(
     walls: Points, flat: Points, places: Places, lattice: RestLattice, room: Room, lower: Points
 ) -> tuple["csr_array", Points]:
-    """A matrix (m, b) of sums over wall particles at places, by their weights over the flat ones, and the sums (m,)
-    that fluid at rest needs there."""
+    """Return a matrix (m, b) of sums over wall particles at places, by their weights over the flat ones, and the sums
+    (m,) that fluid at rest needs there."""
     from scipy.sparse import coo_array, vstack
 
     place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
@@ -356,7 +357,7 @@ def _demands(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """The `Fit` for wall particles on lattices, whose weights are at least 0."""
+    """Find changes of weights, a `Fit`, for wall particles on lattices, whose weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -367,8 +368,8 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """The `Fit` for particles that are about evenly spaced, whose weights are at least `LEAST` of those of a flat
-    wall."""
+    """Find changes of weights, a `Fit`, for particles that are about evenly spaced, whose weights are at least `LEAST`
+    of those of a flat wall."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

@@ -20,29 +20,31 @@ from cortado.scene.restart import Origin
 from cortado.words import counted
 
 SAME = 1e-9
-"""Of a frame: a state that comes earlier than a frame is due by less is that frame, as times are rounded."""
+"""Part of the time between frames: a state that comes earlier than a frame is due by less is that frame, as times are
+rounded."""
 
 
 FRACTION = "mass_fraction_"
 SHORTEST, LONGEST = 4.0, 10.0
 """[s] that a film lasts at least and at most, if it has frames enough and nobody asks for another number of them."""
 FEW = 1.0
-"""[s] that a film of a few frames lasts, with at least `SLOWEST` of them in a second."""
+"""Length [s] of a film of a few frames, with at least `SLOWEST` of them in a second."""
 SLOWEST, USUAL = 6.0, 25.0
 """Frames that a film shows in a second: fewer are seen one by one."""
 SMOOTH = 12.0
 """Frames in a second below which a film says how more are recorded."""
 SHORT = 1.5
-"""How many times as fast a film goes for want of frames before it says so."""
+"""Factor by which a film goes faster for want of frames before it says so."""
 EARLY = 1e-6
-"""Of the time between two frames: the last is early if it comes by more before it is due."""
+"""Part of the time between two frames: the last is early if it comes by more before it is due."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 """Speeds that are easy to think of, and these times powers of ten."""
 
 
 @dataclass(frozen=True)
 class Marks:
-    """Frame k is due at the time start + k / rate, and is the first state at that time or after it."""
+    """The times at which frames of a run are due: frame k at start + k / rate, the first state at that time or after
+    it."""
 
     start: float
     """[s] when the run began"""
@@ -50,22 +52,22 @@ class Marks:
     """[1/s] frames in a second that is simulated"""
 
     def passed(self, times: NDArray[Any]) -> NDArray[np.int64]:
-        """(n,) the number of the last mark at or before each of the times (n,) [s]."""
+        """Return the number (n,) of the last mark at or before each of the times (n,) [s]."""
         return np.floor((np.asarray(times) - self.start) * self.rate + SAME).astype(np.int64)
 
     def at(self, numbers: NDArray[Any]) -> NDArray[np.float64]:
-        """(n,) [s] the times of marks of these numbers (n,)."""
+        """Return the times (n,) [s] of marks of these numbers (n,)."""
         return self.start + np.asarray(numbers) / self.rate
 
     def due(self, times: NDArray[Any]) -> NDArray[np.float64]:
-        """(frames,) [s] when frames recorded at ``times`` (frames,) were due. The last state of a run, which may be at
-        no mark, and states that are farther apart than marks have their own times."""
+        """Return the times (frames,) [s] when frames recorded at ``times`` (frames,) were due. The last state of a run,
+        which may be at no mark, and states that are farther apart than marks have their own times."""
         numbers = self.passed(times)
         one_by_one = np.diff(numbers, prepend=numbers[:1] - 1) == 1
         return np.where(one_by_one, self.at(numbers), times)
 
     def chosen(self, times: NDArray[Any], stride: int) -> Marks | None:
-        """The marks of every so many frames of a run, of those recorded at ``times`` (frames,) [s]; None where they are
+        """Return the marks of every ``stride`` frames of those recorded at ``times`` (frames,) [s]; None where they are
         not evenly spaced among the marks, but for the last."""
         numbers = self.passed(times)
         apart = np.diff(numbers)
@@ -76,8 +78,8 @@ class Marks:
 
 
 def common_rate(each: Iterable[Marks | None]) -> float | None:
-    """[1/s] how many frames in a second all of several runs record; None where not all of them say so, or another
-    number."""
+    """Return the number of frames in a second [1/s] that all of several runs record; None where some have none, or
+    another one."""
     rates = {None if marks is None else marks.rate for marks in each}
     return rates.pop() if len(rates) == 1 else None
 
@@ -95,11 +97,10 @@ def frame_writer(
     expected: int | None = None,
     kept: int = 1,
 ) -> vtkhdf.TrajectoryWriter:
-    """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, with
-    ``quantities`` of these names, and for what is noted of so many steps, which have the names and types of
-    ``diagnostics``; all of it of particles of an origin. ``marks``: when frames are due, where times choose them. The
-    disk must have room for all frames, or for as many as are ``expected``. A file of that name is replaced once it has
-    all frames that are ``kept`` of it."""
+    """Open a file with room for frames at ``times`` (frames,) [s] with the fields of the first and ``quantities`` of
+    these names, of particles of an origin. It has room for notes on ``steps`` steps too, with the names and types of
+    ``diagnostics``. ``marks``: when frames are due, where times choose them. The disk must have room for all frames, or
+    for as many as are ``expected``. A file of that name is replaced once it has all frames that are ``kept`` of it."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
@@ -130,7 +131,7 @@ def append_frame(
     quantities: Mapping[str, NDArray[Any]] | None = None,
     time: float | None = None,
 ) -> None:
-    """Write the fields of a frame, after so many steps, with its quantities, to a file of `frame_writer`; its ``time``
+    """Write the fields and the quantities of a frame, after ``step`` steps, to a file of `frame_writer`; its ``time``
     [s] where that was not known."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
@@ -142,28 +143,28 @@ def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def fraction_names(phases: int) -> list[str]:
-    """Names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
+    """Return names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
     return [f"{FRACTION}{k}" for k in range(phases)]
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Which frames a film shows, and when."""
+    """The frames that a film shows, and when."""
 
     frames: tuple[int, ...]
-    """Numbers of those that it shows."""
+    """Numbers of the frames that it shows."""
     times: tuple[float, ...]
     """[s] in the film, of each of them"""
     speed: float | None
     """[-] seconds of the run in a second of the film; 1 is real time; None where times are not known"""
     recorded: int
-    """How many frames there are."""
+    """Number of recorded frames."""
     enough: float = 0.0
     """[1/s] frames in a second of the run with which the film would show `USUAL` ones; 0 where times are not known"""
     is_asked: bool = False
-    """Whether somebody chose the speed."""
+    """True where somebody chose the speed."""
     of_search: bool = False
-    """Whether the frames are those of a search, which [picture] says the number of, and not those of a run."""
+    """True for frames of a search, whose number [picture] gives, and not of a run."""
 
     @classmethod
     def of(
@@ -173,11 +174,11 @@ class Pace:
         speed: float | None = None,
         rate: float | None = None,
     ) -> Pace:
-        """The pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly chosen; if
-        left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows `USUAL` in a
-        second, and any other is in real time, or slower or faster where it would be shorter than `SHORTEST` or longer
-        than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without ``count`` the film has
-        every one of them, or every second, and so on, and no state between two."""
+        """Choose the pace for a run with frames at ``times`` [s]. ``count``: how many frames the film has, evenly
+        chosen; if left out `USUAL` in each of its seconds. ``speed``: if left out, a film of ``count`` frames shows
+        `USUAL` in a second, and any other is in real time, or slower or faster where it would be shorter than
+        `SHORTEST` or longer than `LONGEST`. ``rate`` [1/s]: of frames that were recorded so many in a second; without
+        ``count`` the film has every one of them, or every second, and so on, and no state between two."""
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:
@@ -192,30 +193,30 @@ class Pace:
 
     @classmethod
     def unknown(cls, count: int) -> Pace:
-        """That of so many frames whose times are not known."""
+        """Return the pace of ``count`` frames whose times are not known."""
         rate = float(np.clip(count / SHORTEST, SLOWEST, USUAL))
         return cls(tuple(range(count)), tuple(k / rate for k in range(count)), None, count)
 
     @property
     def frames_per_second(self) -> float:
-        """In the mean."""
+        """Return the mean number of frames in a second of the film."""
         return (len(self.frames) - 1) / self.times[-1] if self.times[-1] > 0.0 else USUAL
 
     @property
     def in_words(self) -> str:
-        """How fast time goes in the film."""
+        """Say how fast time goes in the film."""
         if self.speed is None:
             return "step by step"
         return "in real time" if self.speed == 1.0 else f"at {self.speed:g} x"
 
     @property
     def seconds(self) -> float:
-        """How long the film is [s]."""
+        """Return the length of the film [s]."""
         return self.times[-1] + 1.0 / self.frames_per_second
 
     @property
     def _more(self) -> str:
-        """What records enough frames."""
+        """Return the option that records enough frames."""
         if self.of_search and self.speed is not None:
             return f"picture.film_frames={self.enough * self._span + 1.0:.0f}"
         return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
@@ -232,28 +233,28 @@ class Pace:
 
     @property
     def _span(self) -> float:
-        """[s] that the run lasts."""
+        """Return how long the run lasts [s]."""
         return self.times[-1] * (self.speed or 0.0)
 
     @property
     def _lacks(self) -> bool:
-        """Whether the film is seen frame by frame, or is much shorter than one of a run with frames enough."""
+        """Return True if the film is seen frame by frame, or is much shorter than one of a run with frames enough."""
         return self.frames_per_second < SMOOTH or (self.speed or 0.0) > SHORT * USUAL / self.enough
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film that is written."""
+    """A film that is written, with its pace and notes."""
 
     path: Path
     pace: Pace
-    """Which frames it shows, and how fast."""
+    """Its frames, and how fast it shows them."""
     notes: str = ""
-    """What somebody who sees it should know, in a sentence; empty if there is nothing to say."""
+    """A sentence for those who see it; empty if there is nothing to say."""
 
     @property
     def in_words(self) -> str:
-        """Its pace and its notes, in words."""
+        """Return its pace and its notes, in words."""
         return f"{self.pace}; {self.notes}" if self.notes else str(self.pace)
 
     def __str__(self) -> str:
@@ -263,14 +264,14 @@ class Film:
         return f"Film({self.path}, {self.pace})"
 
     def _repr_html_(self) -> str:
-        """The repr, and a player with the film in it."""
+        """Show the repr, and a player with the film in it, in a notebook."""
         page: str = on_top("film_page")(self)
         return page
 
 
 def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | None = None) -> Pace:
-    """That of a run with frames at ``times`` [s] as a picture table asks for, ``rate`` as for `Pace.of`; warns where it
-    asks for more frames than there are."""
+    """Return the pace of a run with frames at ``times`` [s] as a picture table asks for, ``rate`` as for `Pace.of`;
+    warn where it asks for more frames than there are."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
@@ -280,14 +281,14 @@ def pace_of(times: Sequence[float] | NDArray, picture: Picture, rate: float | No
 
 
 def _whole(times: Sequence[float] | NDArray, rate: float) -> int:
-    """How many frames there are without a last one that comes before it is due."""
+    """Return how many frames there are without a last one that comes before it is due."""
     is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
     return len(times) - 1 if is_early else len(times)
 
 
 def _speed(span: float, count: int, easy: float) -> float:
-    """The speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]: ``easy`` if they are enough
-    for that, or else the speed at which they are `USUAL` in a second."""
+    """Return the speed of a film with at most ``count`` frames of a run that lasts ``span`` [s]: ``easy`` if they are
+    enough for that, or else the speed at which they are `USUAL` in a second."""
     if span <= 0.0:
         return 1.0
     room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))
@@ -295,7 +296,7 @@ def _speed(span: float, count: int, easy: float) -> float:
 
 
 def _easy_speed(span: float) -> float:
-    """The speed of a film that has frames enough, of a run that lasts ``span`` [s]."""
+    """Return the speed of a film that has frames enough, of a run that lasts ``span`` [s]."""
     wanted = span / min(max(span, SHORTEST), LONGEST)
     if wanted <= 0.0:
         return 1.0

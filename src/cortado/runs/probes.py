@@ -33,14 +33,14 @@ from cortado.scene.scene import Scene
 from cortado.words import point_in_words
 
 MOST_CELLS = 200_000
-"""Cells of half a spacing that are looked at; a larger container is not judged."""
+"""Most cells of half a spacing that are looked at; a larger container is not judged."""
 DEEP = 0.01
 """In spacings: a place that is less deep in a wall or a solid is on its surface."""
 
 
 @fixed
 class PressureProbe:
-    """The mean pressure of the particles around a point, those nearby weighing most:
+    """A sensor of the mean pressure of the particles around a point, those nearby weighing most:
 
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius),
 
@@ -48,7 +48,8 @@ class PressureProbe:
     """
 
     def __init__(self, position: Any, radius: float | None = None):
-        """``position`` (d,) [m]; ``radius`` [m], the support radius of the scene's smoothing kernel if left out."""
+        """Place the probe at ``position`` (d,) [m]; ``radius`` [m] is the smoothing kernel's support radius if left
+        out."""
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
 
@@ -79,7 +80,8 @@ class PressureProbe:
 
 @fixed
 class FlowRate:
-    """Volume of fluid that goes through a plane in a second, along its normal; the mean over a layer around it:
+    """A sensor of the volume of fluid that goes through a plane in a second, along its normal; the mean over a layer
+    around it:
 
     Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
 
@@ -87,8 +89,8 @@ class FlowRate:
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):
-        """``position`` (d,) of a point of the plane [m]; ``normal`` (d,); ``reach`` of the layer on both sides [m], two
-        support radii of the scene's smoothing kernel, but at least five spacings, if left out."""
+        """Place the plane by a point ``position`` (d,) [m] and a ``normal`` (d,); ``reach`` of the layer on both sides
+        [m] is two support radii of the scene's smoothing kernel, but at least five spacings, if left out."""
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
             raise InputError(
@@ -116,7 +118,7 @@ class FlowRate:
         return at.lattice.cell * ACROSS[1] / reach_of(self.reach, at)
 
     def _around(self, at: Reading) -> Seen:
-        """By the distances (n, 1) from the plane along its normal."""
+        """Return the particles around the plane, by their distances (n, 1) from it along its normal."""
         reach = reach_of(self.reach, at)
         return Seen.of(at, self.position, reach, self._along, parts_of(reach, at, self._along, 1))
 
@@ -126,7 +128,7 @@ class FlowRate:
 
 @fixed
 class WallForce:
-    """The force with which the fluid pushes the walls, and its torque:
+    """A sensor of the force with which the fluid pushes the walls, and of its torque:
 
     F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
 
@@ -136,8 +138,8 @@ class WallForce:
     """
 
     def __init__(self, lower: Any = None, upper: Any = None, about: Any = None):
-        """``lower``, ``upper`` (d,) corners of the region [m], which has no end there if left out; ``about`` (d,) the
-        point of the torque [m], the origin if left out."""
+        """Take corners ``lower``, ``upper`` (d,) of the region [m], which has no end there if left out, and the point
+        ``about`` (d,) of the torque [m], the origin if left out."""
         self.lower, self.upper, self.about = (
             None if values is None else read(what, values)
             for what, values, read in (("lower", lower, corner), ("upper", upper, corner), ("about", about, point))
@@ -170,13 +172,13 @@ class WallForce:
         }
 
     def _chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
-        """(n, d) the arms of the particles, and their forces, 0 outside of the region."""
+        """Return the arms (n, d) of the particles, and their forces, 0 outside of the region."""
         about = np.zeros(at.dimension) if self.about is None else in_dimension("about", self.about, at.dimension)
         places, inside = self._placed(at)
         return places - about, np.where(inside[:, None], at["wall_force"], 0.0)
 
     def _placed(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
-        """(n, d) the images of the particles that may be in the region [m], and whether they are (n,)."""
+        """Return the images (n, d) of the particles that may be in the region [m], and a mask (n,) of those in it."""
         lower, upper = (
             np.full(at.dimension, end) if values is None else in_dimension(what, values, at.dimension)
             for what, values, end in (("lower", self.lower, -np.inf), ("upper", self.upper, np.inf))
@@ -190,7 +192,7 @@ def _in_space(vectors: NDArray[Any]) -> NDArray[Any]:
 
 @fixed
 class SolidLoad:
-    """The force of the fluid on a solid, and its torque about the solid's position:
+    """A sensor of the force of the fluid on a solid, and of its torque about the solid's position:
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
 
@@ -201,7 +203,7 @@ class SolidLoad:
     """
 
     def __init__(self, solid: str):
-        """``solid``: its name in the scene."""
+        """Take the name of a ``solid`` in the scene."""
         if not isinstance(solid, str) or not solid:
             raise InputError(f"solid is {shown(solid)}, but must be the name of a solid.")
         self.solid = solid
@@ -226,11 +228,11 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
     "wall_force": WallForce,
     "solid_load": SolidLoad,
 }
-"""By their kinds."""
+"""Classes of sensors by their kinds."""
 
 
 def sensors_of(scene: Scene) -> dict[str, Sensor]:
-    """By their names. Up is against gravity."""
+    """Make the sensors of a scene, by their names. Up is against gravity."""
     gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
     upwards: dict[str, Any] = {"wave_gauge": {"up": -gravity}} if gravity.any() else {}
     return {
@@ -240,8 +242,8 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
 
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
-    """(n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in a
-    container without periods and emitters: solids at rest are in the way, those that move are not."""
+    """Test (n,) which points (n, d) [m] no way leads to from particles (m, d) [m] through cells half a spacing wide, in
+    a container without periods and emitters: solids at rest are in the way, moving ones are not."""
     from scipy.ndimage import label
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
@@ -265,27 +267,27 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
 
 MOST = 16
-"""Points along an axis by which planes and columns are looked at."""
+"""Most points along an axis by which planes and columns are looked at."""
 
 
 class Prepared(Cut, Protocol):
-    """What is known of a simulation."""
+    """A simulation as checks of sensors see it."""
 
     @property
     def scene(self) -> Scene:
-        """The scene that is simulated."""
+        """Return the scene that is simulated."""
 
     @property
     def positions(self) -> Points:
-        """(n, d) first positions [m]"""
+        """Return first positions (n, d) [m]."""
 
     @property
     def walls(self) -> Points:
-        """(b, d) wall particles [m]"""
+        """Return wall particles (b, d) [m]."""
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
-    """Warn of sensors, by their names, of which the scene, as it begins, keeps all fluid away."""
+    """Warn of sensors, by their names, from which the scene, as it begins, keeps all fluid away."""
     for name, sensor in sensors.items():
         found = _doubt(simulation, sensor)
         if found is not None:
@@ -293,7 +295,7 @@ def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
 
 
 def _doubt(simulation: Prepared, sensor: Any) -> str | None:
-    """Why a sensor may never see fluid; None where it may, and of sensors that are not Cortado's own."""
+    """Say why a sensor may never see fluid; None where it may, and for sensors that are not Cortado's own."""
     scene, spacing = simulation.scene, simulation.scene.discretisation.spacing
     if isinstance(sensor, WallForce):
         return _without_walls(simulation, sensor)
@@ -319,7 +321,7 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
-    """Of a sensor without a container that is further from fluid and solids than its reach and their own size."""
+    """Say that a sensor without a container is further from fluid and solids than its reach and their own size."""
     ends = _of_things(simulation)
     points = _looked_at(ends, sensor)
     gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
@@ -334,13 +336,13 @@ def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
 
 
 def _of_things(simulation: Prepared) -> tuple[Points, Points]:
-    """The box around fluid and walls as they begin, lower and upper (d,) [m]."""
+    """Return the box around fluid and walls as they begin, lower and upper (d,) [m]."""
     points = np.concatenate([simulation.positions, simulation.walls])
     return points.min(axis=0), points.max(axis=0)
 
 
 def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
-    """Of a gauge whose column does not begin at the bottom of the container, or reaches far beyond it."""
+    """Say that a gauge's column does not begin at the bottom of the container, or reaches far beyond it."""
     scene, ends = simulation.scene, simulation.scene.container.extent()
     assert ends is not None
     heights = corners(*ends) @ gauge.up
@@ -357,7 +359,7 @@ def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
 
 
 def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
-    """Of a reach that is larger than a container without periods."""
+    """Say that a reach is larger than a container without periods."""
     ends = scene.container.extent()
     if wide is None or ends is None or any(scene.container.periods(scene.dimension)[1]):
         return None
@@ -368,7 +370,7 @@ def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
 
 
 def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
-    """(n, d) points of a sensor within a box (2, d), of which fluid has to reach one [m]."""
+    """Return points (n, d) of a sensor within a box (2, d), of which fluid has to reach one [m]."""
     place = sensor.position
     if isinstance(sensor, PressureProbe):
         return np.array([place])
@@ -384,7 +386,7 @@ def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
 
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
-    """What keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
+    """Say what keeps fluid away from each of the points (n, d) [m]; None where nothing does."""
     scene = simulation.scene
     d, deep = scene.dimension, DEEP * scene.discretisation.spacing
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
@@ -406,7 +408,7 @@ def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
 
 
 def _in_metres(scene: Scene, place: Points) -> str:
-    """A hint where a place is far outside, as it would be in millimetres."""
+    """Return a hint where a place is far outside, as it would be in millimetres."""
     ends = scene.container.extent()
     if ends is None or np.abs(place).max() <= 10.0 * np.abs(ends).max():
         return ""
@@ -414,7 +416,7 @@ def _in_metres(scene: Scene, place: Points) -> str:
 
 
 def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
-    """Of a region that no particle is in which could push walls."""
+    """Say that no particle is in a region which could push walls."""
     walls, d = simulation.walls, simulation.scene.dimension
     lower = np.full(d, -np.inf) if sensor.lower is None else sensor.lower
     upper = np.full(d, np.inf) if sensor.upper is None else sensor.upper

@@ -67,18 +67,18 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
 
 
 def vectors(array: wp.array) -> NDArray:
-    """(n, 3) in float64."""
+    """Read an array of vectors from the device, (n, 3) in float64."""
     return np.asarray(array.numpy(), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Pressures:
-    """Of the sorted particles of a step, in float64, off the device: copies."""
+    """The pressures of the sorted particles of a step, in float64, off the device: copies."""
 
     push: NDArray
-    """(n,) with which they push walls [Pa]."""
+    """(n,) pressures with which they push walls [Pa]."""
     stress: NDArray | None
-    """(n,) what a gauge would read [Pa]; None where nobody asks for it."""
+    """(n,) pressures that a gauge would read [Pa]; None where nobody asks for them."""
 
 
 @dataclass(frozen=True)
@@ -88,18 +88,18 @@ class Particles:
     fields: Mapping[str, NDArray]
     """By the names of `Fields`: ``x`` and ``v`` (n, 3), ``n`` and ``m`` (n,)."""
     pressures: Pressures | None
-    """None where none were computed."""
+    """Their pressures; None where none were computed."""
     on_device: "OnDevice | None" = None
-    """Of adjoints those that kernels add to."""
+    """For adjoints, the arrays to which kernels add."""
 
     @classmethod
     def of(cls, fields: Fields, pressures: Pressures | None) -> Self:
-        """Those of fields on the device."""
+        """Read the fields of particles from the device."""
         return cls({name: fields[name].numpy().astype(np.float64) for name in "xvnm"}, pressures)
 
     @classmethod
     def zeros(cls, particles: int, on_device: "OnDevice | None" = None) -> Self:
-        """All 0."""
+        """Make fields and pressures of zeros."""
         shapes = {"x": (3,), "v": (3,), "n": (), "m": ()}
         fields = {name: np.zeros((particles, *shape)) for name, shape in shapes.items()}
         return cls(fields, Pressures(np.zeros(particles), np.zeros(particles)), on_device)
@@ -109,31 +109,31 @@ class Particles:
 
     @property
     def push(self) -> NDArray:
-        """(n,) what they push walls with [Pa]."""
+        """Return the pressures (n,) with which they push walls [Pa]."""
         assert self.pressures is not None
         return self.pressures.push
 
     @property
     def stress(self) -> NDArray:
-        """(n,) what a gauge would read [Pa]."""
+        """Return the pressures (n,) that a gauge would read [Pa]."""
         assert self.pressures is not None and self.pressures.stress is not None
         return self.pressures.stress
 
     @property
     def within(self) -> "OnDevice":
-        """What kernels add to."""
+        """Return the arrays to which kernels add adjoints."""
         assert self.on_device is not None
         return self.on_device
 
 
 @dataclass(frozen=True)
 class OnDevice:
-    """Adjoints of what a step computes, for kernels."""
+    """Adjoints within a step on the device, for kernels."""
 
     bar: Adjoints
-    """Of sorted particles at the start of the step, and of parameters and solids."""
+    """Adjoints of sorted particles at the start of the step, and of parameters and solids."""
     v_star: wp.array
-    """(n,) as that of `cortado.solvers.solver.WithinBar`."""
+    """(n,) adjoint of the predicted velocities, see `cortado.solvers.solver.WithinBar`."""
 
 
 class Sums:
@@ -144,14 +144,15 @@ class Sums:
         self.circulation = circulation_kernels(solver.discretisation)
 
     def __call__(self, kernel: Any, *named: Named, **given: NDArray) -> NDArray:
-        """(n, 3) what a kernel writes to its last argument, given the step's fields and further vectors."""
+        """Return the vectors (n, 3) that a kernel writes to its last argument, given the step's fields and further
+        vectors."""
         arrays = {name: self.on_device(value) for name, value in given.items()}
         found = self._solver.vectors()
         self.context.launch(kernel, *named, **arrays, **{kernel.adj.args[-1].label: found})
         return vectors(found)
 
     def add(self, kernel: Any, bar: Particles, **given: NDArray) -> None:
-        """Have a kernel add to ``x_bar`` and ``v_bar``."""
+        """Let a kernel add to the adjoints ``x_bar`` and ``v_bar``."""
         arrays = {name: self.on_device(value) for name, value in given.items()}
         own = {"x": self._solver.vectors(), "v": self._solver.vectors()}
         self.context.launch(kernel, **arrays, **{f"{name}_bar": array for name, array in own.items()})
@@ -159,13 +160,13 @@ class Sums:
             bar[name][:] += array.numpy()
 
     def on_device(self, values: NDArray) -> wp.array:
-        """Vectors (n, 3)."""
+        """Copy vectors (n, 3) to the device."""
         return wp.array(values, dtype=self._solver.discretisation.precision.vector, device=self._solver.device)
 
 
 @dataclass(frozen=True)
 class _Rubbing:
-    """factor m_i sum a_i over what walls do by forces, (n, 3)."""
+    """The sums factor m_i sum a_i over forces of walls, (n, 3), such as viscous ones."""
 
     actions: list[WallAction]
     factor: float
@@ -191,8 +192,8 @@ class _Rubbing:
 
 
 class WallLoads:
-    """Of a solver's particles, (n, 3) in float64. ``solid`` is the number of a solid's wall particles, or
-    `cortado.particles.wall_terms.ALL_WALLS`."""
+    """The forces of a solver's particles on walls, (n, 3) in float64. ``solid`` is the number of a solid's wall
+    particles, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
         cell, self._power = solver.lattice.cell, solver.density_power
@@ -207,12 +208,12 @@ class WallLoads:
         """What f_i that act beneath particles twist walls with [N m]."""
 
     def forces(self, at: Particles, sums: Sums, solid: int) -> NDArray:
-        """f [N]"""
+        """Return the forces f [N] of particles on the walls of a solid."""
         pushed = self._strength(at)[:, None] * vectors(self._push.total(sums.context, solid))
         return pushed + self._rubbing.value(at, sums, solid)
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents, solid: int) -> NDArray:
-        """The tangent of the load f."""
+        """Return the tangent of the forces f of particles on the walls of a solid."""
         strength_dot = self._scale / at["n"] ** self._power * (dot.push - self._power * at.push * dot["n"] / at["n"])
         pushed = vectors(self._push.total(sums.context, solid))
         pushed_dot = vectors(self._push.tangent(sums.context, along, solid))
@@ -220,7 +221,7 @@ class WallLoads:
         return found + self._rubbing.tangent(at, sums, dot, along, solid)
 
     def adjoint(self, at: Particles, sums: Sums, forces_bar: NDArray, bar: Particles, solid: int) -> None:
-        """From that of f, add to those of the particles."""
+        """Add to the adjoints of the particles by that of the forces f."""
         step, strength = sums.context, self._strength(at)
         strength_bar = (forces_bar * vectors(self._push.total(step, solid))).sum(axis=1)
         bar.push[:] += strength_bar * self._scale / at["n"] ** self._power
@@ -235,9 +236,9 @@ class WallLoads:
 
 @dataclass(frozen=True)
 class SolidLoadQuantity:
-    """Force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at the end of the
-    step, where its walls are, to particle i; of viscosity as a stress to the surface beneath it, where that acts. Each
-    scene has F and T one behind the other, in the plane the component of T that stands on it."""
+    """The quantity of force and torque on a solid, F = sum_i f_i and T = sum_i r_i x f_i, with r_i from its middle at
+    the end of the step, where its walls are, to particle i; of viscosity as a stress to the surface beneath it, where
+    that acts. Each scene has F and T one behind the other, in the plane the component of T that stands on it."""
 
     loads: WallLoads
     solver: ParticleSolver
@@ -273,7 +274,7 @@ class SolidLoadQuantity:
             bar.within.bar.solids.add_whole(number, *places)
 
     def _arms(self, at: Particles) -> NDArray:
-        """(n, 3) [m], along a periodic axis the shorter way."""
+        """Return the arms (n, 3) [m] from the solid to particles, along a periodic axis the shorter way."""
         moving = self.solver.search.moving
         arms = at["x"] - self._each(None if moving is None else moving.after.positions, self.solid.middle)
         periods = np.array(self.solver.system.periods)
@@ -281,37 +282,38 @@ class SolidLoadQuantity:
         return np.asarray(arms - periods * around)
 
     def _each(self, of_moving: wp.array | None, at_rest: NDArray) -> NDArray:
-        """(n, 3) the solid's entry of an array (scenes, solids) of those that move, or what it is of one at rest."""
+        """Return for each particle (n, 3) the solid's entry of an array (scenes, solids) of moving solids, or a
+        constant for one at rest."""
         if of_moving is None or self.solid.number < 0:
             return np.broadcast_to(at_rest, (self.solver.layout.all_particles, 3))
         return self._for_each(vectors(of_moving)[:, self.solid.number])
 
     def _for_each(self, of_scenes: NDArray) -> NDArray:
-        """(n, 3) of (scenes, 3)."""
+        """Repeat vectors of scenes (scenes, 3) for their particles (n, 3)."""
         return np.repeat(of_scenes, self.solver.layout.particles, axis=0)
 
     def _joined(self, forces: NDArray, torques: NDArray) -> NDArray:
-        """(scenes, k) the sums over particles."""
+        """Return sums (scenes, k) of forces and torques over particles."""
         members = self.solver.layout.members
         force, torque = (array.reshape(members, -1, 3).sum(axis=1) for array in (forces, torques))
         return np.concatenate([force[:, : self.dimension], torque if self.dimension == 3 else torque[:, 2:]], axis=1)
 
 
 class QuantityFormula(Protocol):
-    """A quantity of the sorted particles of a step."""
+    """A formula of a quantity of the sorted particles of a step, with its derivatives."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
-        """(n,) or (n, k); of the load on a solid (scenes, k)"""
+        """Return the quantity (n,) or (n, k); for the load on a solid (scenes, k)."""
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, along: Tangents) -> NDArray:
-        """The same along ``dot``; ``along`` has it on the device."""
+        """Return the tangent of the quantity along ``dot``; ``along`` has it on the device."""
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
-        """From its own adjoint, in the shape of its value, add to those of the particles."""
+        """Add to the adjoints of the particles by the quantity's own adjoint, in the shape of its value."""
 
 
 class Density:
-    """rho_i = m_i n_i"""
+    """The quantity of densities, rho_i = m_i n_i."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
         return at["m"] * at["n"]
@@ -325,7 +327,7 @@ class Density:
 
 
 class Pressure:
-    """What a gauge would read."""
+    """The quantity of pressures that a gauge would read."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
         return at.stress
@@ -338,7 +340,7 @@ class Pressure:
 
 
 class SpeedQuantity:
-    """|v_i|; of a particle at rest, where it has a kink, the derivative is taken as 0."""
+    """The quantity of speeds |v_i|; of a particle at rest, where it has a kink, the derivative is taken as 0."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
         return np.linalg.norm(at["v"], axis=1)
@@ -356,7 +358,8 @@ class SpeedQuantity:
 
 @dataclass(frozen=True)
 class Vorticity:
-    """c_i / (mu n_i): see `cortado.runs.quantity_formulas`. In the plane it is the component that stands on it."""
+    """The quantity of vorticities c_i / (mu n_i): see `cortado.runs.quantity_formulas`. In the plane it is the
+    component that stands on it."""
 
     factor: float
     """mu [-]"""
@@ -385,7 +388,7 @@ class Vorticity:
 
 @dataclass(frozen=True)
 class WallForceQuantity:
-    """What a particle pushes all walls with: see `cortado.runs.quantity_formulas`."""
+    """The quantity of forces with which particles push all walls: see `cortado.runs.quantity_formulas`."""
 
     loads: WallLoads
     dimension: int
@@ -401,7 +404,7 @@ class WallForceQuantity:
 
 
 def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:
-    """Those of a solver's particles, and of the loads on its solids, by their names."""
+    """Make the formulas of a solver's particles, and of the loads on its solids, by their names."""
     loads = WallLoads(solver)
     return {
         "density": Density(),

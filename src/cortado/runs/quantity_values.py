@@ -35,21 +35,22 @@ class Moment:
     kept."""
 
     state: State
-    """On the device."""
+    """The state on the device."""
     parameters: Mapping[str, NDArray]
-    """By name, with one row of those over time, and a first axis for the scenes of a batch or one for all of them."""
+    """Parameters by name, with one row of those over time, and a first axis for the scenes of a batch or one for all of
+    them."""
     substeps: int
     """Explicit steps of diffusion within the step."""
     row: int
-    """Which of the steps of a run the parameters are those of, or how many there are: after the last one."""
+    """The step of a run whose parameters these are, or the number of steps: after the last one."""
     evaluator: Callable[[], "QuantityEvaluator"]
-    """Makes what computes quantities."""
+    """Makes the object that computes quantities."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
     def of(cls, rollout: Rollout, step: int, state: State, evaluator: Callable[[], "QuantityEvaluator"]) -> "Moment":
-        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are as
-        `row_of` says."""
+        """Take a state of a rollout's present evaluation, after ``step`` steps. After the last one the parameters are
+        as `row_of` says."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -58,21 +59,21 @@ class Moment:
 
     @property
     def lattice(self) -> Lattice:
-        """Constants of the lattice of particles at rest."""
+        """Return the constants of the lattice of particles at rest."""
         return self.evaluator().lattice
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Those of the scene, as they begin."""
+        """Return the solids of the scene, as they begin."""
         return self.evaluator().solids
 
     @property
     def container(self) -> Container:
-        """The container of the scene."""
+        """Return the container of the scene."""
         return self.evaluator().container
 
     def value(self, name: str) -> NDArray:
-        """A quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""
+        """Return a quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""
         if name not in self._values:
             found = self.evaluator().values([name], self)[name]
             found.flags.writeable = False
@@ -80,11 +81,11 @@ class Moment:
         return self._values[name]
 
     def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
-        """From adjoints of quantities to those of the state's fields and of the step's parameters."""
+        """Turn adjoints of quantities into those of the state's fields and of the step's parameters."""
         return self.evaluator().adjoint(bars, self)
 
     def tangents(self, names: list[str], dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]) -> Arrays:
-        """Of quantities, along tangents of the state's fields and of the step's parameters."""
+        """Return tangents of quantities along tangents of the state's fields and of the step's parameters."""
         return self.evaluator().tangents(names, self, dot, parameters_dot)
 
 
@@ -95,23 +96,23 @@ OF_PRESSURE = {STRESS, "wall_force"}
 
 
 class StepWithin(PressureAdjoint, Protocol):
-    """That of a solver of particles."""
+    """The adjoint of a particle solver's step, given adjoints of quantities within the step."""
 
     bar: Adjoints
 
 
 def _need_the_step(names: Iterable[str]) -> bool:
-    """Whether quantities need the step after the state to be solved, and not its neighbours alone."""
+    """Test whether quantities need the step after the state to be solved, and not its neighbours alone."""
     return any(name in OF_PRESSURE or is_load(name) for name in names)
 
 
 class QuantityEvaluator:
-    """Computes quantities of states, their tangents and adjoints, in the arrays of one solver, which no run may use
-    meanwhile. What it is given and returns is in the scene's order, of a batch with a first axis for the scenes."""
+    """A computation of quantities of states, with tangents and adjoints, in the arrays of one solver, which no run may
+    use meanwhile. Its arguments and results are in the scene's order, of a batch with a first axis for the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
-        """``circulation_factor``: that of `cortado.discretise.calibration`. Raises `InputError` for a solver that has
-        no particles to look at."""
+        """Take a solver; ``circulation_factor`` is that of `cortado.discretise.calibration`. Raises `InputError` for a
+        solver without particles."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")
         self._solver, self._dimension = solver, scene.dimension
@@ -128,12 +129,12 @@ class QuantityEvaluator:
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the solver."""
+        """Return the lock that a thread holds while it uses the solver."""
         return self._solver.turn
 
     @in_turn
     def values(self, names: Iterable[str], moment: Moment) -> Arrays:
-        """Quantities by name, float64."""
+        """Compute quantities by name, float64."""
         wanted = self._checked(names)
         at, sums = self._begin(wanted, moment, replay=False)
         return {name: self._shown(name, self._formulas[name].value(at, sums)) for name in wanted}
@@ -142,8 +143,8 @@ class QuantityEvaluator:
     def tangents(
         self, names: Iterable[str], moment: Moment, dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
     ) -> Arrays:
-        """Their tangents along that of the state, by fields, and of the parameters of the step, as `Moment` has
-        them."""
+        """Return tangents of quantities along those of the state, by fields, and of the parameters of the step, as
+        `Moment` has them."""
         wanted, solver = self._checked(names), self._solver
         at, sums = self._begin(wanted, moment, replay=True)
         state_dot, along = solver.new_state(), solver.new_parameters(1)
@@ -156,8 +157,8 @@ class QuantityEvaluator:
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
-        """From adjoints of quantities, by name, to those of the state, by fields, and of the parameters of the step, as
-        `Moment` has them but with an axis for the scenes."""
+        """Turn adjoints of quantities, by name, into those of the state, by fields, and of the parameters of the step,
+        as `Moment` has them but with an axis for the scenes."""
         wanted, solver = self._checked(bars), self._solver
         at, sums = self._begin(wanted, moment, replay=True)
         solved = _need_the_step(wanted)
@@ -186,7 +187,7 @@ class QuantityEvaluator:
         return {name: array.astype(np.float64) for name, array in state.items()}, found
 
     def _checked(self, names: Iterable[str]) -> list[str]:
-        """Names of quantities and of loads; raises `InputError` for any other."""
+        """Return names of quantities and of loads; raise `InputError` for any other."""
         wanted = list(names)
         for name in wanted:
             if not is_load(name):
@@ -199,7 +200,8 @@ class QuantityEvaluator:
     # ---- the step ------------------------------------------------------------------------------------------------
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[Particles, Sums]:
-        """Look around the particles and, where a pressure is wanted, take the step; ``replay`` it for derivatives."""
+        """Find the particles' neighbours and, where a pressure is wanted, take the step; ``replay`` it for
+        derivatives."""
         rollout = self._rollout
         rollout.begin_evaluation()
         rollout.initial.assign(moment.state)
@@ -221,7 +223,7 @@ class QuantityEvaluator:
         return context
 
     def _solve(self, names: Iterable[str], replay: bool) -> tuple[StepContext, Pressures]:
-        """The step, and its pressures as far as they are wanted."""
+        """Take the step, and return it with its pressures as far as they are wanted."""
         solver, rollout = self._solver, self._rollout
         rollout.forward(keep=False)
         found = solver.sorted_pressures()
@@ -242,7 +244,7 @@ class QuantityEvaluator:
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
     ) -> tuple[ParticleTangent | PressureTangent, Pressures | None]:
-        """That of the sorted particles, and of their pressures."""
+        """Return the tangent of the sorted particles, and of their pressures."""
         solver, parameters = self._solver, self._rollout.parameters
         if not _need_the_step(names):
             own = ParticleTangent(solver, along)
@@ -262,7 +264,7 @@ class QuantityEvaluator:
 
     @cached_property
     def _rollout(self) -> Rollout:
-        """Of one step."""
+        """Make a rollout of one step."""
         return Rollout(self._solver, 1)
 
     @cached_property
@@ -280,7 +282,7 @@ class QuantityEvaluator:
         return self._solver.search.order.numpy()[: self._solver.layout.all_particles]
 
     def _shown(self, name: str, values: NDArray) -> NDArray:
-        """In the scene's order; those of a solid have none."""
+        """Return a quantity in the scene's order; loads on solids have none."""
         if is_load(name):
             return values[0] if self._solver.layout.batch is None else values
         found = np.empty(values.shape)
@@ -296,9 +298,9 @@ class QuantityEvaluator:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own.
-    After the last step they are those of it, but paths of solids go on as far as they went in it: else solids would
-    stop."""
+    """Return the values of parameters for all steps of a rollout, and one row of those over time, in arrays of their
+    own. After the last step they are those of it, but paths of solids go on as far as they went in it: else solids
+    would stop."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}
@@ -308,7 +310,7 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
-    """The transpose of `row_of`: add the adjoint of a parameter of one row to that of all rows, ``total``."""
+    """Add the adjoint of one row of a parameter to that of all rows, ``total``: the transpose of `row_of`."""
     shares = _shares_of_rows(rollout, name, row, total)
     if shares is None:
         total += bar
@@ -318,7 +320,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Of which rows a row is the sum, with their factors; None of parameters that are not over time."""
+    """Return the rows of which a row is the sum, with their factors; None for parameters that are not over time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None
@@ -329,20 +331,20 @@ def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> d
 
 
 class Recorder:
-    """Computes quantities of the states of a rollout in the arrays of another solver of the same scene, as the
+    """A computation of quantities of the states of a rollout in the arrays of another solver of the same scene, as the
     rollout's own are at work."""
 
     def __init__(
         self, rollout: Rollout, names: Iterable[str], evaluator: Callable[[], QuantityEvaluator], dimension: int
     ):
-        """``evaluator`` makes what computes them, and is asked for it where there are ``names``. Raises `InputError`
-        for a name that is none."""
+        """Take ``names`` of quantities; ``evaluator`` makes their evaluator, and is called where there are some. Raises
+        `InputError` for an unknown name."""
         self.names = tuple(dict.fromkeys(check_quantity(name, "record") for name in require_names("record", names)))
         self._rollout, self._evaluator = rollout, evaluator() if self.names else None
         self._dimension = dimension
 
     def __call__(self, step: int, state: State) -> Arrays:
-        """By name those of the state after so many steps, in the precision of the run."""
+        """Return by name the quantities of the state after ``step`` steps, in the precision of the run."""
         made = self._evaluator
         if made is None:
             return {}
@@ -351,7 +353,7 @@ class Recorder:
         return {name: self._value(name, moment).astype(real) for name in self.names}
 
     def _value(self, name: str, moment: Moment) -> NDArray:
-        """NaN where the step after the state loses a particle: the run says so where it takes it."""
+        """Return a quantity; NaN where the step after the state loses a particle: the run says so where it takes it."""
         try:
             return moment.value(name)
         except DivergedError:

@@ -21,34 +21,35 @@ from cortado.words import counted
 
 
 class FrameChoice(Protocol):
-    """Which states are frames, besides the first and the last."""
+    """A choice of the states that are frames of a run, besides the first and the last."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """By which one run is told from another."""
+        """Return the settings by which one run is told from another."""
 
     @property
     def rate(self) -> float | None:
-        """[1/s] frames in a second that is simulated; None where steps are chosen, not times."""
+        """Return the number of frames in a simulated second [1/s]; None where steps are chosen, not times."""
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Whether the state after a step is a frame, given how long after the first state [s] the one before and itself
-        are."""
+        """Test whether the state after a step is a frame, given the times [s] of the state before and of itself, after
+        the first state."""
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """(frames,) [s] as many as there can be, at the times that are known before the run, others about then."""
+        """Return times (frames,) [s] for as many frames as there can be, exact if they are known before the run, else
+        about right."""
 
     def expected(self, rollout: Rollout) -> int:
-        """How many frames are likely to come."""
+        """Return how many frames are likely to come."""
 
     def count(self, steps: int, time: float | None) -> int | None:
-        """How many frames so many steps of one length have that simulate a time [s]; None where that depends on a time
-        that is not known."""
+        """Return how many frames ``steps`` steps of one length have that simulate a time [s]; None where that depends
+        on an unknown time."""
 
 
 @dataclass(frozen=True)
 class EverySteps:
-    """A frame for every so many steps; a `FrameChoice`."""
+    """A choice of one frame for every ``record_every`` steps; a `FrameChoice`."""
 
     steps: int
 
@@ -58,7 +59,7 @@ class EverySteps:
 
     @property
     def rate(self) -> None:
-        """None, as steps are chosen."""
+        """Return None, as steps are chosen."""
 
     def is_due(self, step: int, before: float, now: float) -> bool:
         return step % self.steps == 0
@@ -77,7 +78,8 @@ class EverySteps:
 
 @dataclass(frozen=True)
 class FramesPerSecond:
-    """So many frames in each second that is simulated, each the first state at its time or after it; a `FrameChoice`.
+    """A choice of a number of frames in each simulated second, each the first state at its time or after it; a
+    `FrameChoice`.
 
     Raises:
         InputError: a rate that is not a number greater than 0.
@@ -115,15 +117,15 @@ class FramesPerSecond:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryBatch(Sequence[Trajectory]):
-    """What a batch of runs leaves: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single run; of a
-    scene that lost a particle it has the frames before."""
+    """The trajectories of a batch of runs: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single
+    run; of a scene that lost a particle it has the frames before."""
 
     trajectories: tuple[Trajectory, ...]
     """One for each scene."""
     fields: Mapping[str, NDArray[Any]]
     """(frames, batch, ...) every field that steps change, by its name; NaN behind the last frame of a lost scene."""
     lost: Mapping[int, DivergedError]
-    """What happened to the scenes that lost a particle, by their number."""
+    """Errors of the scenes that lost a particle, by their number."""
 
     def __repr__(self) -> str:
         lost = f", {len(self.lost)} lost" if self.lost else ""
@@ -132,7 +134,7 @@ class TrajectoryBatch(Sequence[Trajectory]):
         return f"TrajectoryBatch({counted(len(self), 'scene')}{lost}, {sizes})"
 
     def __len__(self) -> int:
-        """Number of scenes."""
+        """Return the number of scenes."""
         return len(self.trajectories)
 
     @overload
@@ -146,25 +148,25 @@ class TrajectoryBatch(Sequence[Trajectory]):
 
     @property
     def positions(self) -> NDArray[Any]:
-        """(frames, batch, n, d) [m]"""
+        """Return the positions (frames, batch, n, d) [m]."""
         return self.fields["positions"]
 
     @property
     def velocities(self) -> NDArray[Any]:
-        """(frames, batch, n, d) [m/s]"""
+        """Return the velocities (frames, batch, n, d) [m/s]."""
         return self.fields["velocities"]
 
     @property
     def mass_fractions(self) -> NDArray[Any] | None:
-        """(frames, batch, n, phases) [-]; None with one phase"""
+        """Return the mass fractions (frames, batch, n, phases) [-]; None with one phase."""
         return self.fields.get("mass_fractions")
 
 
 def recorded(
     rollout: Rollout, scene: Scene, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
 ) -> Trajectory | TrajectoryBatch:
-    """Of a scene, from fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...), and of the
-    fields of the rollout's states that no step changes, with ``quantities`` (frames, ...) of the same frames."""
+    """Make the trajectory of a scene from fields (frames, ...) after numbers of steps (frames,), in a batch (frames,
+    batch, ...), and from the fields that no step changes, with ``quantities`` (frames, ...) of the same frames."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}

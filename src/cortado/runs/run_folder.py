@@ -27,11 +27,11 @@ from cortado.scene.scene import Scene
 from cortado.version import __version__
 
 _FORMAT = 2
-"""Of run folders, in environment.json; of those before it says nothing."""
+"""Format of run folders, in environment.json; earlier ones have none there."""
 FORMER_FRAMES = 120
 """The default of film_frames in folders without a format."""
 LARGEST = 2**31
-"""Bytes of a file that is read again when a run goes on."""
+"""Most bytes of a file that is read again when a run goes on."""
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 
 
@@ -39,7 +39,7 @@ _RESUMABLE = ("run", "optimise")
 """The commands that have --resume."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
-"""In which a search notes its evaluations."""
+"""The file in which a search notes its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = (
     "particles",
@@ -59,13 +59,13 @@ FIGURES = (
     *(f"{name}.png" for name in (*_PICTURES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
     *(f"{name}.mp4" for name in _FILMS),
 )
-"""Every file that a run may have in its figures; whatever else is there is the user's."""
+"""Every file that a run may have in its figures; other files there are the user's."""
 TO_RESUME = "; choose another --out, or begin one without --resume"
-"""How a sentence ends that finds no run to go on with."""
+"""End of a sentence about a missing run to go on with."""
 
 
 class _Entry:
-    """Where a file or a folder of a name is in the folder of a run."""
+    """A descriptor of the path of a file or a folder in the folder of a run."""
 
     def __init__(self, name: str):
         self._name = name
@@ -92,7 +92,7 @@ class RunFolder:
     trajectory = _Entry("trajectory.vtkhdf")
     """The recorded frames (VTKHDF)."""
     sensors = _Entry("sensors.csv")
-    """sensors.csv: what sensors read in every step; only where the scene has some."""
+    """sensors.csv: readings of sensors in every step; only where the scene has some."""
     checkpoint = _Entry("checkpoint")
     """The optimiser's own folder, from which it resumes."""
     figures = _Entry("figures")
@@ -100,7 +100,7 @@ class RunFolder:
     report = _Entry("report.html")
     """The page that shows it all."""
     result = _Entry("result.json")
-    """What came out, for machines; it is there when the run has ended."""
+    """The results, for machines; it is there when the run has ended."""
 
     @classmethod
     def create(
@@ -114,7 +114,7 @@ class RunFolder:
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
-        """Makes the folder of a new run.
+        """Make the folder of a new run.
 
         Args:
             path: the folder, made with its parents when missing.
@@ -140,7 +140,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
-        """The folder of an existing run; ``otherwise``: how the sentence ends if there is none.
+        """Open the folder of an existing run; ``otherwise``: how the sentence ends if there is none.
 
         Raises:
             InputError: there is no run in it.
@@ -161,7 +161,7 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """The folder of an existing run that goes on, noted in environment.json with versions and command.
+        """Open the folder of an existing run that goes on, noted in environment.json with versions and command.
 
         Raises:
             InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
@@ -180,7 +180,7 @@ class RunFolder:
         return folder
 
     def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
-        """Raises `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
+        """Raise `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
         differs."""
         noted = read_json(self.environment)
         former = noted.get("kind", kind)
@@ -196,21 +196,21 @@ class RunFolder:
         self.require_meshes()
 
     def require_meshes(self) -> None:
-        """Raises `InputError` for a mesh file that has changed since the run began, or is missing."""
+        """Raise `InputError` for a mesh file that has changed since the run began, or is missing."""
         require_meshes(read_json(self.environment).get("meshes", {}), self.path)
 
     def write_sensors(self, readings: Mapping[str, Readings]) -> None:
-        """Writes sensors.csv, whole or not at all; nothing without sensors."""
+        """Write sensors.csv, whole or not at all; nothing without sensors."""
         if readings:
             write_atomically(self.sensors, as_csv(readings))
 
     def read_sensors(self) -> dict[str, Readings]:
-        """What `write_sensors` wrote, bit for bit; nothing where it wrote nothing. Raises `InputError` for a damaged
-        file."""
+        """Read the file of `write_sensors`, bit for bit; nothing where it wrote nothing. Raise `InputError` for a
+        damaged file."""
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """The scene, with replacements as for `load_scene`; without its warnings, which came when it ran.
+        """Read the scene, with replacements as for `load_scene`; without its warnings, which came when it ran.
 
         Raises:
             InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
@@ -224,28 +224,28 @@ class RunFolder:
                 raise error.in_file(str(self.scene)) from None
 
     def write_result(self, **values: Any) -> None:
-        """Writes result.json, by which a run is known to have ended; takes NumPy values too. A number that is not
-        finite is null."""
+        """Write result.json, by which a run is known to have ended; takes NumPy values too. A number that is not finite
+        is null."""
         write_atomically(self.result, json.dumps(finite(as_json(values)), indent=2) + "\n")
 
     def read_result(self) -> dict[str, Any] | None:
-        """What result.json holds; None of a run that has not ended. Raises `InputError` for a damaged file."""
+        """Read result.json; None for a run that has not ended. Raise `InputError` for a damaged file."""
         return read_json(self.result) if self.result.exists() else None
 
     def append_metrics(self, **values: Any) -> None:
-        """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
+        """Add one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
         line = json.dumps(values, default=plain) + "\n"
         with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(line)
 
     def write_metrics(self, columns: Mapping[str, Any]) -> None:
-        """Writes metrics.jsonl with a line for each step, from (steps,) of each name; whole or not at all."""
+        """Write metrics.jsonl with a line for each step, from (steps,) of each name; whole or not at all."""
         rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
         lines = [json.dumps({"step": step, **row}, default=plain) + "\n" for step, row in enumerate(rows, 1)]
         write_atomically(self.metrics, "".join(lines))
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """All lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
+        """Read all lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
 
         Raises:
             InputError: an earlier line is damaged.
@@ -264,7 +264,7 @@ class RunFolder:
             return False
 
     def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
-        """What is there from the first moment on, the mark before anything else."""
+        """Write the files of a run's first moment, the mark before anything else."""
         write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
         write_atomically(self.scene, scene_json)
         self.figures.mkdir(exist_ok=True)
@@ -286,7 +286,7 @@ class RunFolder:
             self._remove_run()
 
     def _require_own(self) -> None:
-        """Raises `InputError` for a folder that is not meant for one run."""
+        """Raise `InputError` for a folder that is not meant for one run."""
         if Path.cwd().is_relative_to(self.path.resolve()):
             raise InputError(f"{self.path} is the current folder, or one that it is in; choose another --out.")
         runs = sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
@@ -294,7 +294,7 @@ class RunFolder:
             raise InputError(f"{self.path} holds other runs, such as {runs[0]}; choose another --out.")
 
     def _remove_run(self) -> None:
-        """Removes what a run wrote, its mark last, and leaves what others put beside it."""
+        """Remove the files of a run, its mark last, and leave those that others put beside it."""
         written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
         for path in (*(folder / REPLAY_LOG for folder in self._checkpoints()), *written):
             path.unlink(missing_ok=True)
@@ -304,19 +304,20 @@ class RunFolder:
         self.environment.unlink()
 
     def _remove_unfinished(self) -> None:
-        """Removes what killed processes left of files that they were writing."""
+        """Remove unfinished files that killed processes were writing."""
         for folder in (self.path, self.figures, *self._checkpoints()):
             for path in folder.glob(UNFINISHED):
                 path.unlink(missing_ok=True)
 
     def _checkpoints(self) -> list[Path]:
-        """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
+        """Return the folders with the logs of one search after the other, that of the first one last, as it holds the
+        rest."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
 def in_present_words(scene_json: str, has_format: bool) -> str:
-    """A scene of a folder of before: `colour` of [picture] was called colour_by, and in folders without a format the
-    default of film_frames, 120, was written as if it were asked for."""
+    """Return the scene of an earlier folder in present words: `colour` of [picture] was called colour_by, and in
+    folders without a format the default of film_frames, 120, was written as if it were asked for."""
     try:
         scene = json.loads(scene_json)
         picture = scene["picture"]
@@ -330,13 +331,13 @@ def in_present_words(scene_json: str, has_format: bool) -> str:
 
 
 def computed(scene: Any) -> Any:
-    """A scene without what changes only how it is shown, and what is read of it."""
+    """Return a scene without tables that change only how it is shown, and what is read of it."""
     shown = ("picture", "sensor")
     return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
 
 
 def finite(value: Any) -> Any:
-    """A value without numbers that JSON does not have."""
+    """Return a value without numbers that JSON does not have."""
     if isinstance(value, dict):
         return {name: finite(entry) for name, entry in value.items()}
     if isinstance(value, list):
@@ -345,7 +346,7 @@ def finite(value: Any) -> Any:
 
 
 def bytes_of(path: Path) -> bytes:
-    """All of a file; raises `InputError` if it is no regular one, or very large."""
+    """Read all of a file; raise `InputError` if it is no regular one, or very large."""
     try:
         return content(path, LARGEST)
     except OSError as problem:
@@ -360,13 +361,14 @@ def read_json(path: Path) -> Any:
 
 
 def cut_torn_line(path: Path) -> None:
-    """Removes what a killed run left of a last line, so that the next line begins a line."""
+    """Remove an unfinished last line that a killed run left, so that the next line begins a line."""
     if path.exists():
         os.truncate(path, bytes_of(path).rfind(b"\n") + 1)
 
 
 def session(command: Sequence[str], device: str) -> dict[str, Any]:
-    """Where and when a part of a run happens: operating system, Python, the versions that matter, the command."""
+    """Return where and when a part of a run happens: operating system, Python, the versions that matter, the
+    command."""
     return {
         "cortado": __version__,
         "python": platform.python_version(),
@@ -380,19 +382,20 @@ def session(command: Sequence[str], device: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """NumPy numbers and arrays as Python numbers and lists."""
+    """Return NumPy numbers and arrays as Python numbers and lists."""
     if hasattr(value, "tolist"):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def as_json(value: Any) -> Any:
-    """A value as it comes back from a file: arrays and tuples are lists."""
+    """Return a value as it comes back from a file: arrays and tuples are lists."""
     return json.loads(json.dumps(value, default=plain))
 
 
 def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None:
-    """Raise InputError, with the field, where what is given differs from what the run in a folder was begun with."""
+    """Raise `InputError`, with the field, where given settings differ from those that the run in a folder was begun
+    with."""
     if isinstance(former, dict) and isinstance(given, dict):
         for name in sorted({*former, *given}):
             require_same(former.get(name), given.get(name), folder, f"{field}.{name}".lstrip("."))
@@ -407,7 +410,7 @@ def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None
 
 
 def _written(value: Any) -> str:
-    """As in a file; what is left out has no value."""
+    """Write a value as in a file; one that is left out has no value."""
     if value is None:
         return "nothing"
     return json.dumps(value)[: 2 * LONGEST] if isinstance(value, dict) else shown(value)
@@ -425,14 +428,14 @@ def _version(package: str) -> str | None:
 
 
 def mesh_marks(scene_json: str) -> dict[str, str]:
-    """What marks each file of a mesh in a resolved scene, by its path."""
+    """Return the mark of each mesh file in a resolved scene, by its path."""
     tables = json.loads(scene_json)
     meshes = [table for kind in ("solid", "fluid") for table in tables.get(kind) or () if table.get("file")]
     return {table["file"]: _mark(Path(table["file"])) for table in meshes}
 
 
 def require_meshes(marks: Mapping[str, str], run: Path) -> None:
-    """Raises `InputError` for a file that is no longer the one a run was made with."""
+    """Raise `InputError` for a file that is no longer the one a run was made with."""
     for name, mark in marks.items():
         if not Path(name).is_file():
             raise InputError(f"{name} is missing, but the run in {run} was made with it: put it back.")

@@ -21,15 +21,15 @@ from cortado.scene.solids import SolidTable
 
 
 class Cut(Protocol):
-    """A scene that is cut into particles."""
+    """A scene cut into particles, as sensors need to know it."""
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
 
     @property
     def lattice(self) -> Lattice:
-        """Constants of the particles at rest, such as their volume, and along which axes they repeat."""
+        """Return the constants of the particles at rest, such as their volume and the axes along which they repeat."""
 
 
 class Reading(Cut, Protocol):
@@ -37,42 +37,42 @@ class Reading(Cut, Protocol):
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Those of the scene, as they begin."""
+        """Return the solids of the scene, as they begin."""
 
     @property
     def container(self) -> Container:
-        """The container of the scene."""
+        """Return the container of the scene."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A field of the state or a quantity of its particles, float64."""
+        """Return a field of the state or a quantity of its particles, float64."""
 
 
 class Sensor(Protocol):
-    """Something that reads a few numbers of a state, and their derivatives."""
+    """A sensor that reads a few numbers of a state, and their derivatives."""
 
     def columns(self, dimension: int) -> dict[str, str]:
-        """The names of its numbers, with their units."""
+        """Return the names of its numbers, with their units."""
 
     def value(self, at: Reading) -> NDArray[Any]:
-        """(k,) what it reads, one number for each column."""
+        """Return its reading (k,) of a state, one number for each column."""
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """From the adjoint of what it reads, (k,), to those of fields and quantities, by name."""
+        """Turn the adjoint (k,) of its reading into those of fields and quantities, by name."""
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
-"""What w is multiplied with, over the reach to the number of dimensions, so that it has the integral 1."""
+"""Factor of w, over the reach to the number of dimensions, with which it has the integral 1."""
 LEAST_REACH = 5.0
 """In spacings: with it the weights of a lattice add up to 1 within 0.1 %, wherever a plane or a column lies in it."""
 MOST_PARTS = 40
-"""Along an axis: enough for a reach of half a spacing, and less is warned of."""
+"""Most parts along an axis: enough for a reach of half a spacing, and less is warned of."""
 TIME = "time [s]"
 """The first column of a table of readings."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
+    """Weights w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
 
     values: NDArray[Any]
     """w"""
@@ -81,46 +81,46 @@ class Weights:
 
     @classmethod
     def of(cls, q: NDArray[Any]) -> "Weights":
-        """At distances (n,)."""
+        """Compute the weights at distances (n,)."""
         rest = np.clip(1.0 - q, 0.0, None)
         return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
 
 
 Across = Callable[[NDArray[Any]], NDArray[Any]]
-"""How a sensor sees ways (n, d): a linear function to ways (n, k)."""
+"""A sensor's view of ways (n, d): a linear function to ways (n, k)."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """Those of all particles, or of all their parts in one place of their cells, that weigh something."""
+    """One image of all particles, or of all their parts in one place of their cells, that weigh something."""
 
     near: NDArray[np.int_]
-    """(m,) their numbers"""
+    """(m,) numbers of the particles"""
     ways: NDArray[Any]
-    """(m, k) from the place to them [m]"""
+    """(m, k) ways from the place to them [m]"""
     weights: Weights
-    """(m,) each"""
+    """(m,) their weights"""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Particles around a place, along periodic axes with all of their images that are near."""
+    """The particles around a place, along periodic axes with all of their images that are near."""
 
     images: list[Image]
-    """Of each of the parts that a particle is divided into, and each of its images."""
+    """Images of each of the parts of a particle, near the place."""
     particles: int
-    """n"""
+    """Number n of particles."""
     parts: int
-    """How many parts a particle is divided into."""
+    """Number of parts into which a particle is divided."""
     reach: float
-    """From where on they weigh nothing [m]."""
+    """Distance [m] from which on particles weigh nothing."""
 
     @classmethod
     def of(
         cls, at: Reading, place: NDArray[Any], reach: float, across: Across, parts: NDArray[Any] | None = None
     ) -> "Seen":
-        """From a place (d,) as ``across`` shows it. ``parts`` (m, d) are where the parts of a particle lie from it [m],
-        which weigh the same; a particle is one point if they are left out."""
+        """Find particles around a place (d,) as ``across`` shows them. ``parts`` (m, d) are the places of the parts of
+        a particle from it [m], which weigh the same; a particle is one point if they are left out."""
         shifts = np.zeros((1, at.dimension)) if parts is None else parts
         seen, widest = across(shifts), reach + float(np.linalg.norm(across(shifts), axis=1).max())
         ways = at.lattice.domain.ways(at["positions"], in_dimension("position", place, at.dimension), widest, across)
@@ -134,14 +134,14 @@ class Seen:
 
     @property
     def weights(self) -> NDArray[Any]:
-        """(n,) of particles, the mean of their parts, those of their images added up."""
+        """Return the weights (n,) of particles, the mean over their parts, summed over their images."""
         found = np.zeros(self.particles)
         for image in self.images:
             found[image.near] += image.weights.values
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """(n, k) the derivative with respect to the ways, from that with respect to the weights, (n,)."""
+        """Return the derivative (n, k) with respect to the ways, from that with respect to the weights, (n,)."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.weights.slopes / self.reach**2)[:, None] * image.ways
@@ -149,16 +149,16 @@ class Seen:
 
 
 def reach_of(given: float | None, at: Cut) -> float:
-    """How far from a plane or an axis particles count [m]: what is given, or else two support radii, or five spacings
-    where these are more."""
+    """Return the distance [m] from a plane or an axis at which particles count: the given one, or else two support
+    radii, or five spacings where these are more."""
     if given is not None:
         return given
     return max(2.0 * at.lattice.support, LEAST_REACH * at.lattice.cell ** (1.0 / at.dimension))
 
 
 def parts_of(reach: float, at: Reading, across: Across, axes: int) -> NDArray[Any]:
-    """(m, d) where parts of a particle lie from it [m]: evenly in its cell along so many axes, those that are seen
-    best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
+    """Return the places (m, d) of parts of a particle from it [m]: evenly in its cell along ``axes`` axes, those that
+    are seen best, with `LEAST_REACH` of them to a reach, as then the weights of a lattice add up to 1."""
     spacing = at.lattice.cell ** (1.0 / at.dimension)
     count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
@@ -167,14 +167,14 @@ def parts_of(reach: float, at: Reading, across: Across, axes: int) -> NDArray[An
 
 
 def load_columns(dimension: int) -> dict[str, str]:
-    """The names of a force and its torque, with their units: in the plane those of a metre across it."""
+    """Return the names of a force and its torque, with their units: in the plane those of a metre across it."""
     force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
     turning = ["torque_x", "torque_y", "torque_z"] if dimension == 3 else ["torque"]
     return dict.fromkeys(["force_x", "force_y", "force_z"][:dimension], force) | dict.fromkeys(turning, torque)
 
 
 def point(what: str, values: Any) -> NDArray[Any]:
-    """A place or a direction, (d,), finite; raises `InputError`."""
+    """Check a place or a direction, (d,), finite; raise `InputError`."""
     array = corner(what, values)
     if not np.isfinite(array).all():
         raise InputError(f"{what} is {array.tolist()}, but must be finite.")
@@ -182,7 +182,7 @@ def point(what: str, values: Any) -> NDArray[Any]:
 
 
 def corner(what: str, values: Any) -> NDArray[Any]:
-    """The same, or infinite where a region has no end."""
+    """Check a corner (d,) of a region, infinite where it has no end; raise `InputError`."""
     array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
@@ -192,7 +192,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 
 
 def direction(what: str, values: Any) -> NDArray[Any]:
-    """The same of length 1."""
+    """Check a direction (d,) and scale it to length 1; raise `InputError`."""
     array = point(what, values)
     if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
@@ -200,7 +200,7 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """A finite number above 0; raises `InputError`."""
+    """Check a finite number above 0; raise `InputError`."""
     number = as_one_number(what, value)
     if not 0.0 < number < np.inf:
         raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
@@ -208,13 +208,13 @@ def positive(what: str, value: Any) -> float:
 
 
 def checked_sensor(sensor: Any) -> Sensor:
-    """What a user gives as a sensor; raises `InputError`."""
+    """Return what a user gives as a sensor if it is one; else raise `InputError`."""
     require_methods("sensor", sensor, ("columns", "value", "adjoint"), "a sensor, such as one of cortado.sensors")
     return sensor
 
 
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
-    """(k,) what a sensor reads; raises `InputError` unless it has one number for each of its columns."""
+    """Return the reading (k,) of a sensor; raise `InputError` unless it has one number for each of its columns."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
     found = as_numbers(what, sensor.value(at))
     if found.shape != (columns,):
@@ -223,7 +223,7 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """A place with as many components as the scene has dimensions; raises `InputError`."""
+    """Check that a place has one component for each dimension of the scene; raise `InputError`."""
     if len(values) != dimension:
         raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
     return values
@@ -231,30 +231,30 @@ def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What one sensor has read."""
+    """The readings of one sensor over time."""
 
     times: NDArray[Any]
     """(readings,) [s]"""
     values: NDArray[Any]
     """(readings, k)"""
     units: Mapping[str, str]
-    """Of its numbers, by their names, in their order."""
+    """Units of its numbers, by their names, in their order."""
 
     def __repr__(self) -> str:
         return f"Readings({len(self.times)} of {', '.join(self.units)})"
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """(readings,) one of its numbers, by name; raises `InputError` where there is no such."""
+        """Return one of its numbers over time, (readings,), by name; raise `InputError` for an unknown name."""
         if column not in self.units:
             raise InputError(f"a column is {shown(column)}, but must be one of {', '.join(self.units)}.")
         return self.values[:, list(self.units).index(column)]
 
 
 class SensorLog:
-    """The numbers of several sensors, state by state."""
+    """A log of the numbers of several sensors, state by state."""
 
     def __init__(self, sensors: Mapping[str, Sensor], dimension: int):
-        """``sensors`` by the names that tell them apart. Raises `InputError` for what is no sensor."""
+        """Take ``sensors`` by the names that tell them apart; raise `InputError` for an object that is no sensor."""
         if not isinstance(sensors, Mapping):
             raise InputError(f"sensors is {shown(sensors)}, but must be a table of sensors by name.")
         for name, sensor in sensors.items():
@@ -266,28 +266,28 @@ class SensorLog:
         """One for each state that all sensors have read: an interruption leaves whole rows."""
 
     def read(self, at: Reading) -> None:
-        """Have every sensor read a state."""
+        """Let every sensor read a state."""
         self._rows.append({name: self._value(name, sensor, at) for name, sensor in self.sensors.items()})
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """The last step of which there are all readings of these sensors; infinite without sensors."""
+        """Return the last step of which there are all readings of these sensors; infinite without sensors."""
         if any(name not in readings or readings[name].units != self._units[name] for name in self.sensors):
             return -1
         return min((len(readings[name].times) - 1 for name in self.sensors), default=inf)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Have what was read of the first state and after so many steps."""
+        """Take over the readings of the first state and after ``steps`` steps."""
         self._rows = [{name: readings[name].values[k] for name in self.sensors} for k in range(steps + 1)]
 
     def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
-        """NaN where the step after the state loses a particle: the run says so where it takes it."""
+        """Return a reading; NaN where the step after the state loses a particle: the run says so where it takes it."""
         try:
             return value_of(sensor, at)
         except DivergedError:
             return np.full(len(self._units[name]), np.nan)
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """What was read, at the first of these times [s]."""
+        """Return the readings, at the first of these times [s]."""
         found = {}
         for name, units in self._units.items():
             values = np.array([row[name] for row in self._rows]).reshape(len(self._rows), len(units))
@@ -296,7 +296,7 @@ class SensorLog:
 
 
 def as_csv(readings: Mapping[str, Readings]) -> str:
-    """A table with a column for the time and one for each number of each sensor, the unit in its head."""
+    """Write a table with a column for the time and one for each number of each sensor, the unit in its head."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     heads = [f"{name}.{column} [{unit}]" for name, own in readings.items() for column, unit in own.units.items()]
@@ -306,7 +306,7 @@ def as_csv(readings: Mapping[str, Readings]) -> str:
 
 
 def from_csv(path: Path) -> dict[str, Readings]:
-    """What `as_csv` wrote into a file; raises `InputError` for anything else."""
+    """Read a file of `as_csv`; raise `InputError` for anything else."""
     columns = read_columns(path)
     times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
     if not len(times):
@@ -328,12 +328,12 @@ def _rows(readings: list[Readings]) -> Iterable[list[str]]:
 
 
 Summary = dict[str, dict[str, dict[str, float]]]
-"""By the sensor, by its number, by what it is: ``last``, ``mean`` and ``greatest``."""
+"""By the sensor and its number: ``last``, ``mean`` and ``greatest``."""
 
 
 def summary(readings: Mapping[str, Readings]) -> Summary:
-    """Of each number of each sensor the last reading, the mean over time, and the greatest: the reading farthest from
-    0, with its sign."""
+    """Return for each number of each sensor the last reading, the mean over time, and the greatest: the reading
+    farthest from 0, with its sign."""
     return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
 
 
@@ -348,23 +348,23 @@ def _of(read: Readings, column: str) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredColumn:
-    """What was measured of one number of a sensor, at times within the run."""
+    """Measured values of one number of a sensor, at times within the run, beside its readings."""
 
     name: str
     """"gauge.height" of the sensor gauge."""
     unit: str
     times: NDArray[Any]
-    """(k,) [s], of those that are within the run."""
+    """(k,) [s], times within the run."""
     values: NDArray[Any]
     """(k,)"""
     simulated: NDArray[Any]
-    """(k,) what the sensor read then: between two steps interpolated linearly."""
+    """(k,) readings of the sensor then: between two steps interpolated linearly."""
     left_out: int
-    """Measured points that are before or after the run."""
+    """Number of measured points that are before or after the run."""
 
     @property
     def errors(self) -> dict[str, float]:
-        """Of the simulated less the measured values, in the sensor's unit."""
+        """Return errors of the simulated less the measured values, in the sensor's unit."""
         off = self.simulated - self.values
         worst = int(np.abs(off).argmax())
         return {
@@ -376,7 +376,7 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """The columns of a table of measured data, each beside the readings of a run's sensor.
+    """Read the columns of a table of measured data, each beside the readings of a run's sensor.
 
     The table has a column "time" [s] and columns such as "gauge.height", named as in sensors.csv; units in brackets may
     be left out, and so may entries.
@@ -414,6 +414,6 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
 
 
 def _name_and_unit(head: str) -> tuple[str, str | None]:
-    """Of a column; None where it has no unit in brackets."""
+    """Split the head of a column into name and unit; None where it has no unit in brackets."""
     name, bracket, unit = head.partition("[")
     return name.strip(), unit.rstrip().removesuffix("]").strip() if bracket else None

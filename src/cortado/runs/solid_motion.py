@@ -27,36 +27,36 @@ from cortado.scene.solids import SolidTable
 
 @dataclass(frozen=True, eq=False)
 class SolidMotion:
-    """One solid, in every frame."""
+    """The motion of one solid, in every frame."""
 
     positions: NDArray[Any]
-    """(frames, d) of its middle [m]"""
+    """(frames, d) positions of its middle [m]"""
     rotations: NDArray[Any]
     """(frames, 3) rotation vectors, in 2-D (frames,) angles, by which it is turned about its middle [rad]"""
     velocities: NDArray[Any] | None = None
-    """(frames, d) of the middle of a body that is free [m/s]; None for one that is told where to go."""
+    """(frames, d) velocities of the middle of a body that is free [m/s]; None for one with a given path."""
     angular_velocities: NDArray[Any] | None = None
     """(frames, 3), in 2-D (frames,), of a body that is free [rad/s]; None for others."""
     scale: float = 1.0
-    """How many times as large as in the scene one is that is told where to go."""
+    """Scale of a solid with a given path, relative to the scene's."""
 
     def __getitem__(self, frames: slice | NDArray[np.intp]) -> Self:
-        """In some of the frames."""
+        """Return the motion in some of the frames."""
         velocities, spins = (None if a is None else a[frames] for a in (self.velocities, self.angular_velocities))
         places, turns = self.positions[frames], self.rotations[frames]
         return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
     def carried(self, shifts: NDArray[Any]) -> Self:
-        """A body that is free a short time later in each frame, or earlier, ``shifts`` (frames,) [s]: it goes on at its
-        velocities."""
+        """Return a free body's motion a short time later in each frame, or earlier, ``shifts`` (frames,) [s]: it goes
+        on at its velocities."""
         assert self.velocities is not None and self.angular_velocities is not None
         places, turns = self.positions + shifts[:, None] * self.velocities, (shifts * self.angular_velocities.T).T
         rotations = self.rotations + turns if turns.ndim == 1 else _product(turns, self.rotations)
         return replace(self, positions=places, rotations=rotations)
 
     def between(self, known: NDArray[Any], times: NDArray[Any], table: SolidTable) -> Self:
-        """A solid that is told where to go at ``times`` (k,) [s], with frames at times ``known`` (frames,) [s]: as its
-        ``table`` tells, but for what a run may have changed, which is interpolated."""
+        """Return the motion at ``times`` (k,) [s] of a solid with a given path and frames at times ``known`` (frames,)
+        [s]: as its ``table`` tells, but for changes by a run, which are interpolated."""
         shift, turn = courses(table)
         kept = self.positions - shift.at(known)
         places = np.stack([np.interp(times, known, x) for x in kept.T], axis=1) + shift.at(times)
@@ -71,20 +71,20 @@ class SolidMotion:
 
 
 class SolidMotions(dict[str, SolidMotion]):
-    """Of the solids of a run that move, by their names."""
+    """The motions of the solids of a run that move, by their names."""
 
     def __missing__(self, name: object) -> SolidMotion:
-        """Raises `InputError`."""
+        """Raise `InputError` for a solid that did not move."""
         known = f"moved {', '.join(self)}" if self else "moved none"
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
 
     def in_frames(self, frames: slice) -> "SolidMotions":
-        """In some of the frames."""
+        """Return the motions in some of the frames."""
         return SolidMotions({name: motion[frames] for name, motion in self.items()})
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> "SolidMotions":
-        """At ``times`` (k,) [s], each near the frame of a number ``recorded`` (k,), in a run of a scene with frames at
-        times ``known`` (frames,) [s]."""
+        """Return the motions at ``times`` (k,) [s], each near the frame of a number ``recorded`` (k,), in a run of a
+        scene with frames at times ``known`` (frames,) [s]."""
         shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
         if not shifts.any():
             return SolidMotions({name: motion[recorded] for name, motion in self.items()})
@@ -98,17 +98,17 @@ class SolidMotions(dict[str, SolidMotion]):
 
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> SolidMotions:
-    """Of the solids of a scene that move, by their names, from recorded fields (frames, 1, ...) of states."""
+    """Return the motions of the solids of a scene, by their names, from recorded fields (frames, 1, ...) of states."""
     return SolidMotions({table.name: _motion(table.name, fields, scene.dimension) for table in moved(scene, fields)})
 
 
 def motions_in(fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
-    """Of all solids of which recorded fields (frames, 1, ...) of states tell, by their names."""
+    """Return the motions of all solids that recorded fields (frames, 1, ...) of states have, by their names."""
     return SolidMotions({name: _motion(name, fields, dimension) for name in solids_in(fields)})
 
 
 def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
-    """The solids of a scene that move, of which fields of states tell."""
+    """Return the solids of a scene that move, of which fields of states tell."""
     return [table for table in moving(scene.solid) if position_name(table.name) in fields]
 
 
@@ -126,8 +126,8 @@ def _motion(name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> So
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """The rotations of axes (frames, d, 3), columns in the frame of space, after those that a body began with; in 2-D
-    angles, each the nearest to the one before."""
+    """Return the rotations of axes (frames, d, 3), columns in the frame of space, after those that a body began with;
+    in 2-D angles, each the nearest to the one before."""
     if dimension == 2:
         return np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
     from scipy.spatial.transform import Rotation
@@ -136,20 +136,20 @@ def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[
 
 
 def _product(turns: NDArray[Any], begun: NDArray[Any]) -> NDArray[Any]:
-    """(frames, 3) the rotation vectors of a first rotation and a turn after it."""
+    """Return the rotation vectors (frames, 3) of a first rotation and a turn after it."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray((Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
 
 
 def sized(scene: Scene, motions: Mapping[str, SolidMotion]) -> Scene:
-    """A scene with the solids that move as large as they are in a run."""
+    """Return a scene with the solids that move as large as they are in a run."""
     tables = (table.stretched(motions[table.name].scale) if table.name in motions else table for table in scene.solid)
     return scene.model_copy(update={"solid": tuple(tables)})
 
 
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
-    """The same where they are in a frame, to be drawn."""
+    """Return a scene with the solids where they are in a frame, to be drawn."""
     tables = []
     for table in sized(scene, motions).solid:
         if motion := motions.get(table.name):

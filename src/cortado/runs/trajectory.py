@@ -45,7 +45,7 @@ class Frame:
     """further fields of the state by name, such as those that parts keep; see `Trajectory`"""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A quantity of the particles by its name, one that was recorded or the speed, or a field of the state.
+        """Return a quantity of the particles by its name, one that was recorded or the speed, or a field of the state.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
@@ -55,7 +55,7 @@ class Frame:
         return chosen(self.quantities, name, fields)
 
     def moved(self, duration: float) -> Frame:
-        """About the state a short time [s] later, or earlier: every particle goes on along its velocity."""
+        """Return about the state a short time [s] later, or earlier: every particle goes on along its velocity."""
         if duration == 0.0:
             return self
         return replace(self, positions=self.positions + duration * self.velocities, time=self.time + duration)
@@ -65,7 +65,7 @@ class Frame:
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """A quantity that was recorded, the speed, or one of ``fields``; raises `InputError` for any other name."""
+    """Return a quantity that was recorded, the speed, or one of ``fields``; raise `InputError` for any other name."""
     check_quantity(name, others=tuple(fields))
     if name in fields:
         return fields[name]
@@ -79,13 +79,13 @@ def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[st
 
 
 SUFFIXES = (".vtkhdf", ".hdf")
-"""By which ParaView knows a trajectory."""
+"""Endings by which ParaView knows a trajectory."""
 
 
 @public
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What a run leaves: recorded frames, and what the solver noted of every step.
+    """The recorded frames of a run, and the solver's notes on every step.
 
     ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
     ``trajectory[::10]`` are trajectories of these frames alone; ``len``, ``for`` and ``reversed`` go over the frames.
@@ -148,7 +148,7 @@ class Trajectory:
         return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.times)
 
     @overload
@@ -158,7 +158,7 @@ class Trajectory:
     def __getitem__(self, k: slice) -> Trajectory: ...
 
     def __getitem__(self, k: int | slice) -> Frame | Trajectory:
-        """A frame, or a trajectory of some; what the solver noted stays that of the whole run.
+        """Return a frame, or a trajectory of some; the solver's notes stay those of the whole run.
 
         Raises:
             IndexError: there is no such frame.
@@ -177,8 +177,9 @@ class Trajectory:
         return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
-        """(frames, n) or (frames, n, k) a quantity of the particles, one that was recorded or the speed, or a field of
-        the states, which may have other axes behind the first; any other quantity `Simulation.quantity` computes.
+        """Return a quantity (frames, n) or (frames, n, k) of the particles, one that was recorded or the speed, or a
+        field of the states, which may have other axes behind the first; any other quantity `Simulation.quantity`
+        computes.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
@@ -189,7 +190,7 @@ class Trajectory:
         return (self[k] for k in range(len(self)))
 
     def _chosen(self, frames: slice) -> Trajectory:
-        """The trajectory of some frames."""
+        """Return the trajectory of some frames."""
         names = ("times", "steps", "positions", "velocities", "mass_fractions")
         arrays = {name: getattr(self, name) for name in names}
         kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
@@ -201,29 +202,29 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """(frames,) [s] when pictures and films show each frame: at its whole mark in a run with ``--fps``, to which it
-        is moved along its velocities, and else at its time."""
+        """Return the times (frames,) [s] at which pictures and films show each frame: at its whole mark in a run with
+        ``--fps``, to which it is moved along its velocities, and else at its time."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Return the number of dimensions, 2 or 3."""
         return self.positions.shape[2]
 
     @property
     def particles(self) -> int:
-        """n"""
+        """Return the number of particles."""
         return self.positions.shape[1]
 
     @property
     def _fields(self) -> dict[str, NDArray[Any]]:
-        """(frames, ...) every field that steps change, by its name."""
+        """Return every field that steps change, (frames, ...), by its name."""
         fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
         return {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """(steps,) [-] pressure iterations of each step, of a solver with one loop.
+        """Return the pressure iterations (steps,) [-] of each step, of a solver with one loop.
 
         Raises:
             InputError: the solver notes something else.
@@ -232,7 +233,7 @@ class Trajectory:
 
     @property
     def density_errors(self) -> NDArray[Any]:
-        """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step.
+        """Return the average (rho - rho_0) / rho_0 (steps,) [-] at the end of each step.
 
         Raises:
             InputError: the solver notes something else.
@@ -241,17 +242,17 @@ class Trajectory:
 
     @property
     def converged(self) -> NDArray[Any]:
-        """(steps,) bool: whether the solver reached its tolerance."""
+        """Return booleans (steps,), true where the solver reached its tolerance."""
         return self.diagnostics["converged"]
 
     @property
     def not_converged(self) -> int:
-        """Number of steps at which the solver did not reach its tolerance."""
+        """Return the number of steps at which the solver did not reach its tolerance."""
         return int(np.count_nonzero(~self.converged))
 
     @property
     def last_state(self) -> RestartState:
-        """The state of the last frame, from which `Simulation.run` goes on bit for bit, in arrays of its own.
+        """Return the state of the last frame, from which `Simulation.run` goes on bit for bit, in arrays of its own.
 
         Raises:
             InputError: there is no frame.
@@ -265,7 +266,7 @@ class Trajectory:
         return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1]), size), self.origin)
 
     def save(self, path: str | Path) -> None:
-        """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
+        """Write a VTKHDF file, which ParaView opens; a file of that name is replaced.
 
         Raises:
             InputError: no frames, a name that does not end in one of `SUFFIXES`, or a path that cannot be written.
@@ -284,14 +285,14 @@ class Trajectory:
             self.write_frames(writer)
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
-        """Writes all frames to a file that has room for them."""
+        """Write all frames to a file that has room for them."""
         for k, step in enumerate(self.steps):
             recorded = {name: array[k] for name, array in self.quantities.items()}
             frame = {name: array[k] for name, array in self._fields.items()}
             append_frame(writer, frame, int(step), recorded, float(self.times[k]))
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
-        """Writes the surface of the fluid and its particles, in the colours of pictures, and solids for other programs:
+        """Write the surface of the fluid and its particles, in the colours of pictures, and solids for other programs:
         see `docs/into_blender.md`. Returns the file to open, or the folder of a series.
 
         ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
@@ -312,7 +313,7 @@ class Trajectory:
         return path
 
     def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` of the dimensions time, particle and space, with units: position, velocity, with
+        """Return an ``xarray.Dataset`` of the dimensions time, particle and space, with units: position, velocity, with
         several phases mass_fraction, recorded quantities, and where solids that move are, along a dimension solid.
 
         Raises:
@@ -323,8 +324,8 @@ class Trajectory:
     def picture(
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
-        """A shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera is
-        where it sees the fluid in every frame. Arguments and errors as of `film`."""
+        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1, which a notebook shows. The camera
+        is where it sees the fluid in every frame. Arguments and errors as of `film`."""
         image: ShadedPicture = on_top("trajectory_picture")(self, k, scene, device, settings)
         return image
 
@@ -349,13 +350,13 @@ class Trajectory:
         return film
 
     def _repr_html_(self) -> str:
-        """The run in motion, with y up; and its first, middle and last frame, coloured by speed."""
+        """Show the run in motion, with y up, and its first, middle and last frame, coloured by speed, in a notebook."""
         page: str = on_top("trajectory_page")(self)
         return page
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads a file written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at work.
+        """Read a file written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at work.
 
         Raises:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -379,7 +380,7 @@ class Trajectory:
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
-    """(steps,) of that name; raises `InputError` where a solver has other diagnostics."""
+    """Return the diagnostic (steps,) of a name; raise `InputError` where a solver has other diagnostics."""
     if name not in diagnostics:
         raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
     return diagnostics[name]

@@ -41,13 +41,13 @@ from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 
 FINE = 0.5
-"""In spacings: how far apart the points of a column are at most."""
+"""In spacings: greatest distance between the points of a column."""
 ACROSS_REACH = 20.0
-"""How many of them there are at least from the axis of a column to its side."""
+"""Least number of points from the axis of a column to its side."""
 LEAST = 1e-3
 """The part of a level that counts as no room at all."""
 MOST = 4_000_000
-"""Points: where solids go higher they are further apart."""
+"""Most points: where solids go higher they are further apart."""
 NARROW = 0.01
 """The part of a column that has to be within a container that cuts it."""
 FILM = 1.0
@@ -56,7 +56,7 @@ FILM = 1.0
 
 @dataclass(frozen=True)
 class Standing:
-    """A solid where it is: x is at ``middle + scale turn r``, with the place r in its own frame."""
+    """A solid in its place beside a gauge: x is at ``middle + scale turn r``, with the place r in its own frame."""
 
     own: Solid
     middle: NDArray[Any]
@@ -65,23 +65,24 @@ class Standing:
     """(d, d)"""
     scale: float
     pose: Pose | None
-    """Of one that moves."""
+    """Pose of a solid that moves; else None."""
 
     @classmethod
     def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
-        """In a state, which one that stays needs not."""
+        """Take a solid in a state, which one that stays does not need."""
         if at is None or not table.moves:
             return cls(table.own_solid(), table.middle(), table.turn(d), 1.0, None)
         pose = Pose.of(table.name, table.motion == "free", at)
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """(n, d) the places r of points (n, d) [m], or of those of their images that are nearest to its middle."""
+        """Return the places r (n, d) of points (n, d) [m], or of those of their images that are nearest to its
+        middle."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """How high it goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite if it has no
-        end."""
+        """Return how high it goes above a foot (d,) along ``up`` (d,), and how far from its middle [m], infinite if it
+        has no end."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -89,22 +90,22 @@ class Standing:
 
 @dataclass(frozen=True)
 class Axis:
-    """The line at which a gauge stands, upwards from its floor."""
+    """The axis of a gauge: the line at which it stands, upwards from its floor."""
 
     foot: tuple[float, ...]
     """(d,) where its axis meets its floor [m]"""
     up: tuple[float, ...]
     """(d,) unit vector"""
     reach: float
-    """Of its weights [m]."""
+    """Reach of its weights [m]."""
     step: float
-    """From point to point [m]."""
+    """Distance from point to point [m]."""
     film: float
     """`FILM` [m]"""
 
     @classmethod
     def of(cls, at: Reading, position: NDArray[Any], floor: float, up: NDArray[Any], reach: float) -> "Axis":
-        """The axis of a gauge."""
+        """Make the axis of a gauge at a position, from its floor upwards."""
         in_dimension("position", position, at.dimension)
         spacing = at.lattice.cell ** (1.0 / at.dimension)
         foot = position + (floor - position @ up) * up
@@ -112,7 +113,7 @@ class Axis:
         return cls(tuple(foot.tolist()), tuple(up.tolist()), reach, step, FILM * spacing)
 
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """(c, d) the points of the floor from its foot [m], and their weights (c,)."""
+        """Return the points (c, d) of the floor from its foot [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         across = np.linalg.svd(np.array([self.up]))[2][1:]
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
@@ -123,7 +124,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Column:
-    """The points of a column, and what solids take of them."""
+    """The points of a gauge's column, with the parts that solids take of them."""
 
     axis: Axis
     points: NDArray[Any]
@@ -133,11 +134,11 @@ class Column:
     outside: NDArray[Any]
     """(c,) the part of each place that is behind the sides of the container"""
     solids: list[tuple[Standing, NDArray[Any]]]
-    """Those in it, and how far its points are from them (levels, c) [m], where that is less than a step."""
+    """Solids in it, and the distance of its points from them (levels, c) [m], where that is less than a step."""
 
     @classmethod
     def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
-        """None where no solid is in it."""
+        """Make a column with solids in it; None where no solid is in it."""
         foot, up = np.array(axis.foot), np.array(axis.up)
         tops, sizes = np.array([one.reach(up, foot) for one in solids]).T
         ways = domain.shortest(foot - np.array([one.middle for one in solids], dtype=np.float64))
@@ -164,17 +165,19 @@ class Column:
 
     @cached_property
     def _taken(self) -> NDArray[Any]:
-        """(levels, c) what solids and the container take of each point, 1 or more where that is all of it."""
+        """Return the part (levels, c) of each point that solids and the container take, 1 or more where that is all of
+        it."""
         return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """(levels,) the part of each level that is none of a solid."""
+        """Return the part (levels,) of each level that no solid takes."""
         return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Which ends of levels the height is linear between, and the depths that fill the room below them [m]."""
+        """Return the ends of levels between which the height is linear, and the depths that fill the room below them
+        [m]."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
         kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor
@@ -184,8 +187,8 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """How high above its floor fluid stands that has a depth where there are no solids [m]; which part (levels,) of
-        what solids take of each level adds to it; and by how much it grows with the depth."""
+        """Return how high above its floor fluid stands that has a depth where there are no solids [m]; which part
+        (levels,) of each level's solids adds to it; and its derivative with respect to the depth."""
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -196,7 +199,7 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def solid_bars(self, depth: float, bar: float, domain: Domain) -> dict[str, NDArray[Any]]:
-        """From the derivative with respect to the level of a depth [m] to those of fields of solids that move."""
+        """Turn the derivative with respect to the level of a depth [m] into those of fields of solids that move."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, dict[str, NDArray[Any]]()
         for one, far in self.solids:
@@ -216,7 +219,7 @@ class Column:
 
 
 def column_of(axis: Axis, at: Reading) -> Column | None:
-    """A column as solids stand in it in a state; None where none does."""
+    """Return a column as solids stand in it in a state; None where none does."""
     tables, domain = at.solids, at.lattice.domain
     if not tables:
         return None
@@ -227,8 +230,8 @@ def column_of(axis: Axis, at: Reading) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """(c,) which part of each place of a column is within a container whose sides are along it; None where all are, and
-    of containers with other sides."""
+    """Return the part (c,) of each place of a column within a container whose sides are along it; None where all are,
+    and for containers with other sides."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -244,18 +247,18 @@ def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
 
 @lru_cache(maxsize=64)
 def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, container: Container) -> Column | None:
-    """The same of solids that stay, once."""
+    """Return a column with solids that stay, computed once."""
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
 
 
 FINER = 4.0
-"""How many times as many parts a particle has along an axis where solids are in the column of a gauge."""
+"""Factor of a particle's number of parts along an axis where solids are in the column of a gauge."""
 
 
 @fixed
 class WaveGauge:
-    """How high the surface of the fluid is at a place: its volume in a column around it fills the room of the column
-    from the floor on. Without solids that is its volume over the column's cross-section,
+    """A sensor of the height of the fluid's surface at a place: its volume in a column around it fills the room of the
+    column from the floor on. Without solids that is its volume over the column's cross-section,
 
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1,
 
@@ -267,9 +270,9 @@ class WaveGauge:
     """
 
     def __init__(self, position: Any, floor: float = 0.0, radius: float | None = None, up: Any = None):
-        """``position`` (d,) [m], of which the component along ``up`` does not matter; ``floor``: from where on
-        the column is filled, along ``up`` [m]; ``radius`` [m], two support radii of the scene's smoothing kernel, but
-        at least five spacings, if left out; ``up`` (d,), +y if left out."""
+        """Place a gauge at ``position`` (d,) [m], of which the component along ``up`` does not matter; ``floor``: from
+        where on the column is filled, along ``up`` [m]; ``radius`` [m], two support radii of the scene's smoothing
+        kernel, but at least five spacings, if left out; ``up`` (d,), +y if left out."""
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
@@ -294,8 +297,8 @@ class WaveGauge:
         return bars | {"positions": around.pulled(bar[0] * column.level(depth)[2] * scale)}
 
     def _seen(self, at: Reading) -> tuple[Column | None, float, Seen]:
-        """Its column where solids are in it, V over the cross-section that the container leaves, and the particles by
-        their horizontal ways (n, d): in more parts where a column has sides."""
+        """Return its column where solids are in it, V over the cross-section that the container leaves, and the
+        particles by their horizontal ways (n, d): in more parts where a column has sides."""
         reach, across = reach_of(self.radius, at), at.dimension - 1
         axis = Axis.of(at, self.position, self.floor, self.up, reach)
         column, inside = column_of(axis, at), cut_by(axis, at.container)
