@@ -104,7 +104,7 @@ class Fluid(FluidBody):
 
 
 class RegionFluid(Fluid):
-    """A body that fills a region, with particles that are, or begin, on a lattice of the spacing."""
+    """Fluid that fills a shape. Its particles are on a lattice of the spacing, or are packed from one before a run."""
 
     @abstractmethod
     def block(self, spacing: float) -> Block:

@@ -97,7 +97,8 @@ class Seen:
 
 
 class Contacts:
-    """The contacts between the bodies of one solver; each step looks for them once poses are known."""
+    """The contacts of the free bodies of one solver with solids, the container and each other; each step looks for them
+    once poses are known."""
 
     def __init__(
         self,
@@ -158,11 +159,12 @@ class Contacts:
             step.launch(self.strength.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
-        """Return the tangent of the search for contacts, along changes of the bodies' poses."""
+        """Return forward mode of `look`: from ``changes`` of the bodies' poses to those of what contacts push with."""
         return ContactsTangent(self, changes)
 
     def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
-        """Return the adjoint of the search for contacts, which adds to the bodies' changes."""
+        """Return reverse mode of `look`: from the adjoints in ``changes`` of what contacts push with to those of poses,
+        densities and the time step."""
         return ContactsAdjoint(self, changes)
 
 

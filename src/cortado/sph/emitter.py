@@ -227,7 +227,8 @@ EMITTED = StateField("emitted", "m", Entry.DOUBLE, Axis.SCALAR)
 
 @dataclass(frozen=True)
 class Nozzle:
-    """The last particles of a scene, as they wait in a nozzle."""
+    """The particles that wait in a nozzle, the last ones of a scene: how far each is behind the opening and beside the
+    axis, and the direction and the area of the opening."""
 
     first: int
     """Number of the first of them."""

@@ -18,6 +18,8 @@ def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
     """Make the kernels of gravity; the tangent is the acceleration kernel with another table."""
     vector = precision.vector
 
+    # acceleration[i] = acceleration_in[i] + what is returned; ``gravity`` is the whole table, and ``step`` the entry of
+    # the particle's scene, by the rules of `cortado.particles.particle_kernels`
     @particle_kernel(integration_module(precision, True, taped), "acceleration:acceleration_in")
     def accelerate(member: int, gravity: wp.array2d(dtype=vector), step: wp.int32) -> vector:
         return gravity[member, step]

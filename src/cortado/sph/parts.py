@@ -251,7 +251,8 @@ class PartMaker(Protocol):
 
 
 class Carried:
-    """Fields of particles in sorted order during a step, or their tangents or adjoints."""
+    """What a solver carries of particles from step to step, such as a pressure, sorted as in a step; or the tangents or
+    the adjoints of that."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
         """Allocate the fields' arrays; raise `TypeError` for a field that has not an entry for each particle."""

@@ -128,11 +128,12 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
         control: real, theta: theta_type, M_i: matrix, A_i: matrix, A_u_i: matrix, R_i: real, mu_i: real
     ) -> tuple[matrix, real]:
         M = real(0.5) * (M_i + wp.transpose(M_i))  # so that the adjoint of M is symmetric, as M is
-        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
+        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane  # M_zz is 1 in the plane
         mean = real(1.0) / (real(0.5) * fluidity(mu_i) + real(0.5) * R_i / (trace + tiny))
         G = A_i * inverse(regular(M))
-        D = G + wp.transpose(G)
-        mu = part(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
+        twice_D = G + wp.transpose(G)
+        shear_rate = wp.sqrt(real(0.5) * wp.ddot(twice_D, twice_D) + slowest)  # sqrt(2 D : D)
+        mu = part(M) * apparent(shear_rate, mean, theta)
         return traction(M, A_u_i, mu, control), mu
 
     return stress
@@ -326,8 +327,8 @@ class StressKernels:
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> StressKernels:
     """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity; with ``sticks`` walls have
-    no slip. ``control`` of kernels is C, ``eta`` the viscosity of the stress, and ``theta`` are the parameters of the
-    law."""
+    no slip. ``control`` of kernels is C, ``eta`` the mu of the formulas above, as ``mu`` of a step is the viscosity of
+    the fluid, and ``theta`` are the parameters of the law."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)

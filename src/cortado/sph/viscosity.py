@@ -1,11 +1,13 @@
-"""The viscous force of the report (eq. 10; Monaghan 2005) between pairs and with walls at rest, of PCISPH:
+"""The viscous force of pairs of particles (Monaghan 2005), which scenes with PCISPH may have in place of the stress:
 
-a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V_b phi(x_ib, v_i)),   kappa = 2 (d + 2)
+    a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
+    phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   kappa = 2 (d + 2).
 
-phi = B G with B = v . x / (|x|^2 + 0.01 h^2). mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a pair
-[Pa s] (Cleary and Monaghan 1999: the harmonic mean keeps the shear stress continuous between fluids). The sum over b is
-there for walls without slip. phi is odd in (x, v) together and central, so that momentum and angular momentum are kept;
-it carries no shear to a wall.
+G = a x is the gradient of the smoothing kernel: functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``
+(`cortado.particles.neighbourhood.pair_functions`). mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a
+pair [Pa s] (Cleary and Monaghan 1999: the harmonic mean keeps the shear stress continuous between fluids). The sum over
+b is over walls without slip, where v_ib is against the wall's velocity. phi is odd in (x, v) together and central, so
+that momentum and angular momentum are kept.
 """
 
 from dataclasses import dataclass
@@ -107,6 +109,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     def wall_force(
         x_ij: vector, v_ij: vector, n_i: real, m_i: real, mu_i: real, kappa: real, s: neighbourhood
     ) -> vector:
+        # v_ij is against the wall's velocity, and `rubbing_sum` multiplies by w_b
         return (kappa * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
     @summed(wall_force)

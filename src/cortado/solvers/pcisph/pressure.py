@@ -62,7 +62,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c: wp.array(dtype=real),
         error: wp.array(dtype=pair_of),
     ):
-        """Correct pressures by the predicted density; ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice."""
+        """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2;
+        ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice, for a sum and a maximum."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

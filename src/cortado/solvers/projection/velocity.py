@@ -19,12 +19,12 @@ from cortado.sph.moment_functions import matrix_type, moment_functions, symmetri
 
 @dataclass(frozen=True)
 class VelocityKernels:
-    """The kernels of the velocity that pressures leave."""
+    """The kernels of u = v* - D^T y / m, the velocity that the pressure y leaves of the predicted one."""
 
     velocity: Kernels
-    """The velocity; its adjoint starts from the f of all particles."""
+    """u and the kick u - v*; their adjoint starts from the f of all particles that `own_adjoint` writes."""
     pull_tangent: wp.Kernel
-    """Comes before the tangent of the velocity."""
+    """T = y L with its tangent, which the tangent of the velocity reads of neighbours."""
     own_adjoint: wp.Kernel
     """Comes before the adjoint of the velocity: from the adjoints of u and of the kick to those of v* and f."""
     time_adjoint: wp.Kernel
