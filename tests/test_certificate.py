@@ -13,9 +13,8 @@ import warp as wp
 import cortado
 from cortado import DivergedError, InputError, Problem, Simulation, gradients, load_scene, losses
 from cortado.certificate import Consistency, certify
-from cortado.certificate.consistency import balanced
+from cortado.certificate.consistency import LossHistory, balanced, in_float64
 from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
-from cortado.certificate.loss_history import LossHistory, in_float64
 from cortado.pictures.run_pictures import gradient_check
 from cortado.problem import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer

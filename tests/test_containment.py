@@ -15,7 +15,8 @@ from cortado.discretise.room import Region
 from cortado.discretise.shapes import corners
 from cortado.particles.state import POSITIONS, VELOCITIES, Layout, to_device
 from cortado.scene.shape_tables import CylinderContainer
-from cortado.solvers.containment import Containment, Walled
+from cortado.solvers.containment import Containment
+from cortado.solvers.obstacles import Walled
 from scenes import jet, plane, scene
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}

@@ -27,7 +27,7 @@ UNNAMED = {
     },
     "sph.surface_tension": {"tension_functions.stress_derivative"},
     "sph.viscous_stress": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
-    "solvers.projection.images": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
+    "solvers.projection.effects": {f"image_sums.{name}_back" for name in ("lift", "mirror_walls", "behind")},
     "solvers.projection.coarse_residual": {"coarse_sums.push_back"},
     "solvers.projection.sums": {
         *("projection_sums.moments_back", "projection_sums.force_back"),

@@ -11,7 +11,7 @@ from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation,
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.rollout.outcome import divergence_sentence
-from cortado.solvers.projection.coarse_levels import Levels
+from cortado.solvers.projection.coarse import Levels
 from finite_differences import both_modes, central_difference
 from reference_projection import Projection
 from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers

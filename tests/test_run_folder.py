@@ -19,8 +19,8 @@ from cortado import InputError, Scene
 from cortado.cli import main
 from cortado.files.disk import unfinished
 from cortado.files.terminal import track
+from cortado.pictures.pages import Section, write_report, written
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
-from cortado.pictures.report import Section, write_report, written
 from cortado.runs.run_folder import RunFolder
 from cortado.scene.appearance import Picture
 

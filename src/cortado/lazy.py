@@ -34,15 +34,15 @@ def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[
 
 FUNCTIONS = {
     "export": "pictures.export_formats",
-    "film_page": "pictures.notebook",
+    "film_page": "pictures.pages",
     "fit_page": "optimisation.fitting.figures",
     "labelled": "pictures.export_formats",
-    "result_page": "pictures.notebook",
+    "result_page": "pictures.pages",
     "simulation_film": "pictures.run_pictures",
-    "simulation_page": "pictures.notebook",
+    "simulation_page": "pictures.pages",
     "simulation_picture": "pictures.run_pictures",
     "trajectory_film": "pictures.run_pictures",
-    "trajectory_page": "pictures.notebook",
+    "trajectory_page": "pictures.pages",
     "trajectory_picture": "pictures.run_pictures",
 }
 """The modules that have them, within `cortado`."""

@@ -12,7 +12,15 @@ import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
 from cortado.calls import public
-from cortado.certificate.consistency import Consistency, balanced, check_consistency
+from cortado.certificate.consistency import (
+    Consistency,
+    LossHistory,
+    balanced,
+    check_consistency,
+    first_rows,
+    in_float64,
+    up_to,
+)
 from cortado.certificate.horizon import (
     PERTURBATION,
     Alignment,
@@ -26,7 +34,6 @@ from cortado.certificate.horizon import (
     horizon,
     scales,
 )
-from cortado.certificate.loss_history import LossHistory, first_rows, in_float64, up_to
 from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointNorms
 from cortado.gradients.estimator import NO_RUN

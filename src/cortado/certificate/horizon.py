@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.certificate.loss_history import LossHistory
+from cortado.certificate.consistency import LossHistory
 from cortado.errors import InputError, shown
 from cortado.gradients import AdjointViscosity, EnsembleMean, Exact, GradientEstimator, Guided, RandomizedSmoothing
 from cortado.gradients.estimator import NO_RUN

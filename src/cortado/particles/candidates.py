@@ -15,8 +15,7 @@ import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
-from cortado.particles.loads import loads
-from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import UNROLL, Discretisation, loads, neighbourhood_type, pair_functions
 
 BITS = 32
 """Candidates that one thread compares before it appends."""

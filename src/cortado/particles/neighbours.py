@@ -20,9 +20,15 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, HostCopy, KernelLauncher
 from cortado.errors import InputError
 from cortado.particles.candidates import append_function, scan_around
-from cortado.particles.loads import loads
 from cortado.particles.moving_walls import MovingWalls, WallArrays
-from cortado.particles.neighbourhood import REFLECTIONS, UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import (
+    REFLECTIONS,
+    UNROLL,
+    Discretisation,
+    loads,
+    neighbourhood_type,
+    pair_functions,
+)
 from cortado.particles.state import Layout
 
 MOST_IMAGED = (2**31 - 1) // REFLECTIONS

@@ -24,11 +24,11 @@ from cortado.files.terminal import announce
 from cortado.particles.state import Entry
 from cortado.pictures.film import LEAST_PIXELS, Page, ShownRun, alone, coloured_by, film, lacking
 from cortado.pictures.image_files import write_picture
+from cortado.pictures.pages import Figures
 from cortado.pictures.painter import Scale
 from cortado.pictures.particle_view import scene_view
 from cortado.pictures.plane import PlaneStage
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
-from cortado.pictures.report import Figures
 from cortado.pictures.stage import Stage
 from cortado.runs.frames import Film, common_rate, pace_of
 from cortado.runs.sensor import MeasuredColumn, Readings

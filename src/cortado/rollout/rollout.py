@@ -25,8 +25,7 @@ from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import MEMORY_BUDGET, Checkpoints, Progress, checkpoint_interval
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.containment import Lost
-from cortado.solvers.narrows import shut_in
+from cortado.solvers.containment import Lost, shut_in
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent
 
 Observer = Callable[[int, State], None]

@@ -24,9 +24,8 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.solvers.contacts import Contacts, Touching
-from cortado.solvers.containment import Walled
 from cortado.solvers.makers import ForceMaker, SolverSetting
-from cortado.solvers.obstacles import FINE, NamedSolid, Obstacle
+from cortado.solvers.obstacles import FINE, NamedSolid, Obstacle, Walled
 from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle

@@ -1,9 +1,11 @@
 """A search for lost particles at the end of every step, on the device: those outside of their container or in a solid,
-too far away, or not finite. Any solver can use it."""
+too far away, or not finite; and for walls that face one another nearer than a spacing, so that they leave particles no
+room. Any solver can use it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,11 @@ import warp as wp
 from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
-from cortado.discretise.room import TOLERANCE, Region
+from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.particles.moving_walls import MovingWalls, Poses, matrix_of
 from cortado.particles.state import Layout, State, padded
-from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
+from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
 """Stands in place of the first lost particle's number while every particle is well."""
@@ -225,50 +227,11 @@ def lost_kernel(precision: Precision) -> Any:
     return find_lost
 
 
-DEEPEST, THINNEST = 1.0, 0.45
-"""In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
-there are few wall particles, let some in by half a spacing."""
 REACH = 4.0
 """In spacings: how far from a surface particles are looked at."""
-FURTHEST = 1e6
-"""In spacings from the region of the first particles and walls: particles beyond are lost."""
 
 Distance = Callable[[Points], Points]
 """(n,) how far points (n, d) [m] are outside of a wall [m]."""
-
-
-@dataclass(frozen=True)
-class Walled:
-    """The places where particles may go: the region of the container and the solids in it."""
-
-    region: Region
-    """The container, without the sides that nothing closes: along a period, or where no pressure acts."""
-    near: Region
-    """A box around the first particles and the walls."""
-    spacing: float
-    """[m]"""
-    solids: tuple[Obstacle, ...]
-    """Solids at rest, in their places."""
-    moving: tuple[Obstacle, ...]
-    """Solids that move, each about its middle."""
-    periods: Points
-    """(d,) the lengths of the period [m], 0 for axes without one"""
-
-    @property
-    def dimension(self) -> int:
-        """Return the number of dimensions, 2 or 3."""
-        return len(self.near.lower)
-
-    def tolerance(self, one: Obstacle) -> float:
-        """Return how deep in a solid a particle may be [m]: a spacing, or 0.45 of a thin solid's thickness."""
-        return min(DEEPEST * self.spacing, THINNEST * one.thickness)
-
-    def furthest(self, precision: Precision) -> Region:
-        """Return the box that positions must not leave [m]: far away, within the distance from the origin that a
-        precision resolves; what is spilled over the rim of an open cup may fall on."""
-        spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
-        limit = np.inf if spilled else precision.furthest * self.spacing
-        return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
 
 
 @dataclass(frozen=True)
@@ -434,3 +397,40 @@ def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: 
     """Return distances (n,) of points (n, d) [m] outside of a solid that is turned, scaled and moved to ``middle``."""
     d = points.shape[1]
     return np.asarray(scale * one.solid.distance((points - middle[:d]) @ turn[:d, :d] / scale))
+
+
+NARROW = 0.95
+"""In spacings: walls that are nearer to one another press on what is between them."""
+FACING = -0.5
+"""The product of the normals of two walls, below which they face one another: corners of 90 degrees have 0."""
+STEP = 1e-3
+"""In spacings: half of the difference of places that normals are computed with."""
+
+
+def shut_in(containment: Containment, member: int, points: Points) -> str | None:
+    """Name in words the walls of a scene between which some of the points (n, d) [m] are shut in; None with room around
+    all. Moving solids are where they are after the last step."""
+    spacing = containment.walled.spacing
+    best, found = NARROW * spacing, None
+    near = [
+        (name, distance, distances)
+        for name, distance in containment.walls(member)
+        if ((distances := distance(points)) < NARROW * spacing).any()
+    ]
+    for (name, one, d), (other, two, e) in combinations(near, 2):
+        narrow = np.flatnonzero(d + e < best)
+        x = points[narrow]
+        facing = (_normals(one, x, STEP * spacing) * _normals(two, x, STEP * spacing)).sum(axis=1) < FACING
+        if facing.any():
+            best = float((d + e)[narrow][facing].min())
+            found = f"{name} and {other}" if name != other else name
+    if found is None:
+        return None
+    gap = f"{max(best, 0.0):.2g} m apart" if best > STEP * spacing else "with no room between them"
+    return f"fluid is shut in by {found}, {gap}, nearer than a spacing: leave one, or make the spacing smaller"
+
+
+def _normals(distance: Distance, points: Points, step: float) -> Points:
+    """Return normals (n, d) out of a wall at points (n, d) [m], by central differences of distances over a step [m]."""
+    moves = step * np.eye(points.shape[1])
+    return np.stack([(distance(points + move) - distance(points - move)) / (2.0 * step) for move in moves], axis=1)

@@ -1,4 +1,5 @@
-"""Solids as solvers know them: by their wall particles, and as meshes, for those who ask how deep something is."""
+"""Where particles may go: the region of their container, and solids as solvers know them, by their wall particles and
+as meshes, for those who ask how deep something is."""
 
 from dataclasses import dataclass
 
@@ -6,6 +7,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.device.precision import Precision
+from cortado.discretise.room import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.solid import Solid
 
@@ -13,6 +16,11 @@ FINE = 0.2
 """In spacings: the width of faces by which round solids are looked at."""
 HEIGHT = 100.0
 """Height over width of the mesh that stands for a plane shape."""
+DEEPEST, THINNEST = 1.0, 0.45
+"""In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
+there are few wall particles, let some in by half a spacing."""
+FURTHEST = 1e6
+"""In spacings from the region of the first particles and walls: particles beyond are lost."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,40 @@ class NamedSolid:
     """Number of its wall particles (`cortado.scene.motions.wall_numbers`)."""
     middle: NDArray
     """(3,) where its middle is at the start [m]"""
+
+
+@dataclass(frozen=True)
+class Walled:
+    """The places where particles may go: the region of the container and the solids in it."""
+
+    region: Region
+    """The container, without the sides that nothing closes: along a period, or where no pressure acts."""
+    near: Region
+    """A box around the first particles and the walls."""
+    spacing: float
+    """[m]"""
+    solids: tuple[Obstacle, ...]
+    """Solids at rest, in their places."""
+    moving: tuple[Obstacle, ...]
+    """Solids that move, each about its middle."""
+    periods: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
+
+    @property
+    def dimension(self) -> int:
+        """Return the number of dimensions, 2 or 3."""
+        return len(self.near.lower)
+
+    def tolerance(self, one: Obstacle) -> float:
+        """Return how deep in a solid a particle may be [m]: a spacing, or 0.45 of a thin solid's thickness."""
+        return min(DEEPEST * self.spacing, THINNEST * one.thickness)
+
+    def furthest(self, precision: Precision) -> Region:
+        """Return the box that positions must not leave [m]: far away, within the distance from the origin that a
+        precision resolves; what is spilled over the rim of an open cup may fall on."""
+        spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
+        limit = np.inf if spilled else precision.furthest * self.spacing
+        return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
 
 
 def middle_of(one: Obstacle) -> Points:

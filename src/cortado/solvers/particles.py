@@ -23,9 +23,9 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import POSITIONS, VELOCITIES, Fields, Layout, Parameters, State, StateField, check_fields
 from cortado.scene.discrete_scene import Lattice
-from cortado.solvers.containment import Containment, Walled
+from cortado.solvers.containment import Containment
 from cortado.solvers.loop import IterationLog, Loop, convergence_kernels
-from cortado.solvers.obstacles import NamedSolid
+from cortado.solvers.obstacles import NamedSolid, Walled
 from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.density import Density
 from cortado.sph.integration import integration_kernels

@@ -36,7 +36,7 @@ from cortado.optimisation.inverse.solved_task import (
 from cortado.optimisation.inverse.task import Setup, Task, load_task, setup
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
-from cortado.pictures.report import Section, write_report
+from cortado.pictures.pages import Section, write_report
 from cortado.runs.run_folder import TO_RESUME, RunFolder
 from cortado.words import counted
 

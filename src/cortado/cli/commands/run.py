@@ -21,7 +21,7 @@ from cortado.files.interruption import keeping
 from cortado.files.terminal import announce, track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
-from cortado.pictures.report import Section
+from cortado.pictures.pages import Section
 from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Progress, Rollout
 from cortado.rollout.step_bounds import done_of, ends_at_a_time

@@ -18,8 +18,8 @@ from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
 from cortado.particles.state import State
 from cortado.pictures.film import coloured_by, is_out, lacking
+from cortado.pictures.pages import Figures, Section, write_report
 from cortado.pictures.plots import images, particles
-from cortado.pictures.report import Figures, Section, write_report
 from cortado.pictures.run_pictures import density_errors, readings, run_pictures, trajectory_view
 from cortado.pictures.shown_solids import solid_outline
 from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence

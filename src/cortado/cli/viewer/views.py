@@ -34,7 +34,7 @@ from cortado.optimisation.inverse.task import Setup, load_task, setup
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.particles.state import State
-from cortado.pictures.notebook import table
+from cortado.pictures.pages import table
 from cortado.pictures.painter import colours_of
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.solid_motion import posed, sized, solid_motions

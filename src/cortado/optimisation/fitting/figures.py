@@ -9,9 +9,8 @@ import numpy as np
 from cortado.optimisation.fitting.certainty import FittedPart
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, unit_of, with_error
 from cortado.optimisation.fitting.observations import Video
-from cortado.pictures.notebook import picture, table
+from cortado.pictures.pages import Figures, picture, table
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
-from cortado.pictures.report import Figures
 
 GREATEST_SERIES = 4
 """Most numbers of a frame that are drawn one by one; of more, their root mean square and their mean."""

@@ -18,9 +18,9 @@ from cortado.optimisation.optimise import Result
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.film import FilmedRun, Page, film, is_out, those
 from cortado.pictures.image_files import write_picture
+from cortado.pictures.pages import Figures
 from cortado.pictures.painter import colours_of, painter, side_by_side
 from cortado.pictures.plots import images, loss_curve, panels, particles
-from cortado.pictures.report import Figures
 from cortado.pictures.shown_solids import solid_outline
 from cortado.pictures.tracing.space import State
 from cortado.runs.frames import Pace, pace_of

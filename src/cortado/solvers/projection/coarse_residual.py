@@ -22,8 +22,7 @@ from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.solvers.projection.effects import weights_type
-from cortado.solvers.projection.images import image_sums
+from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, moment_functions, symmetric

@@ -1,5 +1,5 @@
 """Solves (A + B^T B) e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel
-1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle is that of A alone: the
+1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse`. The V-cycle is that of A alone: the
 few rows of B cost an iteration each, or less.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks does, which wait
@@ -239,7 +239,7 @@ def system_type(precision: Precision) -> Any:
         """Number of blocks for each scene."""
         A: numbers
         weight: numbers
-        """w of nodes, see `cortado.solvers.projection.coarse_levels`."""
+        """w of nodes, see `cortado.solvers.projection.coarse`."""
         residual: numbers
         """r, which is overwritten."""
         x_values: numbers

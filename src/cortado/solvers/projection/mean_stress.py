@@ -6,7 +6,7 @@ and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 19
 
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 
-in d dimensions, where images and walls that mirror (`cortado.solvers.projection.images`) count h and 1 - h times.
+in d dimensions, where images and walls that mirror (`cortado.solvers.projection.effects`) count h and 1 - h times.
 The multiplier k / dt is no stress beside a wall, where neighbours are missing, and scatters where they
 are uneven, so that the forces do not.
 
@@ -29,7 +29,7 @@ from cortado.particles.pair_sums import fluid_sum, image_sum
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
-from cortado.solvers.projection.images import CONTAINER
+from cortado.solvers.projection.effects import CONTAINER
 from cortado.solvers.projection.walls import normal_part
 from cortado.sph.integration import integration_module
 from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric

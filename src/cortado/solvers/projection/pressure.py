@@ -5,7 +5,7 @@ With k = dt p, the divergence D, in which walls that move have velocities v_b, a
     (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
-and what images add to both (`cortado.solvers.projection.images`),
+and what images add to both (`cortado.solvers.projection.effects`),
 
 an iteration from y, an extrapolation of k (Nesterov 1983), is
 
@@ -44,8 +44,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.particle_kernels import particle_kernel
-from cortado.solvers.projection.effects import weights_type
-from cortado.solvers.projection.images import image_sums
+from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.moment_functions import matrix_type, symmetric

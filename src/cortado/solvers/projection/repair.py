@@ -3,7 +3,7 @@
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
-with images in n and d (`cortado.solvers.projection.images`).
+with images in n and d (`cortado.solvers.projection.effects`).
 
 No repair takes a particle further than a sixth of a spacing s: where walls leave no room, or where they press on what
 is in them, densities cannot be right, and a particle would be thrown through a wall.
@@ -24,8 +24,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.solvers.projection.effects import weights_type
-from cortado.solvers.projection.images import image_sums
+from cortado.solvers.projection.effects import image_sums, weights_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
 from cortado.sph.density import density_sums

@@ -13,8 +13,7 @@ from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
-from cortado.solvers.projection.effects import effect_functions, weights_type
-from cortado.solvers.projection.images import image_share, image_sums
+from cortado.solvers.projection.effects import effect_functions, image_share, image_sums, weights_type
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.sums import APART, projection_sums
 from cortado.solvers.projection.walls import beside_solid_kernel, beside_sums, edge_functions
