@@ -25,16 +25,17 @@ MESHES = (
 )
 
 
-def simulated(dimension: int, spacing: float, step: float, steps: int, every: int, **tables: Any) -> Any:
+def simulated(
+    dimension: int, spacing: float, step: float, steps: int, every: int, precision: str = "float32", **tables: Any
+) -> Any:
     """The trajectory of a scene of water; a particle that enters a solid or leaves the container ends the run."""
     scene = Scene(
         dimension=dimension,
-        discretisation={"spacing": spacing},
         phase=[WATER],
         solver={"kind": "projection", "time_step": step},
-        **tables,
+        **{"discretisation": {"spacing": spacing}, **tables},
     )
-    return Simulation(scene).run(steps, record_every=every)
+    return Simulation(scene, precision=precision).run(steps, record_every=every)
 
 
 def in_frame(run: Any, name: str, frame: int) -> np.ndarray:
@@ -120,7 +121,7 @@ def cup_turned(across: int, steps: int) -> dict[str, float]:
     }
 
 
-def meshes(steps: int, name: str, bottom: bool = True) -> dict[str, float]:
+def meshes(steps: int, name: str, bottom: bool = True, **options: Any) -> dict[str, float]:
     """Water falls onto a mesh of `MESHES`, or is in it: the greatest energy over the first, which is that above the
     floor, and the greatest depth of a particle in the mesh, in spacings; without the ``bottom`` of the cup to see that
     it is this that holds water."""
@@ -129,7 +130,7 @@ def meshes(steps: int, name: str, bottom: bool = True) -> dict[str, float]:
         file = str(Path(folder) / "mesh.stl")
         mesh.export(file)
         solid = {"name": "mesh", "shape": "mesh", "file": file, **tables.pop("mesh", {})}
-        run = simulated(3, 0.05, 0.002, steps, 25, solid=[solid], **tables)
+        run = simulated(3, 0.05, 0.002, steps, 25, solid=[solid], **tables, **options)
         body = MeshSolid(**solid).solid()
         furthest = max(-body.distance_up_to(x.astype(np.float64), 0.1).min() for x in run.positions)
     heights = run.positions[:, :, 1].astype(np.float64)

@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado.cli.commands.check
 import cortado.cli.commands.describe
@@ -62,6 +63,10 @@ def run(path: Path, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
 
 
+SAME_FLAGS = f"import warp as wp; wp.config.cpu_compiler_flags = {wp.config.cpu_compiler_flags!r}\n"
+"""First line of an example, so that its kernels are those of the tests."""
+
+
 def test_there_are_nine_short_ones():
     paths = list(FOLDER.glob("*.py"))
     assert {path.name for path in paths} == MISTAKES.keys() and len(paths) == 9
@@ -70,7 +75,7 @@ def test_there_are_nine_short_ones():
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_an_example_ends_well(name, tmp_path):
-    (tmp_path / name).write_text(source_of(name))
+    (tmp_path / name).write_text(SAME_FLAGS + source_of(name))
     done = run(tmp_path / name, tmp_path)
     assert done.returncode == 0, done.stderr
     written = sorted(path.name for path in tmp_path.iterdir() if path.name != name)
@@ -84,7 +89,7 @@ def test_its_check_can_fail(name, tmp_path):
     right, wrong, said = MISTAKES[name]
     source = source_of(name)
     assert source.count(right) == 1
-    (tmp_path / name).write_text(source.replace(right, wrong))
+    (tmp_path / name).write_text(SAME_FLAGS + source.replace(right, wrong))
     done = run(tmp_path / name, tmp_path)
     assert done.returncode == 1 and f"AssertionError: {said}" in done.stderr
 
