@@ -412,7 +412,7 @@ def test_linings_and_walls_that_move_hold_water_too(name):
 
 
 def test_a_paddle_stirs_and_nothing_enters_it():
-    found = stirred(36, 800, thickness=0.14)
+    found = stirred(24, 560, thickness=0.14)
     assert found["turns"] > 0.6
     assert found["deepest"] < 0.5 and found["outside"] < 0.5
 
