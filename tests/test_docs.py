@@ -7,6 +7,7 @@ import shlex
 import shutil
 import tomllib
 from pathlib import Path
+from textwrap import dedent
 
 import mathml
 import matplotlib.pyplot
@@ -17,11 +18,13 @@ import scene_page
 import task_page
 import trimesh
 
+import cortado
 from cortado.cli import main
 from cortado.optimisation.inverse.fit_task import load_fit
 from cortado.optimisation.inverse.tables import FitTables, TaskTables
 from cortado.optimisation.inverse.task import load_task
 from cortado.scene.scene import Scene, load_scene
+from scenes import plane
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -55,6 +58,29 @@ def test_the_code_runs_as_printed(name, tmp_path, monkeypatch):
     assert len(shown) == (1 if name in TUTORIALS else 0)
 
 
+DRAG = """
+from cortado.particles.particle_kernels import pointwise_kernels
+
+
+class DragForce(FollowForce):
+    shares = ("drag",)
+
+    def __init__(self, setting):
+        self.kernels = drag_kernels(setting.discretisation)
+
+
+class Drag:
+    parameters = [Parameter("drag", "1/s", "linear drag", Axis.SCALAR, lambda simulation: 2.0)]
+
+    def force(self, setting):
+        return DragForce(setting)
+"""
+
+
+def slower(x, v):
+    return -2.0 * v
+
+
 def test_the_force_with_kernels_runs_as_printed(tmp_path, monkeypatch):
     """From a file, as Warp wants the text of kernels."""
     (program,) = re.findall(r"^```py\n(.*?)^```$", DOCUMENTS["adding_parts.md"], re.DOTALL | re.MULTILINE)
@@ -62,6 +88,13 @@ def test_the_force_with_kernels_runs_as_printed(tmp_path, monkeypatch):
     file.write_text(program, encoding="utf-8")
     monkeypatch.chdir(ROOT)
     runpy.run_path(str(file), run_name="__main__")
+    (kernels,) = re.findall(r"^ {7}@cache\n(?: {7}.*\n|\n)+", DOCUMENTS["adding_parts.md"], re.MULTILINE)
+    file.write_text(program + dedent(kernels) + DRAG, encoding="utf-8")
+    drag = cortado.Simulation(plane(), precision="float64", forces=[runpy.run_path(str(file))["Drag"]()])
+    like = cortado.Simulation(plane(), precision="float64", forces=[cortado.forces.Body(slower)])
+    still = cortado.losses.FinalPositions(drag.positions)
+    np.testing.assert_allclose(drag.run(10).positions, like.run(10).positions, rtol=0.0, atol=1e-14)
+    assert cortado.certify(cortado.Problem(drag, 10, still), ["drag"]).right
 
 
 @pytest.mark.parametrize("name", TUTORIALS)

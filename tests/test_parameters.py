@@ -18,11 +18,13 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "parameters.md"
 
 
 def test_the_document_has_the_table_of_the_registry():
-    assert markdown() in DOCUMENT.read_text(encoding="utf-8")
+    written = DOCUMENT.read_text(encoding="utf-8")
+    assert markdown() in written, "put the table there that this prints: python -m cortado.scene.parameters"
 
 
 def test_the_docstring_of_a_problem_names_every_parameter():
-    assert [parameter.name for parameter in PARAMETERS if f"``{parameter.name}``" not in Problem.__doc__] == []
+    missing = [parameter.name for parameter in PARAMETERS if f"``{parameter.name}``" not in Problem.__doc__]
+    assert missing == [], "name them in the docstring of Problem, src/cortado/problem.py"
 
 
 def test_every_parameter_of_steps_is_on_the_device():
