@@ -17,8 +17,8 @@ from PIL import Image
 
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.cli.viewer.views import opened
-from cortado.cli.viewer.window import PULL
+from cortado.cli.view_window import PULL
+from cortado.cli.views import opened
 
 PORT = 18410
 BLOCK = (

@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado import Scene, Trajectory
-from cortado.cli import main
-from cortado.cli.viewer import window as view_window
-from cortado.cli.viewer.views import LiveView, RecordedView, TaskView, opened
-from cortado.cli.viewer.window import AHEAD, LONGEST_ARROW, PULL, upwards
+from cortado.cli import main, view_window
+from cortado.cli.view_window import AHEAD, LONGEST_ARROW, PULL, upwards
+from cortado.cli.views import LiveView, RecordedView, TaskView, opened
 from cortado.files.image_encoding import to_srgb
 from cortado.pictures.particle_view import outline
 from cortado.pictures.shown_solids import solid_outline
@@ -216,7 +215,7 @@ def test_a_step_that_fails_says_why(task, monkeypatch):
     def fails(*_args, **_options):
         raise cortado.ComputationError("The run diverged.")
 
-    monkeypatch.setattr("cortado.cli.viewer.views.optimise", fails)
+    monkeypatch.setattr("cortado.cli.views.optimise", fails)
     task._wished, loss = True, task.loss
     task.tick()
     assert "The run diverged." in task.told.content and task.loss == loss and not task.button.disabled

@@ -18,7 +18,7 @@ import pytest
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
-from cortado.cli.viewer.views import opened
+from cortado.cli.views import opened
 from signals import listen
 
 viser = pytest.importorskip("viser")

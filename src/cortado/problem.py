@@ -35,7 +35,7 @@ from cortado.runs.trajectory import noted
 from cortado.scene.parameter_values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
-from cortado.solvers.makers import fingerprint as parts_fingerprint
+from cortado.solvers.build import fingerprint as parts_fingerprint
 from cortado.sph.free_energy import FREE_ENERGIES
 from cortado.words import counted
 

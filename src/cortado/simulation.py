@@ -43,8 +43,7 @@ from cortado.scene.quantity_names import check_readable
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
-from cortado.solvers.build import first_capacity
-from cortado.solvers.makers import (
+from cortado.solvers.build import (
     ForceMaker,
     SolverMaker,
     SolverSetting,
@@ -53,6 +52,7 @@ from cortado.solvers.makers import (
     check_own,
     checked_makers,
     checked_solver,
+    first_capacity,
     forces_named,
     known_of,
     solver_named,

@@ -207,7 +207,7 @@ def view(
         precision: "float32" or "float64", of a scene or a task that runs; "float32" if left out.
         port: Of the page on this machine; the next one that is free if it is taken.
     """
-    from cortado.cli.viewer.views import view as show
+    from cortado.cli.views import view as show
 
     return partial(show, path, as_text(overrides), device, precision, port)
 

@@ -26,7 +26,7 @@ from cortado.scene.parameter_values import (
 )
 from cortado.scene.parameters import Axis, Changing, Source
 from cortado.scene.restart import Clock, RestartState
-from cortado.solvers.makers import ForceMaker
+from cortado.solvers.build import ForceMaker
 
 DENSITY = "reference_density"
 """The field of a state that the first mass fractions and the rest densities decide."""

@@ -24,7 +24,7 @@ from cortado.scene.shape_tables import CylinderContainer
 from cortado.scene.tables import MISSING, Table, sentences
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
-from cortado.solvers.makers import known_in
+from cortado.solvers.build import known_in
 from cortado.words import counted
 
 _ALGORITHMS = {

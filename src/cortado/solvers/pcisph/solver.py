@@ -15,9 +15,8 @@ from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.state import Parameters, State
 from cortado.scene.solvers import PcisphSolver
-from cortado.solvers.build import particle_system
+from cortado.solvers.build import SolverSetting, particle_system
 from cortado.solvers.loop import LoopLimits
-from cortado.solvers.makers import SolverSetting
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.pressure import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps

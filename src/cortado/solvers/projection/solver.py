@@ -29,9 +29,8 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Parameters, State
 from cortado.scene.solvers import ProjectionSolver
-from cortado.solvers.build import particle_system
+from cortado.solvers.build import SolverSetting, particle_system
 from cortado.solvers.loop import LoopLimits
-from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
 from cortado.solvers.projection.effects import image_sums, weights_type

@@ -13,7 +13,7 @@ from weakref import finalize
 
 import numpy as np
 
-from cortado.cli.viewer.window import (
+from cortado.cli.view_window import (
     HEIGHT_UNITS,
     PULL,
     UNITS,

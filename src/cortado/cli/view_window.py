@@ -81,7 +81,7 @@ class Window:
         try:
             import viser  # noqa: F401  for the sentence
 
-            from cortado.cli.viewer.server import GuardedServer
+            from cortado.cli.view_server import GuardedServer
         except ModuleNotFoundError:
             raise InputError("viser is not installed, which shows it: pip install viser.") from None
         self.scene = scene
