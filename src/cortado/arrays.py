@@ -18,9 +18,9 @@ REFUSED = {
     "M": "dates",
     "m": "spans of time",
 }
-"""What an array holds whose entries are not real numbers, by the kind of its type."""
+"""Words for the entries of an array that are not real numbers, by the kind of its type."""
 GREATEST_NUMBER = 10**18
-"""Of steps: within a 64-bit number."""
+"""Greatest number of steps, within a 64-bit number."""
 
 
 def as_number(value: Any) -> float | None:
@@ -35,7 +35,7 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """A real number or an array of them in float64, or an `InputError` in a sentence that begins with ``what``.
+    """Return a real number or an array as float64; raises `InputError`, in a sentence that begins with ``what``.
 
     Takes whatever NumPy makes an array of: numbers, lists, arrays of other libraries. An array of float64 is not
     copied. Complex numbers, text, truth values and masked entries are refused, as NumPy would convert them without a
@@ -56,8 +56,8 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """A real number or an array of them, of float32, of float64 or of integers, in float64: half precision, which
-    rounds to three digits, is refused."""
+    """Return real numbers of float32, float64 or integers as float64; raises `InputError` for others, also for half
+    precision, which rounds to three digits."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -65,14 +65,14 @@ def as_precise_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def read_only(what: str, value: Any) -> np.ndarray:
-    """A real number or an array of them in float64, as an array of its own that cannot be changed."""
+    """Return a real number or an array as a read-only float64 array of its own."""
     array = as_numbers(what, value).copy()
     array.setflags(write=False)
     return array
 
 
 def as_one_number(what: str, value: Any) -> float:
-    """A real number, or an `InputError` in a sentence that begins with ``what``; an array of shape () is one."""
+    """Return a real number as a float, also from an array of shape (); raises `InputError`."""
     array = as_numbers(what, value)
     if array.shape:
         raise InputError(f"{what} has shape {array.shape}, but must be one number.")
@@ -80,25 +80,25 @@ def as_one_number(what: str, value: Any) -> float:
 
 
 def is_whole(value: object) -> bool:
-    """Whether a value is a whole number, of Python or of NumPy; a truth value is none."""
+    """Test if a value is a whole number of Python or NumPy, other than a truth value."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def require_whole(what: str, value: object, least: int) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a whole number of at least so
-    much."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is a whole number of at least
+    ``least``."""
     if not is_whole(value) or value < least:  # type: ignore[operator]
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
 
 
 def require_at_most(what: str, value: Any, most: int) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, where a number is greater."""
+    """Raise `InputError`, in a sentence that begins with ``what``, where a number exceeds ``most``."""
     if value > most:
         raise InputError(f"{what} is {shown(value)}, but must be at most {most:,}.")
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
+    """Return a whole number of at least ``least``, also from a float; raises `InputError`."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
@@ -108,15 +108,15 @@ def whole_number(what: str, value: Any, least: int) -> int:
 
 
 def require_function(what: str, value: Any, *arguments: str) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is None or a function of so many
-    arguments, which are described in words."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is None or a function of these
+    arguments, described in words."""
     if value is not None:
         require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raises `InputError` for what is no function, or does not take so many arguments, if Python can tell; ``other``:
-    what else it could be, in words."""
+    """Raise `InputError` unless ``function`` is callable with the ``wanted`` arguments, as far as Python can tell;
+    ``other``: what else it could be, in words."""
     if not callable(function) or isinstance(function, type):
         raise InputError(
             f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
@@ -134,31 +134,31 @@ def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str
 
 
 def require_truth(what: str, value: object) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is True or False."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{what} is {shown(value)}, but must be True or False.")
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what`` and says what is ``wanted``, unless a value is an
+    """Raise `InputError`, in a sentence that begins with ``what`` and says what is ``wanted``, unless a value is an
     object with these methods."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 
 
 def require_table(what: str, value: object, example: str) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a table of others by name."""
+    """Raise `InputError`, in a sentence that begins with ``what``, unless a value is a mapping."""
     if not isinstance(value, Mapping):
         raise InputError(f"{what} is {shown(value)}, but must be given by name, as {example}.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:
-    """The number of steps, or an `InputError` in a sentence."""
+    """Return a number of steps; raises `InputError` unless it is whole and at least ``least``."""
     return whole_number("steps", steps, least)
 
 
 def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
-    """A list of numbers of steps from 0 to ``most``, or an `InputError` in a sentence."""
+    """Return a list of numbers of steps from 0 to ``most``; raises `InputError` for anything else."""
     if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
         raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
     found = [whole_number("a number of steps", step, 0) for step in steps]
@@ -168,7 +168,7 @@ def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
 
 
 def _is_masked(value: Any) -> bool:
-    """True for a masked array, or a list with masked arrays in it, that has masked entries."""
+    """Test if a value is a masked array with masked entries, or a list that holds one."""
     if isinstance(value, np.ma.MaskedArray):
         return bool(np.ma.is_masked(value))
     return isinstance(value, (list, tuple)) and any(map(_is_masked, value))
@@ -179,15 +179,14 @@ def _is_real(value: Any) -> bool:
 
 
 def require_names(what: str, names: Any) -> list[Any]:
-    """Several names, as a list; raises `InputError` for one text alone, whose letters would be taken for names."""
+    """Return several names as a list; raises `InputError` for a single text, whose letters would be taken for names."""
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """A finite vector (d,) that is not 0 with the length 1, also where the square of its own is too small or too large
-    for a number."""
+    """Return a finite vector (d,) other than 0 scaled to length 1, also where its square under- or overflows."""
     size = np.linalg.norm(vector)
     if not 0.0 < size < np.inf:
         vector = vector / np.abs(vector).max()

@@ -28,18 +28,18 @@ _WORDS: dict[Any, str] = {
     Mapping: "a table",
     Iterable: "a list",
 }
-"""What sentences call the types of arguments; of a class that is not here, the first one that it is derived from."""
+"""Words for types of arguments in sentences; a class that is not here has those of its first base class here."""
 
 
 def face(module: dict[str, Any]) -> Callable[[], list[str]]:
-    """The ``__dir__`` of a public module, whose names, in ``__all__``, are `public` from now on."""
+    """Return the ``__dir__`` of a public module, and make the names of its ``__all__`` `public`."""
     names: list[str] = module["__all__"]
     module.update({name: public(module[name]) for name in names})
     return lambda: names
 
 
 def public(value: T) -> T:
-    """A function or a class of Cortado with its methods, `told`, wherever it is named; anything else as it is. A
+    """Make a function, or a class and its methods, `told` wherever it is named; return anything else unchanged. A
     decorator where public modules import the name late."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
@@ -63,8 +63,8 @@ def public(value: T) -> T:
 
 @cache
 def told(function: F) -> F:
-    """Have a function, or the ``__init__`` of a class, raise an `InputError` for a call that does not fit it, where
-    Python has a `TypeError`. It does so for an argument of another type, too, where that makes the call fail."""
+    """Wrap a function, or a class's ``__init__``, to raise `InputError` instead of `TypeError` for a call that does not
+    fit, or that fails by an argument's type."""
     if hasattr(function, "is_told"):
         return function
     takes = signature(function)
@@ -97,7 +97,7 @@ def told(function: F) -> F:
 
 
 def _misfit(function: Any, bound: BoundArguments) -> str | None:
-    """The sentence about the first argument that is not of the type that the function has for it."""
+    """Return a sentence about the first argument whose type does not match the function's hints, else None."""
     try:
         hints = get_type_hints(function)
     except NameError:  # of types that are imported for the check of types alone
@@ -109,7 +109,7 @@ def _misfit(function: Any, bound: BoundArguments) -> str | None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """True for a value of a type, as far as it can be told without going over what may be gone over once only."""
+    """Test if a value is of a type, as far as possible without consuming iterators."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -145,7 +145,7 @@ def _takes(function: Any, number: int) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """The words for a value of a type in a sentence."""
+    """Return the words for a value of a type in a sentence."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return " or ".join(dict.fromkeys(map(_words, inner)))
@@ -162,12 +162,13 @@ def _words(hint: Any) -> str:
 
 
 _OWN = "_made_with"
-"""The attribute with the names of those that the constructor has set."""
+"""Name of the attribute that holds the names set by the constructor."""
 
 
 def fixed(made: type[T]) -> type[T]:
-    """A class whose public attributes stay as its constructor sets them, as what it computes is decided there; others
-    are refused too. A class derived from it may have further attributes of its own, and an object methods of its own.
+    """Make the public attributes of a class's objects stay as the constructor sets them; no others may be added. A
+    class derived from it may have further attributes of its own, and an object methods of its own. Raises `InputError`
+    where one is set or deleted, and where the class is called with other arguments than it takes.
 
     Raises `InputError` where one is set or deleted, and where the class is called with other arguments than it takes.
     """
@@ -212,7 +213,7 @@ class FixedDict(dict[Any, Any]):
     """A copy of a table that cannot be changed; its ``repr`` is that of the table."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the table as a plain dict."""
         return FixedDict, (dict(self),)
 
     def _refuse(self, *arguments: Any, **named: Any) -> NoReturn:
@@ -235,7 +236,7 @@ class Staying:
     """An object with arrays on a device, which raises `InputError` where it is pickled or copied."""
 
     instead: ClassVar[str] = "but NumPy arrays of what it holds can"
-    """The end of the sentence: what can be pickled in its place."""
+    """End of the error sentence: what can be pickled in its place."""
 
     def __reduce__(self) -> NoReturn:
         name = type(self).__name__

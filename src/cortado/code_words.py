@@ -13,21 +13,21 @@ import numpy as np
 import warp as wp
 
 KEPT = ("builtins", "jax", "math", "numpy", "scipy", "torch", "warp")
-"""Packages that do not change, and of whose functions and objects the name counts."""
+"""Packages that do not change, whose functions and objects count by name alone."""
 PYTHON = sysconfig.get_path("stdlib")
-"""The folder of modules of Python's own, and sometimes of what is installed."""
+"""Folder of Python's standard modules, and sometimes of installed ones."""
 SNIPPETS = ("native_snippet", "adj_native_snippet", "replay_snippet")
-"""Attributes of functions of Warp with their texts in C++."""
+"""Attributes of Warp functions that hold their C++ texts."""
 
 
 def code_words(value: Any) -> str:
-    """A checksum of its `words`."""
+    """Return a checksum of the `words` of a value."""
     return sha256("\n".join(words(value)).encode()).hexdigest()[:16]
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Lines that are the same in another process, and others where a value computes something else. Of objects, and of
-    modules of a user's, attributes with these ``names`` count, as the code has that reads them; all if left out."""
+    """Return lines equal in every process, and different where a value computes something else. Objects and a user's
+    modules count by attributes with these ``names``, as the reading code has them; by all if left out."""
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]
@@ -49,7 +49,7 @@ def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | Non
 
 
 def _parts(value: Any) -> Any:
-    """The parts by which a value is told from others: itself, or a list of what it consists of."""
+    """Return the parts that tell a value from others: itself, or a list of its contents."""
     if isinstance(value, wp.Function) and value.func:
         forms = [*value.user_overloads.values(), *value.user_templates.values()] or [value]
         more = ("func", "custom_grad_func", "custom_replay_func", *SNIPPETS)
@@ -71,7 +71,7 @@ def _parts(value: Any) -> Any:
 
 
 def _is_told_by_name(value: Any) -> bool:
-    """True for a module or a function of Cortado's or Python's own."""
+    """Test if a value is a module or a function of Cortado's or Python's own."""
     file = value.__code__.co_filename if isfunction(value) else ""
     is_python = file.startswith(PYTHON) and "site-packages" not in file
     return is_python or (package_of(value) == "cortado" and (ismodule(value) or isfunction(value)))
@@ -83,21 +83,21 @@ def _of_code(code: CodeType) -> list[str]:
 
 
 def read_by(function: FunctionType) -> dict[str, Any]:
-    """The values that a function reads from outside of it, by name."""
+    """Return the values that a function reads from outside itself, by name."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     found = {name: function.__globals__[name] for name in names_in(function) if name in function.__globals__}
     return dict(sorted({**found, **{name: cell.cell_contents for name, cell in cells if cell != CellType()}}.items()))
 
 
 def names_in(function: Any) -> tuple[str, ...]:
-    """All that a function, or a code, may read from outside of it, or of what it finds there."""
+    """Return all names that a function, or a code, may read from outside or as attributes."""
     code = getattr(function, "__code__", function)
     inner = [name for one in code.co_consts if isinstance(one, CodeType) for name in names_in(one)]
     return tuple(dict.fromkeys([*code.co_names, *inner]))
 
 
 def package_of(value: Any) -> str:
-    """The name of the package of a module, a function or a class, or of the class of an object."""
+    """Return the name of the package of a module, a function or a class, or of an object's class."""
     name = (
         value.__name__
         if ismodule(value)

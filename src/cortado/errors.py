@@ -7,27 +7,27 @@ from contextlib import contextmanager
 from typing import Any
 
 LONGEST = 90
-"""How many characters of a value a sentence repeats."""
+"""Greatest number of characters of a value in a sentence."""
 
 
 class CortadoError(Exception):
-    """Any error of Cortado's own."""
+    """The base class of Cortado's errors."""
 
 
 class CortadoWarning(UserWarning):
-    """Something that works but is probably not meant."""
+    """A warning of something that works but is probably not meant."""
 
 
 class MassWarning(CortadoWarning):
-    """The fluid has another mass than was asked for; the command line says it where it describes a scene or a run."""
+    """A warning that the fluid has another mass than asked for, printed where a scene or run is described."""
 
 
 _INSIDE = ("cortado", "pydantic", "contextlib", "functools")
-"""Modules whose lines are none of a user's."""
+"""Modules whose lines are not the user's."""
 
 
 def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
-    """Warn at the line of the user's that led here."""
+    """Give a warning at the line of the user's code that led here."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back
@@ -36,34 +36,34 @@ def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
 
 @contextmanager
 def unwarned() -> Iterator[None]:
-    """No warning of Cortado's is told within it."""
+    """Suppress Cortado's warnings in the block."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
         yield
 
 
 class InputError(CortadoError):
-    """Something that the user gave is wrong; takes the sentence that says so. Exit code 2."""
+    """An error in the user's input; takes the sentence that says so. Exit code 2."""
 
 
 class OutOfRangeError(InputError):
-    """A parameter has a value with which there can be no run: out of its range, beyond what a precision holds, or a
-    place where no fluid can be. Where it is one of many points, the others are computed all the same."""
+    """An error for a parameter value that allows no run: out of its range, beyond a precision, or a place where no
+    fluid can be. Where it is one of many points, the others are computed all the same."""
 
 
 class Words(str):
-    """Words of a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
+    """Words in a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
 
 
 class MissingDerivativeError(InputError):
-    """A solver has no such derivative."""
+    """An error for a derivative that a solver does not have."""
 
 
 class SceneError(CortadoError):
-    """A scene is wrong: where, what was found and what was wanted. Exit code 2."""
+    """An error in a scene: where, what was found and what was wanted. Exit code 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """``sentence`` replaces "is <found>, but must be <wanted>." where that does not fit, the field left out."""
+        """Set the parts of the sentence; ``sentence`` replaces "is <found>, but must be <wanted>.", its default."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
         """As the user gave it; None for a scene that was built in Python."""
@@ -76,7 +76,7 @@ class SceneError(CortadoError):
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
-        """This error with the name of the file."""
+        """Return this error with the name of the file."""
         _, *rest = self.args
         return SceneError(file, *rest)
 
@@ -86,11 +86,11 @@ class SceneError(CortadoError):
 
 
 class ComputationError(CortadoError):
-    """The computation failed although the input was good. Exit code 1."""
+    """An error of a computation that failed although the input was good. Exit code 1."""
 
 
 class DivergedError(ComputationError):
-    """A particle was lost: it left its container, or its position is not finite or too far away."""
+    """An error for a lost particle: it left its container, or its position is not finite or too far away."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
@@ -110,11 +110,11 @@ class DivergedError(ComputationError):
         """Of one run among several: what became of them together, in a sentence."""
 
     def with_advice(self, advice: str) -> "DivergedError":
-        """This error with another advice."""
+        """Return this error with another advice."""
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """This error as the first of several, after a sentence about all of them."""
+        """Return this error as the first of several, after a sentence about all of them."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:
@@ -124,7 +124,7 @@ class DivergedError(ComputationError):
 
 
 def shown(value: Any) -> str:
-    """A value on one short line, for a sentence."""
+    """Return a value on one short line, for a sentence."""
     if isinstance(value, Words):
         return str(value)
     if isinstance(value, Mapping):
@@ -140,7 +140,7 @@ def shown(value: Any) -> str:
 
 
 class EngineMissingError(CortadoError, ImportError):
-    """The reference engine is not installed."""
+    """An error for the missing reference engine."""
 
     def __str__(self) -> str:
         return (
@@ -150,7 +150,7 @@ class EngineMissingError(CortadoError, ImportError):
 
 
 class ExtraMissingError(InputError, ImportError):
-    """A library that comes with an extra of Cortado is not installed. Exit code 2."""
+    """An error for a missing library that comes with an extra of Cortado. Exit code 2."""
 
     def __init__(self, name: str, package: str):
         super().__init__(name, package)
@@ -161,10 +161,10 @@ class ExtraMissingError(InputError, ImportError):
 
 
 class LibraryMissingError(CortadoError, ImportError):
-    """A library that Cortado can do without is not installed."""
+    """An error for a missing library that Cortado can do without."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """``module`` of Cortado that needs it, by default the one with the name of the package."""
+        """Name the library; ``module`` of Cortado needs it, by default the one with the name of the package."""
         super().__init__(name, package, module)
         self.package = package
         """What it is installed as."""

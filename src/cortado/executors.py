@@ -34,24 +34,26 @@ __all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 OnResult = Callable[[int, Any], None]
-"""Called in the caller's thread with the number of an item, from 0, and its result, as results arrive."""
+"""A function called in the caller's thread with the number of an item, from 0, and its result, as results arrive."""
 
 
 class Executor(ABC):
-    """Computes a function of many items that do not depend on one another.
+    """The base class of executors of a function of many independent items, which change no bit of a result.
 
     Where an executor computes changes no bit of a result on the same kind of processor.
     """
 
     def threads(self) -> int:
-        """The number of items that are computed at a time."""
+        """Return the number of items that are computed at a time."""
         return 1
 
     @abstractmethod
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """The function's result for every item, in the order of the items.
+        """Return the function's result for every item, in the order of the items. The function keeps what is large,
+        such as a problem, and items are small. Items are taken as they are needed. Raises what the function raised for
+        the first item, in their order, for which it raised anything.
 
         The function keeps what is large, such as a problem, and items are small. Items are taken as they are needed.
         Raises what the function raised for the first item, in their order, for which it raised anything.
@@ -60,7 +62,7 @@ class Executor(ABC):
 
 @dataclass(frozen=True)
 class InProcess(Executor):
-    """Computes one item after the other in this process."""
+    """An executor that computes one item after the other in this process."""
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
@@ -75,7 +77,7 @@ class InProcess(Executor):
 
 
 def _check_call(function: Any, items: Any, on_result: Any) -> None:
-    """Raises `InputError` for arguments of `Executor.map` that it cannot work with."""
+    """Raise `InputError` for arguments of `Executor.map` that it cannot work with."""
     require_arguments("function", function, ("an item",))
     if not isinstance(items, Iterable):
         raise InputError(f"items is {shown(items)}, but must be a list of them.")
@@ -83,7 +85,7 @@ def _check_call(function: Any, items: Any, on_result: Any) -> None:
 
 
 def checked_executor(executor: Any) -> Executor:
-    """The executor; raises `InputError` for anything else, such as a client of Dask, whose ``map`` is another."""
+    """Return the executor; raises `InputError` for anything else, such as a client of Dask."""
     if not isinstance(executor, Executor):
         is_class = isinstance(executor, type)
         found = f"the class {executor.__name__}" if is_class else f"of the type {type(executor).__name__}"
@@ -97,17 +99,17 @@ def checked_executor(executor: Any) -> Executor:
 # ---- workers of a scheduler --------------------------------------------------------------------------------------
 
 REACHED = 10.0
-"""[s] within which a scheduler answers."""
+"""Seconds within which a scheduler answers."""
 LOOK = 1.0
-"""[s] after which workers are counted again."""
+"""Seconds after which workers are counted again."""
 WAIT = 0.1
-"""[s] after which the first worker is looked for again."""
+"""Seconds after which the first worker is looked for again."""
 AHEAD = 2
-"""Items at a time for each thread of a worker: one that is computed and others that wait, so that none is idle."""
+"""Number of items sent ahead for each thread of a worker: one computed and others that wait, against idling."""
 
 
 class Distributed(Executor):
-    """Computes on the workers of a scheduler of Dask's distributed.
+    """An executor on the workers of a scheduler of Dask's distributed.
 
     What a lost worker was computing is computed again by another one. Results arrive in the order of the items, with
     the bits that they have in one process, and errors are raised here as they were there. A worker computes one item
@@ -115,8 +117,9 @@ class Distributed(Executor):
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
-        """``scheduler``: its address, such as "tcp://10.0.0.1:8786", or a client of it; ``patience`` [s]: how long to
-        wait where there is no worker left.
+        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client; ``patience`` [s]: how long to
+        wait where there is no worker left. Raises `InputError` where distributed is not installed, or where there is no
+        scheduler.
 
         Raises `InputError` where distributed is not installed, or where there is no scheduler.
         """
@@ -149,7 +152,9 @@ class Distributed(Executor):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """See `Executor.map`. ``function``, items and results are pickled.
+        """Return the function's results for all items; see `Executor.map`. ``function``, items and results are pickled.
+        Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
+        scheduler or all workers are lost for good, or an item ends its process.
 
         Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
         scheduler or all workers are lost for good, or an item ends its process.
@@ -158,7 +163,7 @@ class Distributed(Executor):
         return _Map(self, Payload.of(function), on_result).results(items)
 
     def threads(self) -> int:
-        """The number of items that workers compute at a time; raises `ComputationError` where the scheduler is lost."""
+        """Return how many items workers compute at a time; raises `ComputationError` where the scheduler is lost."""
         if self.client.status != "running":
             raise self.lost()
         try:
@@ -171,11 +176,11 @@ class Distributed(Executor):
         second while there is something to compute."""
 
     def lost(self) -> ComputationError:
-        """The error where the scheduler is not there any more."""
+        """Return the error for a scheduler that is not there any more."""
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
 
     def deserted(self, seconds: float) -> ComputationError:
-        """The error where there was no worker for so long [s]."""
+        """Return the error for a lack of workers over so many seconds."""
         return ComputationError(
             f"The scheduler {self.address} has had no worker for {seconds:.0f} s; start some, such as by "
             f"`dask worker {self.address} --nthreads 1`."
@@ -183,7 +188,7 @@ class Distributed(Executor):
 
 
 class _Map:
-    """One function, mapped over items by the workers."""
+    """A mapping of one function over items by the workers."""
 
     def __init__(self, executor: Distributed, payload: Payload, on_result: OnResult | None):
         self._executor, self._payload, self._on_result = executor, payload, on_result
@@ -202,7 +207,7 @@ class _Map:
         """When the workers were counted last, and when there were any [s]."""
 
     def results(self, items: Iterable[Item]) -> list[Any]:
-        """The results in the order of the items."""
+        """Return the results in the order of the items."""
         import dask
 
         with self._watched(), dask.config.set({"distributed.admin.large-graph-warning-threshold": 2**40}):
@@ -225,7 +230,7 @@ class _Map:
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """Within it workers that are lost with items of this map are noted."""
+        """Note in the block workers that are lost with items of this map."""
 
         def hear(event: tuple[float, dict[str, Any]]) -> None:
             _, said = event
@@ -247,7 +252,7 @@ class _Map:
             warn(f"The worker {worker} was lost; what it was computing is computed again by another one.")
 
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
-        """Send as many items as workers need, none after an error; whether there is anything to wait for."""
+        """Send as many items as workers need, none after an error; return True if there is anything to wait for."""
         self._count_workers(LOOK)
         while not self._most and not self._sent:  # how much an item asks for may depend on how many workers there are
             time.sleep(WAIT)
@@ -290,7 +295,7 @@ class _Map:
             self._on_result(number, self._results[number])
 
     def _answer(self, future: Future[Any], number: int) -> Answer | Lacking:
-        """The answer of a call that has ended; raises `ComputationError` where there is none."""
+        """Return the answer of a call that has ended; raises `ComputationError` where there is none."""
         try:
             answer = future.result()
         except CancelledError:
@@ -315,7 +320,7 @@ class _Map:
 
 
 def _distributed() -> Any:
-    """Dask's distributed; raises `InputError` where it is not installed."""
+    """Import and return Dask's distributed; raises `InputError` where it is not installed."""
     try:
         import distributed
     except ModuleNotFoundError:
@@ -326,7 +331,7 @@ def _distributed() -> Any:
 
 
 def _connected(module: Any, address: str) -> Any:
-    """A client of the scheduler at an address; raises `InputError` where there is none."""
+    """Return a client of the scheduler at an address; raises `InputError` where there is none."""
     from distributed.comm import connect
 
     async def meet() -> None:
@@ -350,28 +355,28 @@ def _connected(module: Any, address: str) -> Any:
 
 LOOPBACK = "127.0.0.1"
 GONE = "3 s"
-"""After so long another process takes the place of one that has ended, and was not started again."""
+"""Time after which another process replaces one that has ended, and was not started again."""
 PROCESSES_A_CORE = 4
-"""At most; each has some 200 MB of its own."""
+"""Greatest number of processes for each core; each has some 200 MB of its own."""
 LEAST_LIMIT = 64
-"""The limit where there are few cores."""
+"""Limit on the number of processes where there are few cores."""
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Leaves Ctrl-C, which a terminal sends to all processes, to the one that started the workers."""
+"""Code that leaves Ctrl-C, which a terminal sends to all processes, to the one that started the workers."""
 
 
 class LocalWorkers(Distributed):
-    """Worker processes on this machine, each with a nanny in this process that starts it again when it is killed."""
+    """An executor on worker processes of this machine, each with a nanny here that restarts it when killed."""
 
     def __init__(self, client: Any, cluster: Any):
         super().__init__(client)
         self._cluster = cluster
 
     def replace_workers(self) -> None:
-        """Where a nanny ended with its worker, the cluster lets go of it after `GONE`; this starts another one."""
+        """Start workers for those whose nanny has ended, which the cluster drops after `GONE`."""
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
-        """The error where there was no worker for so long [s]."""
+        """Return the error for a lack of workers over so many seconds."""
         return ComputationError(
             f"No worker process has started for {seconds:.0f} s; there may be too little memory for it, or the script "
             'does not begin under `if __name__ == "__main__":`.'
@@ -380,8 +385,11 @@ class LocalWorkers(Distributed):
 
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
-    """Worker processes on this machine, which a scheduler in this process starts, starts again when they are lost, and
-    ends with the block.
+    """Start worker processes on this machine with a scheduler in this process, which restarts lost ones, and end them
+    with the block. ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda".
+    The cores are shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin
+    under ``if __name__ == "__main__":``, as every process imports it. Raises `InputError` for more processes than there
+    are GPUs, or than four for each core, and 64.
 
     ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda". The cores are
     shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin under
@@ -417,7 +425,7 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
 
 
 def _environments(number: int | None, device: str) -> list[dict[str, str]]:
-    """Environment variables of each process."""
+    """Return the environment variables of each process."""
     if number is not None:
         require_processes("number", number)
     if device == "cpu":
@@ -432,7 +440,7 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, unless so many processes make sense here."""
+    """Raise `InputError`, in a sentence that begins with ``what``, for a senseless number of processes."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)

@@ -22,14 +22,15 @@ from cortado.simulation import Simulation
 __all__ = ["measure", "picture", "restart_state", "rollout", "state", "step", "value"]
 
 Arrays = Mapping[str, Any]
-"""By name."""
+"""Arrays by name."""
 _BRIDGE = JaxBridge()
 
 
 def state(
     simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, "jax.Array"]:
-    """A state as arrays of JAX: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
+    """Return a state as arrays of JAX: that before the first step, or a ``given`` one, such as
+    ``trajectory.last_state``.
 
     ``parameters``, as numbers, are any that a first state depends on, such as ``initial_velocities``; those of the run
     that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
@@ -40,14 +41,14 @@ def state(
 
 
 def restart_state(simulation: Simulation, given: Arrays, parameters: Values | None = None) -> States:
-    """The other way round: what `Simulation.run`, files and other processes take."""
+    """Return a state of tensors as restart states, which `Simulation.run`, files and other processes take."""
     return calls.restart_state(_BRIDGE, simulation, given, parameters)
 
 
 def step(
     simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1
 ) -> dict[str, "jax.Array"]:
-    """The state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
+    """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
 
     ``parameters`` are any of those of `Problem` but first values, arrays or numbers; one over time has a row for each
     of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost; within a
@@ -59,14 +60,14 @@ def step(
 def rollout(
     simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1, record_every: int = 1
 ) -> dict[str, "jax.Array"]:
-    """The states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
-    (frames, ...); otherwise as `step`."""
+    """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
+    (frames, ...); see `step`."""
     return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
 
 
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "jax.Array"]:
-    """The loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name, whose result is an array
-    (), of a batch (batch,).
+    """Return the loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name, whose result is an
+    array (), of a batch (batch,).
 
     With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
     `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
@@ -75,8 +76,8 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
 
 
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Array"]:
-    """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
-    function ``reading(state, parameters=None)`` of arrays.
+    """Return a sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as
+    "pressure", as a function ``reading(state, parameters=None)`` of arrays.
 
     It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
     step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
@@ -85,7 +86,7 @@ def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Ar
 
 
 def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "jax.Array":
-    """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
+    """Return a picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
 
     ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
     (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode

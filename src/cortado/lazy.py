@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
-    """The ``__getattr__`` of a package, which finds its modules, and the names in ``homes``, each with the module that
-    has it: one within the package, or anywhere in Cortado if it begins with ``cortado.``."""
+    """Return the ``__getattr__`` of a package, which finds its modules, and the names in ``homes``, each with the
+    module that has it: one within the package, or anywhere in Cortado if it begins with ``cortado.``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:
@@ -45,9 +45,9 @@ FUNCTIONS = {
     "trajectory_page": "pictures.pages",
     "trajectory_picture": "pictures.run_pictures",
 }
-"""The modules that have them, within `cortado`."""
+"""Modules within `cortado` by the function that each has."""
 
 
 def on_top(name: str) -> "Any":
-    """The function of that name, one of `FUNCTIONS`."""
+    """Return the function of a name, one of `FUNCTIONS`."""
     return getattr(importlib.import_module(f"cortado.{FUNCTIONS[name]}"), name)

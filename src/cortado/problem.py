@@ -42,15 +42,15 @@ from cortado.words import counted
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 KEPT = 2
-"""Batches of a problem, of different sizes, that are kept for the next evaluation."""
+"""Number of batches of a problem, of different sizes, that are kept for the next evaluation."""
 
 
 @dataclass(frozen=True)
 class ProblemForwardPass(Staying):
-    """A forward run of a problem with its loss, and the ways back through it."""
+    """A forward run of a problem with its loss, and with backward passes through it."""
 
     loss: Any
-    """Of a batch (batch,)."""
+    """Loss of the run, of a batch (batch,)."""
     instead = "but the problem can, and the parameters, with which it is run again"
     _residual: Residual
     _values: Arrays
@@ -60,16 +60,16 @@ class ProblemForwardPass(Staying):
 
     @property
     def rollout(self) -> Rollout:
-        """The run of this forward pass."""
+        """Rollout of this forward pass."""
         return self._residual.rollout
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds which uses the rollout."""
+        """Lock that a thread holds while it uses the rollout."""
         return self.rollout.turn
 
     def _derivative(self, estimator: AdjointEstimator) -> BackwardStep:
-        """The estimator's backward step, made once for each problem."""
+        """Return the estimator's backward step, made once for each problem."""
         if self.rollout.solver.layout.batch is not None and not estimator.batches:
             raise InputError(
                 f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
@@ -88,8 +88,8 @@ class ProblemForwardPass(Staying):
 
     @in_turn
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """The gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the last
-        to the first.
+        """Return the gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the
+        last to the first.
 
         Other evaluations of the problem may be in between: the bits are the same. Raises `InputError` for an estimator
         whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
@@ -100,8 +100,8 @@ class ProblemForwardPass(Staying):
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """The gradient by an estimator, and the derivatives with respect to the fields of the first state, by name, and
-        its ``time``."""
+        """Return the gradient by an estimator, and the derivatives with respect to the fields of the first state, by
+        name, and its ``time``."""
         derivative = self._derivative(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
@@ -109,7 +109,7 @@ class ProblemForwardPass(Staying):
 
     @property
     def _lost(self) -> OfLost:
-        """Their losses have no numbers, and so no derivatives."""
+        """NaN for each lost scene of a batch, whose loss has no number and so no derivatives."""
         return dict.fromkeys(self.rollout.lost, np.nan)
 
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
@@ -133,7 +133,7 @@ class ProblemForwardPass(Staying):
 
 
 def _fingerprint(simulation: Simulation, steps: int, loss: Any, states: Sequence[RestartState]) -> str:
-    """A text of the parts of a problem that its values follow from; see `Problem.fingerprint`."""
+    """Return a text of the parts of a problem that its values follow from; see `Problem.fingerprint`."""
     energy = simulation.free_energy
     parts = {
         "scene": simulation.scene.computed_json().encode(),
@@ -183,7 +183,7 @@ class Problem:
         memory_budget: int = MEMORY_BUDGET,
         state: RestartState | Sequence[RestartState] | None = None,
     ):
-        """``steps`` may be 0: the loss is then one of the first state.
+        """Make a problem of ``steps`` steps, which may be 0: the loss is then one of the first state.
 
         ``loss``: an object with ``value`` and ``adjoint``, `losses.Frames` of such, or a function of Warp arrays (see
         `losses.Recorded`). ``memory_budget``: bytes of states kept on the way forward; with less, states are
@@ -203,7 +203,7 @@ class Problem:
         self._batches: dict[int, Problem] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the problem as its constructor's arguments."""
         return Problem, (self.simulation, self.steps, self.loss, self.memory_budget, self._states or None)
 
     def __repr__(self) -> str:
@@ -212,32 +212,32 @@ class Problem:
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds which uses the problem's simulation."""
+        """Lock that a thread holds while it uses the problem's simulation."""
         return self.simulation.turn
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
+        """Return the loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
-        """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
+        """Return the last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """States of the rollout under these parameters, by the number of steps before them, from 0 on."""
+        """Return states of the rollout under these parameters, by the number of steps before them, from 0 on."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
-        """The whole trajectory under these parameters; see `Simulation.run`."""
+        """Return the whole trajectory under these parameters; see `Simulation.run`."""
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
-        """The loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch with a
-        first axis for the scenes."""
+        """Return the loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch
+        with a first axis for the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
@@ -245,9 +245,9 @@ class Problem:
     def value_and_gradients(
         self, parameters: Values, gradient: AdjointEstimator | None = None
     ) -> tuple[Any, Arrays, Arrays]:
-        """The loss, its derivatives with respect to the parameters as of `value_and_gradient`, and those with respect
-        to the first state: float64, by the names of its fields in their shapes, with ``time`` for its clock; of a batch
-        with a first axis for the scenes."""
+        """Return the loss, its derivatives as `value_and_gradient`, and those with respect to the first state: float64,
+        by the names of its fields in their shapes, with ``time`` for its clock. Those of a batch have a first axis for
+        the scenes."""
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
 
@@ -255,7 +255,8 @@ class Problem:
     def estimate(
         self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """The loss and its derivatives, with what the estimator ``gradient`` (`gradients.Exact` by default) reports.
+        """Return the loss and its derivatives, with what the estimator ``gradient`` (`gradients.Exact` by default)
+        reports.
 
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
         go back through a run; `gradients.AdjointNorms` is such an observer.
@@ -273,8 +274,8 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """A forward run that can be gone back through, also after other evaluations: what estimators work with. Its
-        states are kept for as long as it is held."""
+        """Run forward, and return a run for backward passes, also after other evaluations. Its states are kept for as
+        long as it is held."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -284,8 +285,8 @@ class Problem:
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
-        """The derivative of the loss along ``directions`` (any of the parameters), by forward mode: a float, of a batch
-        (batch,)."""
+        """Return the derivative of the loss along ``directions`` (any of the parameters), by forward mode: a float, of
+        a batch (batch,)."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -304,7 +305,7 @@ class Problem:
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
+        """Run in forward mode, and give ``observe`` the number of every state and its tangent along ``directions`` (any
         of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
         `states` does."""
         return self.several_tangents(parameters, [(directions, observe)], steps)
@@ -313,7 +314,7 @@ class Problem:
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """The tangents along several directions, each with an observer of its own, of one run; see `tangents`."""
+        """Run once in forward mode along several directions, each with an observer of its own; see `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -326,8 +327,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Tangents of quantities of a state of the last run under these parameters, by name, along ``dot``, the state's
-        own tangent by fields, and ``directions`` of the parameters."""
+        """Return tangents of quantities of a state of the last run under these parameters, by name, along ``dot``, the
+        state's own tangent by fields, and ``directions`` of the parameters."""
         names = list(quantities)
         if not names:
             return {}
@@ -337,11 +338,11 @@ class Problem:
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
-        """The scenes of a batch that lost a particle in the last evaluation, by their number, and what happened."""
+        """Errors of the scenes of a batch that lost a particle in the last evaluation, by their number."""
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Batchable.room`."""
+        """Return how many points `together` takes at once; see `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -350,7 +351,7 @@ class Problem:
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """See `Batchable.together`."""
+        """Return estimates at several points in one launch; see `Batchable.together`."""
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
@@ -365,14 +366,14 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """This problem, in the same arrays, beginning at another state."""
+        """Return this problem, with shared arrays, beginning at another state."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
         return found
 
     def batch_of(self, size: int) -> "Problem":
-        """This problem with so many scenes in one launch; the last few sizes are kept."""
+        """Return this problem with ``size`` scenes in one launch; the last few sizes are kept."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
@@ -383,29 +384,29 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
-        may be in a file), free energy (by its name, curvature and code), forces and solver of one's own,
-        ``fingerprint`` of the loss, or the code of a function; for any other loss only its type is known."""
+        """Text that identifies the problem by words and checksums: steps, precision, scene, first positions (which may
+        be in a file), free energy (by its name, curvature and code), forces and solver of one's own, ``fingerprint`` of
+        the loss, or the code of a function; for any other loss only its type is known."""
         return _fingerprint(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:
-        """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""
+        """Return the pressure iterations (steps,) of the last evaluation, of a solver with one loop."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
+        """Diagnostics (steps,) by name of the last evaluation: ``converged``, and others that the solver notes."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:
-        """The parameters as arrays; they go with the state, if one is given."""
+        """Return the parameters as arrays, checked to go with the first state, if one is given."""
         values = self._space.checked(parameters)
         self._space.check_restarts(self._states, values)
         self.simulation.judged_states.update(one for one in self._states if one.origin is not None)
         return values
 
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
-        """States by the number of steps before them; ``keep`` checkpoints for a way back."""
+        """Return states by the number of steps before them; ``keep`` stores checkpoints for a backward pass."""
         wanted, single, ends = set(steps), self.simulation.batch is None, dict[int, Any]()
         each = np.array([self._space.colours(own) for own in self._space.members(values)])
         made, colours = (Snapshot, each[0]) if single else (SnapshotBatch, each)
@@ -423,6 +424,6 @@ class Problem:
 
     @property
     def _going(self) -> list[int] | None:
-        """The scenes of a batch that have not lost a particle; None of a single scene."""
+        """Numbers of the scenes of a batch that have not lost a particle; None of a single scene."""
         batch = self.simulation.batch
         return None if batch is None else [b for b in range(batch) if b not in self.lost]

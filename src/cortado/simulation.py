@@ -64,7 +64,7 @@ from cortado.watching import Watch
 from cortado.words import counted
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
-"""Particles of all scenes in one launch, beyond which more of them are no faster."""
+"""Number of particles of all scenes in one launch above which more are no faster, by kind of device."""
 
 
 @public
@@ -87,7 +87,7 @@ class Simulation(Stepping):
         solver: SolverMaker | None = None,
         lanes: int | None = None,
     ):
-        """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
+        """Prepare ``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
         "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
         one launch, each with parameters of its own; see `docs/batches.md`. ``forces``: forces of one's own, such as
         `cortado.forces.Body`, which act besides the scene's; ``solver``: what makes a solver of one's own, instead of
@@ -147,16 +147,16 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """The name of the solver in sentences, if it has fields of its own in states: then no other goes on from
-        them."""
+        """Name of the solver in sentences, if it adds fields of its own to states, from which no other solver goes on;
+        else None."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the simulation as its constructor's arguments."""
         return _made_again, (self._made_of(self.precision.name, self.batch), self._points)
 
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
-        """The arguments from which a simulation of the same scene is made."""
+        """Return the arguments to make a simulation of this scene, in a precision and for a batch."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return self.scene, self.device.alias, precision, energy, batch, *self._given, self._lanes
 
@@ -166,18 +166,18 @@ class Simulation(Stepping):
         return f"Simulation({batch}{sizes}, {self.device.alias}, {self.precision.name})"
 
     def _repr_html_(self) -> str:
-        """The repr, and a picture of the first particles."""
+        """Return the repr, and a picture of the first particles."""
         page: str = on_top("simulation_page")(self)
         return page
 
     @property
     def _points(self) -> str:
-        """A checksum of the first positions."""
+        """Checksum of the first positions."""
         return sha256(self.positions.tobytes()).hexdigest()
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds which uses the simulation."""
+        """Lock that a thread holds while it uses the simulation."""
         return self.solver.turn
 
     @in_turn
@@ -214,7 +214,7 @@ class Simulation(Stepping):
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ) -> Trajectory:
-        """Run a rollout forward and return its frames; warnings and errors as of `run`."""
+        """Run a rollout forward and return its frames; warns and raises as `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         parts = frame_parts(expected_frames(rollout, record_every), numbers, self.precision.bytes)
@@ -240,16 +240,16 @@ class Simulation(Stepping):
         return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """The fields of a state that a trajectory records: those that steps change."""
+        """Return the fields of a state that a trajectory records, as steps change them."""
         return state.numpy(self.dimension, only=[field.name for field in state.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
-        """The number of numbers that `frame` records at most, if vectors have so many components."""
+        """Return the greatest number of numbers that `frame` records, for vectors with so many components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
-        """The fields of a rollout's states that no step changes."""
+        """Return the fields of a rollout's states that no step changes."""
         names = [field.name for field in rollout.initial.fields if field.is_constant]
         return rollout.initial.numpy(self.dimension, only=names)
 
@@ -261,7 +261,7 @@ class Simulation(Stepping):
         state: RestartState | Sequence[RestartState] | None = None,
         time: float | None = None,
     ) -> Rollout:
-        """A rollout that is ready to go forward from the scene's first state; see `run` for its arguments."""
+        """Return a rollout that is ready to go forward from the scene's first state; see `run` for its arguments."""
         given = {} if controls is None else controls
         rollout = Rollout(self.solver, steps_of_run(self, steps, time, given))
         space = ParameterSpace(self, rollout.steps)
@@ -278,9 +278,9 @@ class Simulation(Stepping):
         of: RestartState | Sequence[RestartState] | Trajectory | None = None,
         controls: Mapping[str, Any] | None = None,
     ) -> np.ndarray:
-        """A quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 / s],
-        "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own keeps, or
-        the load on a solid, such as "rotor.load".
+        """Return a quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 /
+        s], "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own
+        keeps, or the load on a solid, such as "rotor.load".
 
         Args:
             name: of the quantity.
@@ -313,7 +313,7 @@ class Simulation(Stepping):
 
     @in_turn
     def evaluator(self) -> QuantityEvaluator:
-        """The evaluator of quantities of states on the device, made once."""
+        """Return the evaluator of quantities of states on the device, made once."""
         made: QuantityEvaluator | None = self.__dict__.get("_evaluator")
         if made is None:
             spacing, support = self.scene.discretisation.spacing, self.lattice.support
@@ -322,8 +322,8 @@ class Simulation(Stepping):
         return made
 
     def renderer(self, **settings: Any) -> Renderer:
-        """The renderer that takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates
-        them: as the table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+        """Return the renderer that takes pictures of the simulation, ``renderer.render(trajectory[k])``, and
+        differentiates them: as the table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
 
         ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
         look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
@@ -331,8 +331,8 @@ class Simulation(Stepping):
         return scene_renderer(self, **settings)
 
     def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
-        """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
-        says; ``settings`` replace keys of it: ``width=640, height=360``, as those of `film` do.
+        """Return a shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the
+        scene says; ``settings`` replace keys of it: ``width=640, height=360``, as those of `film` do.
 
         Raises:
             SceneError: settings that do not fit.
@@ -343,34 +343,34 @@ class Simulation(Stepping):
         return image
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
-        """Write a film of a run of this simulation; as `Trajectory.film`, on the device of the simulation, which also
-        computes what ``colour`` names where it was not recorded, such as the pressure."""
+        """Write a film of a run on the simulation's device; see `Trajectory.film`. It also computes the quantity of
+        ``colour`` where it was not recorded, such as the pressure."""
         film: Film = on_top("simulation_film")(self, trajectory, path, settings)
         return film
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Number of space dimensions, 2 or 3."""
         return self.scene.dimension
 
     @unwarned()
     def batch_of(self, size: int) -> "Simulation":
-        """A simulation of this scene so many times in one launch."""
+        """Return a simulation of ``size`` copies of this scene in one launch."""
         return Simulation(*self._made_of(self.precision.name, size))
 
     @unwarned()
     def in_precision(self, precision: str) -> "Simulation":
-        """A single one of the same scene, on the same device, in a precision."""
+        """Return a single simulation of this scene, on the same device, in a precision."""
         return Simulation(*self._made_of(precision, None))
 
     def replaced(self, *overrides: str) -> "Simulation":
-        """One of a scene with other values, on the same device: see `Scene.replaced`."""
+        """Return a simulation of this scene with other values, on the same device: see `Scene.replaced`."""
         _, *others = self._made_of(self.precision.name, self.batch)
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """The number of runs of so many steps that are worth one launch, and fit half of the memory that is free, with
-        at most so many bytes of ``checkpoints`` in all."""
+        """Return the number of runs of ``steps`` steps that are worth one launch, and fit half of the free memory, with
+        at most ``checkpoints`` bytes of kept states in all."""
         neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
@@ -379,14 +379,14 @@ class Simulation(Stepping):
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Every parameter of `Problem` as the scene and forces have it, without what its schedule changes."""
+        """Return every parameter of `Problem` as the scene and forces have it, without the changes of its schedule."""
         return scene_values(self, self.known)
 
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Explicit steps of diffusion within a time step that are stable under these parameters; raises `InputError`
-        where there would be more than `cortado.sph.diffusion.MOST_SUBSTEPS`."""
+        """Return the number of explicit diffusion substeps per time step that is stable under these parameters; raises
+        `InputError` where there would be more than `cortado.sph.diffusion.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
@@ -394,7 +394,7 @@ class Simulation(Stepping):
 
 
 def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> dict[str, Any]:
-    """The controls of the step after a frame of the run that they were given to."""
+    """Return the controls of the step after a frame of the run that they were given to."""
     step = int(trajectory.steps[frame] - trajectory.steps[0])
     rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
     return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}
@@ -402,7 +402,7 @@ def _controls_at(given: dict[str, Any], trajectory: Trajectory, frame: int) -> d
 
 @unwarned()
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
-    """A simulation from what it was made from, first positions of the same checksum included."""
+    """Make a simulation from pickled arguments; raises `InputError` unless first positions have an equal checksum."""
     simulation = Simulation(*made_of)
     if simulation._points != points:
         raise InputError(

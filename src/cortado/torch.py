@@ -23,14 +23,14 @@ from cortado.simulation import Simulation
 __all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "state", "step", "value"]
 
 Tensors = Mapping[str, Any]
-"""By name."""
+"""Tensors by name."""
 _BRIDGE = TorchBridge()
 
 
 def state(
     simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, "torch.Tensor"]:
-    """A state as tensors: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
+    """Return a state as tensors: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
 
     ``parameters``, as numbers, are any that a first state depends on, such as ``initial_velocities``; those of the run
     that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
@@ -41,14 +41,14 @@ def state(
 
 
 def restart_state(simulation: Simulation, given: Tensors, parameters: Values | None = None) -> States:
-    """The other way round: what `Simulation.run`, files and other processes take."""
+    """Return a state of tensors as restart states, which `Simulation.run`, files and other processes take."""
     return calls.restart_state(_BRIDGE, simulation, given, parameters)
 
 
 def step(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1
 ) -> dict[str, "torch.Tensor"]:
-    """The state after ``steps`` steps from ``given``: `Simulation.step` as a function of tensors.
+    """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of tensors.
 
     ``parameters`` are any of those of `Problem` but first values, tensors or numbers; one over time has a row for each
     of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost.
@@ -59,14 +59,14 @@ def step(
 def rollout(
     simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1, record_every: int = 1
 ) -> dict[str, "torch.Tensor"]:
-    """The states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
-    (frames, ...); otherwise as `step`."""
+    """Return the states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
+    (frames, ...); see `step`."""
     return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
 
 
 def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "torch.Tensor"]:
-    """The loss of a problem as a function ``loss(parameters, state=None)`` of tensors by name, whose result is a tensor
-    (), of a batch (batch,).
+    """Return the loss of a problem as a function ``loss(parameters, state=None)`` of tensors by name, whose result is a
+    tensor (), of a batch (batch,).
 
     With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
     `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
@@ -75,8 +75,8 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
 
 
 def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.Tensor"]:
-    """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
-    function ``reading(state, parameters=None)`` of tensors.
+    """Return a sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as
+    "pressure", as a function ``reading(state, parameters=None)`` of tensors.
 
     It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
     step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
@@ -85,7 +85,7 @@ def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.
 
 
 def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "torch.Tensor":
-    """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
+    """Return a picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
 
     ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
     (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
@@ -95,10 +95,10 @@ def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: 
 
 
 class Steps(torch.nn.Module):
-    """So many steps of a simulation as a module, with parameters of the simulation that are trained."""
+    """A PyTorch module that takes ``steps`` steps of a simulation, with trained parameters of the simulation."""
 
     def __init__(self, simulation: Simulation, steps: int = 1, trained: Values | None = None):
-        """``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``."""
+        """Make the module; ``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``."""
         super().__init__()
         layer = calls.steps_layer(simulation, steps)
         self.simulation, self.steps = simulation, steps
@@ -107,7 +107,7 @@ class Steps(torch.nn.Module):
         self._names = tuple(made)
 
     def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
-        """The state after the steps; ``parameters`` are further ones."""
+        """Return the state after the steps; ``parameters`` are further ones, which are not trained."""
         own = {name: self.trained[_key(name)] for name in self._names}
         for name in parameters or {}:
             if name in own:
@@ -116,7 +116,7 @@ class Steps(torch.nn.Module):
 
 
 def _key(name: str) -> str:
-    """The name that PyTorch has for a parameter, whose name may have a point."""
+    """Return PyTorch's name for a parameter, whose name may have a point."""
     return name.replace(".", "/")
 
 

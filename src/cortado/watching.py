@@ -20,25 +20,25 @@ from cortado.scene.parameter_values import Arrays
 
 
 class Watched(Steppable, Protocol):
-    """A simulation as `Watch` sees it."""
+    """Protocol of a simulation as `Watch` needs it."""
 
     @property
     def walls(self) -> NDArray:
-        """(b, d) wall particles [m]"""
+        """Positions (b, d) of wall particles [m]."""
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
-        """A rollout that is ready to go forward."""
+        """Return a rollout that is ready to go forward."""
 
     def in_precision(self, precision: str) -> Any:
-        """A single one of the same scene in a precision."""
+        """Return a single simulation of this scene in a precision."""
 
     def batch_of(self, size: int) -> Any:
-        """A simulation of this scene so many times in one launch."""
+        """Return a simulation of ``size`` copies of this scene in one launch."""
 
 
 class Watch:
-    """Looks at the states of one rollout, with the arrays of another solver of the same scene, as the rollout's own are
-    at work."""
+    """An observer of one rollout that computes quantities and reads sensors, with the arrays of another solver of the
+    scene, as the rollout's own are at work."""
 
     def __init__(
         self,
@@ -47,8 +47,8 @@ class Watch:
         record: Iterable[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """``sensors`` are read besides those of the scene, which a batch does not read. Raises `InputError` for names
-        of quantities that there are not, and for sensors of a batch."""
+        """Prepare to record quantities, and to read ``sensors`` besides those of the scene, which a batch does not
+        read. Raises `InputError` for unknown quantities, and for sensors of a batch."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
         if sensors and simulation.batch is not None:
@@ -69,24 +69,24 @@ class Watch:
         """Of the quantities that are recorded."""
 
     def frame(self, step: int, state: State) -> Arrays:
-        """The quantities of a state after so many steps, by name."""
+        """Return the recorded quantities of a state after so many steps, by name."""
         return self._recorder(step, state)
 
     def step(self, step: int, state: State) -> None:
-        """Have the sensors read a state after so many steps; every state in its turn."""
+        """Make the sensors read a state after so many steps; it is called for every state in its turn."""
         if self._log.sensors:
             moment = Moment.of(self._rollout, step, state, self._evaluator)
             self._log.read(Snapshot(state, self._dimension, self._colours, moment))
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """The last step of which an earlier process has left all readings; infinite without sensors."""
+        """Return the last step of which an earlier process has left all readings; infinite without sensors."""
         return self._log.known(readings)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Have what sensors of an earlier process read of the first states, up to that after so many steps."""
+        """Take over sensor readings by an earlier process of the first states, up to that after ``steps`` steps."""
         self._log.go_on(steps, readings)
 
     def readings(self) -> dict[str, Readings]:
-        """The readings of the sensors, by their names."""
+        """Return the readings of the sensors, by their names."""
         clock, steps = self._rollout.clocks[0], np.arange(self._rollout.steps + 1)
         return self._log.readings(clock.times(steps, float(self._rollout.time_steps[0])))

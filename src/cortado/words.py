@@ -6,12 +6,12 @@ from typing import Any
 
 
 def counted(number: int, noun: str) -> str:
-    """``1 phase``, ``2 phases``"""
+    """Return a number with its noun, ``1 phase`` or ``2 phases``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def quoted(names: Iterable[str]) -> str:
-    """Names as a sentence shows them: ``'gravity', 'viscosity'``."""
+    """Return names as a sentence shows them: ``'gravity', 'viscosity'``."""
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
@@ -21,13 +21,13 @@ def point_in_words(point: Iterable[float]) -> str:
 
 
 def sized(arrays: Mapping[str, Any]) -> str:
-    """Names with the shapes of what they stand for: ``gravity (3,), viscosity``."""
+    """Return names with the shapes of their arrays: ``gravity (3,), viscosity``."""
     shapes = {name: getattr(value, "shape", ()) for name, value in arrays.items()}
     return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
 
 
 class ShortRepr:
-    """A dataclass (made with ``repr=False``) whose arrays are shown by their shapes."""
+    """A base of dataclasses (made with ``repr=False``) whose arrays are shown by their shapes."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

@@ -47,40 +47,39 @@ from cortado.simulation import Simulation
 from cortado.words import counted
 
 BESIDE = 0.1 * PERTURBATION
-"""Of the spacing and of the speed of a fall: by so much particles are moved off a corner."""
+"""Part of the spacing, and of the speed of a fall, by which particles are moved off a corner of the loss."""
 ROUGHLY = 0.1
-"""Relative distance at most of the adjoint of a loss in float32 from finite differences of its values."""
+"""Greatest relative distance of the adjoint of a loss in float32 from finite differences of its values."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What `certify` returns: whether the adjoint is right, how long it is useful, and which estimator to use."""
+    """The result of `certify`: if the adjoint is right, how many steps it is useful for, and the estimator to use."""
 
     particles: int
     steps: int
     time_step: float
-    """[s]"""
+    """Time step of the run [s]."""
     loss: float
     loss_changes: dict[str, float]
-    """For every parameter, by how much a meaningful perturbation of it would change the loss: extrapolated, the adjoint
-    times a perturbation that was not tried."""
+    """Change of the loss by a meaningful perturbation of each parameter, extrapolated: the adjoint times a perturbation
+    that was not tried."""
     consistency: Consistency
-    """Of the derivatives with respect to all parameters together."""
+    """Check of the derivatives with respect to all parameters together."""
     wrong: tuple[str, ...]
     """Parameters with a wrong derivative; empty where the adjoint is right."""
     norms: np.ndarray
-    """(steps + 1,) norm of the exact adjoint of the state after each number of steps."""
+    """Norms (steps + 1,) of the exact adjoint of the state after each number of steps."""
     growth: float
-    """By how many e-folds the norm of the exact adjoint grows in each step backwards."""
+    """Growth of the exact adjoint's norm in each step backwards, in e-folds."""
     horizons: tuple[Horizon, ...]
-    """For every parameter that was asked for; none where the adjoint is wrong."""
+    """Horizon of every parameter asked for; none where the adjoint is wrong."""
     alignment: Alignment | None
-    """How well each estimator's gradient points along the smoothed one, for all of these parameters together."""
+    """Alignment of each estimator's gradient with the smoothed one, for all of these parameters together."""
     beside: Consistency | None = None
-    """Where the loss has a corner at these parameters, on which differences do not tell: the same check beside it, with
-    particles that are moved a little."""
+    """Check beside a corner of the loss, where differences do not tell, with particles moved a little; else None."""
     beyond: tuple[str, ...] = ()
-    """Sentences: what there is no answer to, as a copy of the run loses a particle."""
+    """Sentences on questions left open, as a copy of the run loses a particle."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -88,7 +87,7 @@ class Certificate:
         return f"Certificate({size}, {verdict}, use gradients.{self.estimator})"
 
     def __str__(self) -> str:
-        """The certificate as tables and sentences."""
+        """Return the certificate as tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
         lines = [size, _table(["parameter", "slope times a perturbation", "adjoint"], self._changes())]
         if not self.right:
@@ -115,7 +114,7 @@ class Certificate:
         return "\n".join(lines)
 
     def _changes(self) -> Iterator[tuple[str, str, str]]:
-        """Of each parameter by how much it changes the loss, extrapolated unless its horizon lasts, and the verdict."""
+        """Yield each parameter with its change of the loss, extrapolated unless its horizon lasts, and the verdict."""
         tried = {one.parameter for one in self.horizons if one.lasts}
         for name, share in self.loss_changes.items():
             verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
@@ -126,17 +125,17 @@ class Certificate:
 
     @property
     def right(self) -> bool:
-        """Whether every adjoint is right."""
+        """True if every adjoint is right."""
         return not self.wrong
 
     @property
     def horizon(self) -> int:
-        """The last step up to which the exact gradient is useful for every parameter that was asked for."""
+        """Last step up to which the exact gradient is useful for every parameter asked for."""
         return min((one.measured for one in self.horizons), default=0)
 
     @property
     def estimator(self) -> str:
-        """The gradient estimator to use for these parameters and this number of steps, as it is written in Python."""
+        """Gradient estimator to use for these parameters and this number of steps, as written in Python."""
         if not self.right:
             return "RandomizedSmoothing()"
         if all(one.lasts for one in self.horizons):
@@ -148,13 +147,13 @@ class Certificate:
 
     @property
     def _spread(self) -> str:
-        """What the estimator that is advised is given."""
+        """Phrase with the spread to give to the advised estimator; empty if it takes none."""
         if self.alignment is None or "(spread)" not in self.estimator:
             return ""
         return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the certificate as a table for JSON."""
         c, found = self.consistency, asdict(self)
         found["consistency"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_converged": c.last_converged}
         for one, made in zip(self.horizons, found["horizons"], strict=True):
@@ -216,7 +215,7 @@ def certify(
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
-    """Of a problem in float64; raises `DivergedError` where its run diverges."""
+    """Return the certificate of a problem in float64; raises `DivergedError` where its run diverges."""
     random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -258,7 +257,7 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 
 
 def _problem(subject: Any, steps: int | None) -> Problem:
-    """The problem itself; for a scene or a simulation, one whose loss is how far the particles move in ``steps``."""
+    """Return a problem itself; for a scene or a simulation, one with the particles' squared displacements as loss."""
     if isinstance(subject, Problem):
         if steps is not None:
             own = f"as the problem has {subject.steps} steps"
@@ -274,7 +273,7 @@ def _problem(subject: Any, steps: int | None) -> Problem:
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """The check of all parameters together and, where it fails, the names of those that also fail alone."""
+    """Return the check of all parameters together and, where it fails, the names of those that also fail alone."""
     together = check_consistency(history, values, gradient, balanced(gradient, along))
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -285,9 +284,11 @@ def _consistency(
 def _beside(
     problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
 ) -> tuple[Consistency | None, int]:
-    """The check of all parameters together, with first positions and velocities moved a little at random, and the
-    steps that it is of: those before the one in which the run that was moved loses a particle. None where there are
-    none.
+    """Check all parameters with first positions and velocities moved a little at random, and return the check and its
+    number of steps: those before the moved run loses a particle (None where none are). Fluid at rest is on the corner
+    of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the errors of many corners may
+    cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved has the same terms, and is
+    on no corner.
 
     Fluid at rest is on the corner of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the
     errors of many corners may cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved
@@ -309,11 +310,11 @@ def _beside(
 
 
 WIDTH = 110
-"""Characters of a table at most."""
+"""Greatest number of characters of a table's line."""
 
 
 def beyond_words(horizon: Horizon) -> str | None:
-    """Up to which step there is an answer; None where it is the last one."""
+    """Return a sentence on the step after which a horizon has no answer; None where it is the last one."""
     if horizon.reached == horizon.sample_steps[-1]:
         return None
     moved = f"a run that the perturbation of {horizon.parameter} moves"
@@ -323,7 +324,7 @@ def beyond_words(horizon: Horizon) -> str | None:
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """To how many digits reverse mode, forward mode and central differences agree, and whether that is on a corner."""
+    """Return in words to how many digits reverse, forward and central differences agree, and if on a corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

@@ -34,8 +34,8 @@ from cortado.words import ShortRepr
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """The same problem of so many steps, at the end of which its loss is one, or that of its frames up to there; None
-    where nothing is left of it."""
+    """Return a problem cut to ``steps`` steps, with its loss at their end, or with the loss's frames up to there; None
+    where nothing is left."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -44,7 +44,7 @@ def up_to(problem: Problem, steps: int) -> Problem | None:
 
 
 def first_rows(problem: Problem, values: Arrays, steps: int) -> Arrays:
-    """Parameters of a problem as those of its first steps."""
+    """Return parameters of a problem, with the rows of its first ``steps`` steps."""
     known = problem.simulation.known
     over_time = {name for name, value in values.items() if name in known.over_time and value.ndim > known[name].rank}
     return {name: value[:steps] if name in over_time else value for name, value in values.items()}
@@ -55,7 +55,7 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 
 
 def in_float64(problem: Problem) -> Problem:
-    """The problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
+    """Return the problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
 
     Losses of this package are computed from states in float64 then. Whether any other loss can be is not known, so it
     is still computed in float32: see `Rounded`.
@@ -81,10 +81,10 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A loss that may work in float32 alone, given states in float64, which are rounded to float32 for it."""
+    """A wrapper of a loss that may work in float32 alone: it rounds states in float64 to float32."""
 
     def __init__(self, loss: Any, single: Simulation):
-        """``single``: the simulation in float32 that the loss was made for."""
+        """Wrap a loss made for the float32 simulation ``single``."""
         self._loss, self._single = as_loss(loss), single
 
     def value(self, end: Snapshot) -> float:
@@ -108,13 +108,13 @@ class Rounded:
 
 
 SAMPLE_STEPS = 25
-"""Sample steps at most, where the loss is one of the last state."""
+"""Greatest number of sample steps, where the loss is one of the last state."""
 ROUGH = (1e-1, 1e-2, 1e-3)
 """Steps h of central differences of a loss in float32, in units of the direction."""
 FLOAT32_ROUND_OFF = 1e-6
 """Relative round-off of a loss in float32."""
 ABOVE_ROUND_OFF = 30.0
-"""A difference of such losses counts where it is this many times greater than their round-off."""
+"""Least ratio of a difference of float32 losses to their round-off at which it counts."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +122,11 @@ class Tangent:
     """Derivatives along one direction, by forward mode."""
 
     losses: np.ndarray
-    """(sample_steps,)"""
+    """Losses (sample_steps,)."""
     slopes: np.ndarray
-    """(sample_steps,) of the loss."""
+    """Derivatives (sample_steps,) of the loss."""
     strain: np.ndarray
-    """(sample_steps,) distance between the tangent of a particle's position and that of its nearest neighbour [m], root
+    """Distances (sample_steps,) between the tangents of a particle's position and of its nearest neighbour's [m], root
     mean square over particles."""
 
 
@@ -149,13 +149,13 @@ class LossHistory:
         self._total = np.cumsum if frames else np.asarray
 
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """(sample_steps,) central differences of step h along a direction of all or some of the parameters; NaN from
-        the step on in which a run diverges."""
+        """Return central differences (sample_steps,) of step h along a direction of all or some of the parameters; NaN
+        from the step on in which a run diverges."""
         return self.sides(parameters, along, h, np.zeros(len(self.sample_steps)))[0]
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Those, and (sample_steps,) by how much the differences of step h to one side and to the other differ, given
-        the ``losses`` (sample_steps,) between them; 0 of losses in float32, whose round-off would be all of it."""
+        """Return central differences (sample_steps,) and the distances between the differences to both sides, given the
+        ``losses`` (sample_steps,) between them; 0 of losses in float32, whose round-off would be all of it."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -167,7 +167,9 @@ class LossHistory:
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """Relative distance of the adjoints of `Rounded` losses from finite differences of their values.
+        """Return the relative distance of the adjoints of `Rounded` losses from finite differences of their values. It
+        is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or where
+        round-off is as large as the differences.
 
         It is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or
         where round-off is as large as the differences.
@@ -185,8 +187,8 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """At every sample step its loss, and the states with parameters moved by -h and by h along the direction, as
-        far as both runs come."""
+        """Yield at every sample step its loss, and the states with parameters moved by -h and by h along the direction,
+        as far as both runs come."""
         behind, ahead = (
             self._reached({**parameters, **{name: parameters[name] + step * d for name, d in along.items()}})
             for step in (-h, h)
@@ -196,7 +198,7 @@ class LossHistory:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """The states at those sample steps that a run comes to before it loses a particle; none where it cannot
+        """Return the states at sample steps that a run comes to before it loses a particle; none where it cannot
         begin."""
         try:
             return self.problem.states(parameters, self._losses)
@@ -210,7 +212,7 @@ class LossHistory:
         return shorter.states(first_rows(problem, parameters, last), steps)
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
-        """Derivatives along a direction, which names all or some of the parameters."""
+        """Return derivatives along a direction, which names all or some of the parameters."""
         dots: dict[int, Arrays] = {}
         dimension = self.problem.simulation.dimension
 
@@ -231,7 +233,8 @@ class LossHistory:
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """The same from the loss's adjoints: their mean times the difference of the states.
+    """Return the change of a loss between two states from its adjoints: their mean times the difference of the states.
+    It is exact to second order, and free of the round-off of the loss's values.
 
     It is exact to second order, and free of the round-off of the loss's values.
     """
@@ -255,17 +258,17 @@ STEPS = tuple(10.0**-k for k in range(3, 9))
 """Steps h of the central differences, in units of the direction. Smaller ones are tried until the differences stop
 converging and agree with forward mode."""
 MODE_TOLERANCE = 1e-8
-"""Relative distance at most of reverse mode from forward mode in float64; both are exact to round-off."""
+"""Greatest relative distance of reverse mode from forward mode in float64; both are exact to round-off."""
 PLATEAU = 1e-3
-"""Relative distance at most of the central differences of two successive steps h for them to count as converged."""
+"""Greatest relative distance of the central differences of two successive steps h that count as converged."""
 CORNER = 1e-4
-"""Relative distance of the slopes to both sides from which on the loss has a corner."""
+"""Least relative distance of the slopes to both sides at which the loss has a corner."""
 SLACK = 10.0
-"""Distance at most of forward mode from a central difference, in units of the least distance of two successive ones."""
+"""Greatest distance of forward mode from a central difference, over the least distance of two successive ones."""
 RESOLUTION = 1e-6
-"""Relative distance that is allowed in any case."""
+"""Relative distance between forward mode and differences that is always allowed."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""The parts of its multiples beyond whole numbers differ."""
+"""Golden ratio less 1, whose multiples all differ in their parts beyond whole numbers."""
 FAINT = 1e-4
 """Parameters that change the loss by less than this part of what the strongest does are left out when the others are
 scaled down to the weakest (`balanced`)."""
@@ -280,21 +283,21 @@ class Consistency(ShortRepr):
     """Derivatives of the loss along one direction, by reverse mode, forward mode and central differences."""
 
     sample_steps: np.ndarray
-    """(sample_steps,) numbers of steps after which the loss is computed."""
+    """Numbers of steps (sample_steps,) after which the loss is computed."""
     losses: np.ndarray
-    """(sample_steps,)"""
+    """Losses (sample_steps,)."""
     adjoint: float
-    """The derivative of the last loss by reverse mode: gradient times direction, summed over all numbers."""
+    """Derivative of the last loss by reverse mode: gradient times direction, summed over all numbers."""
     size: float
-    """Root sum of squares of those products: the round-off of their sum is proportional to it."""
+    """Root sum of squares of the products gradient times direction: the scale of their sum's round-off."""
     tangents: np.ndarray
-    """(sample_steps,) by forward mode."""
+    """Derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """(tried, sample_steps) central differences; no rows where reverse and forward mode already differ."""
+    """Central differences (tried, sample_steps); no rows where reverse and forward mode already differ."""
     sides: np.ndarray
-    """(tried, sample_steps) by how much the differences to one side and to the other differ."""
+    """Distances (tried, sample_steps) between the differences to one side and to the other."""
     steps: np.ndarray
-    """(tried,) their steps h, in units of the direction."""
+    """Steps h (tried,) of the differences, in units of the direction."""
 
     @property
     def disagreement(self) -> float:
@@ -306,7 +309,8 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """(tried - 1, sample_steps) relative distance of central differences of successive h, with their round-off.
+        """Relative distances (tried - 1, sample_steps) of central differences of successive h, with their round-off. At
+        every sample step it is the greatest up to there.
 
         At every sample step it is the greatest up to there.
         """
@@ -315,41 +319,41 @@ class Consistency(ShortRepr):
 
     @property
     def misses(self) -> np.ndarray:
-        """(tried, sample_steps) relative distance of differences from forward mode, the greatest up to there."""
+        """Relative distances (tried, sample_steps) of differences from forward mode, the greatest so far."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """(sample_steps,) the least relative distance of differences to one side and to the other, the greatest up to
-        there. It is small in the limit of small h but on a corner of the loss, where both have limits of their own."""
+        """Least relative distances (sample_steps,) of differences to one side and to the other, the greatest up to each
+        sample step. They vanish for small h except on a corner of the loss, where both have limits of their own."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """Whether reverse mode agrees with forward mode, and differences to one side and to the other have limits of
+        """True if reverse mode agrees with forward mode, and differences to one side and to the other have limits of
         their own, up to where they converge."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
     @property
     def converged(self) -> np.ndarray:
-        """(sample_steps,) whether differences of two successive h agree up to there. Where none do, chaos or round-off
-        hides the limit of differences."""
+        """Masks (sample_steps,), true where differences of two successive h agree up to there. Where none do, chaos or
+        round-off hides the limit of differences."""
         return np.asarray(self.gaps.min(axis=0, initial=np.inf) < PLATEAU)
 
     @property
     def last_converged(self) -> int | None:
-        """The last sample step at which differences converge; None where they do nowhere."""
+        """Last sample step at which differences converge; None where they do nowhere."""
         return int(self.sample_steps[self.converged][-1]) if self.converged.any() else None
 
     @property
     def miss(self) -> float | None:
-        """Relative distance of forward mode from the nearest difference at that sample step."""
+        """Relative distance of forward mode from the nearest difference at the last converged step, or None."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
     def differences_agree(self) -> bool:
-        """Whether forward mode is near a central difference at every sample step at which differences converge.
+        """True if forward mode is near a central difference at every sample step at which differences converge.
 
         Near means within `SLACK` times the least distance of two successive differences, or, on a corner of the loss,
         within the distance of both sides. One near difference is enough: beside a kink of the loss, differences agree
@@ -361,11 +365,11 @@ class Consistency(ShortRepr):
 
     @property
     def right(self) -> bool:
-        """Whether reverse mode agrees with forward mode, and forward mode with differences."""
+        """True if reverse mode agrees with forward mode, and forward mode with differences."""
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
-        """Distances relative to the derivatives, both the greatest up to each sample step."""
+        """Return distances relative to the derivatives, both the greatest up to each sample step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -373,7 +377,8 @@ class Consistency(ShortRepr):
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
-    """The directions scaled so that each parameter's changes the loss by as much as the weakest, or up to twice that.
+    """Return directions scaled such that each parameter's changes the loss by as much as the weakest, or up to twice
+    that.
 
     Along their sum an error in one parameter's adjoint is not hidden by a parameter that changes the loss far more; and
     as no two change it by the same, wrong signs of two of them do not cancel.
@@ -391,7 +396,7 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
 
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays) -> Consistency:
-    """Reverse mode's ``gradient`` along a direction, beside forward mode and central differences."""
+    """Compare reverse mode's ``gradient`` along a direction with forward mode and central differences."""
     tangent = history.tangent(values, along)
     losses, tangents = tangent.losses, tangent.slopes
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])

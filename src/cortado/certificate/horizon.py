@@ -21,7 +21,7 @@ PERTURBATION = 0.05
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """The values of parameters, given as values or as names of the scene's."""
+    """Return the values of parameters, given as values or as names of the scene's."""
     simulation = problem.simulation
     if problem.state is not None:
         raise InputError(
@@ -52,7 +52,7 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Every parameter of the problem that acts and that can be both increased and decreased, with its values.
+    """Return every parameter of the problem that acts and that can be both increased and decreased, with its values.
 
     Values are the chosen ones, else the scene's, as its schedule has them; parameters over time have a row for each
     step. A viscosity of 0 cannot be decreased and is left out; so is a mobility in a scene of one phase, where it does
@@ -74,12 +74,13 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
 
 
 def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
-    """Whether no number of a parameter is at the end of its range."""
+    """Test if no number of a parameter is at the end of its range."""
     return parameter.range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """The size of a meaningful perturbation of every number of these parameters, in their shapes and units.
+    """Return the size of a meaningful perturbation of every number of these parameters, in their shapes and units. It
+    is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
 
     It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
     """
@@ -91,7 +92,7 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """For every parameter a random direction of the given size; one that is a single number is increased."""
+    """Return for every parameter a random direction of the given size; a single number is increased."""
     return {
         name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
         for name, value in values.items()
@@ -99,8 +100,9 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Random directions that are smooth in space and constant in time, which move the fluid as a whole; of a path that
-    begins at 0 they grow in time.
+    """Return random directions that are smooth in space and constant in time, which move the fluid as a whole; for a
+    path that begins at 0 they grow in time. An independent random number for each particle would only move particles
+    against their neighbours.
 
     An independent random number for each particle would only move particles against their neighbours.
     """
@@ -122,7 +124,9 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Growth of an adjoint from the last state to the first, in e-folds: of a line fitted to the logarithm of its norm.
+    """Return the growth of an adjoint from the last state to the first, in e-folds, by a line fitted to the logarithm
+    of its norm. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^
+    grows linearly, it hardly grows.
 
     The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^ grows linearly,
     it hardly grows.
@@ -138,7 +142,7 @@ def growth(norms: np.ndarray, time_step: float) -> float:
 
 
 WITHIN = 0.25
-"""The exact derivative counts as useful where its relative distance from the finite difference is at most this."""
+"""Greatest relative distance from the finite difference at which the exact derivative counts as useful."""
 LINEAR = 0.3
 """Relative displacement of neighbours up to which their forces are nearly linear in it [spacings]."""
 
@@ -149,47 +153,47 @@ class Horizon(ShortRepr):
 
     parameter: str
     sample_steps: np.ndarray
-    """(sample_steps,) numbers of steps after which the loss is computed."""
+    """Numbers of steps (sample_steps,) after which the loss is computed."""
     exact: np.ndarray
-    """(sample_steps,) by forward mode."""
+    """Derivatives (sample_steps,) by forward mode."""
     difference: np.ndarray
-    """(sample_steps,) central difference over the whole perturbation, in both directions; NaN beyond the last step that
-    both of its runs come to."""
+    """Central differences (sample_steps,) over the whole perturbation, in both directions; NaN beyond the last step
+    that both of its runs come to."""
     strain: np.ndarray
-    """(sample_steps,) how far the perturbation separates nearest neighbours, to first order [spacings]."""
+    """Separations (sample_steps,) of nearest neighbours by the perturbation, to first order [spacings]."""
 
     @property
     def meaningful(self) -> np.ndarray:
-        """(sample_steps,) whether the exact derivative is near the difference, relative to the greatest up to there."""
+        """Masks (sample_steps,), true where the exact derivative is near the difference."""
         return np.abs(self.exact - self.difference) <= WITHIN * np.maximum.accumulate(np.abs(self.difference))
 
     @property
     def measured(self) -> int:
-        """The last sample step at which the exact derivative is useful, as it is at the one before; 0 for none."""
+        """Last sample step at which the exact derivative is useful, as it is at the one before; 0 for none."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property
     def reached(self) -> int:
-        """The last sample step that has a difference; 0 for none."""
+        """Last sample step that has a difference; 0 for none."""
         there = np.flatnonzero(~np.isnan(self.difference))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property
     def lasts(self) -> bool:
-        """Whether the exact derivative is useful up to the last step."""
+        """True if the exact derivative is useful up to the last step."""
         return self.measured == self.sample_steps[-1]
 
     @property
     def predicted(self) -> int | None:
-        """The first sample step at which the perturbation separates neighbours by more than `LINEAR`, None for none."""
+        """First sample step at which the perturbation separates neighbours by more than `LINEAR`, None for none."""
         beyond = np.flatnonzero(self.strain > LINEAR)
         return int(self.sample_steps[beyond[0]]) if beyond.size else None
 
 
 def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.ndarray) -> Horizon:
-    """The horizon of one parameter, for a perturbation of it."""
+    """Return the horizon of one parameter, for a perturbation of it."""
     along, spacing = {name: perturbation}, history.problem.simulation.scene.discretisation.spacing
     tangent = history.tangent(values, along)
     difference = history.difference(values, along, 1.0)
@@ -197,20 +201,20 @@ def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.nd
 
 
 MOST_NUMBERS = 12
-"""Components that a smoothed gradient is computed for at most: each costs two runs a sample."""
+"""Greatest number of components of a smoothed gradient: each costs two runs a sample."""
 SAMPLES = 2
 LEAST_COSINE = 0.5
-"""An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
+"""Least cosine of an estimator's gradient with the smoothed one at which it is advised."""
 GOOD_COSINE = 0.95
-"""Where no estimator of one run has this cosine, averages over an ensemble are tried, which cost some ten times as
+"""Cosine below which, for all estimators of one run, averages over an ensemble are tried, which cost some ten times as
 much."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
-"""Of one run."""
+"""Estimators that need one run, tried first."""
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
     "Guided(spread)": lambda spread: Guided(spread, seed=1),
 }
-"""The best ones of the table in `docs/gradients.md`, with other random numbers than the smoothed gradient."""
+"""Best estimators of averages in `docs/gradients.md`, with other random numbers than the smoothed gradient."""
 
 
 @dataclass(frozen=True)
@@ -218,37 +222,38 @@ class Judged:
     """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
 
     estimator: str
-    """As it is written in Python, after ``gradients.``"""
+    """Estimator as written in Python, after ``gradients.``."""
     cosine: float
     size: float
-    """Its norm over that of the smoothed gradient."""
+    """Norm of the gradient over that of the smoothed one."""
 
     @property
     def merit(self) -> float:
-        """The cosine over how many times too large or too small the gradient is; 1 is perfect."""
+        """Cosine over the factor by which the gradient is too large or too small; 1 is perfect."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How well the gradients of several estimators are aligned with the smoothed one."""
+    """The cosines and sizes of the gradients of several estimators, compared with the smoothed one."""
 
     noise: float
-    """Standard error of the smoothed gradient, relative."""
+    """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
-    """`Exact` comes first."""
+    """Judged estimators; `Exact` comes first."""
     spread: Mapping[str, float] = field(default_factory=dict)
-    """By parameter, of the smoothed gradient and of averages."""
+    """Spreads by parameter of the smoothed gradient and of averages."""
 
     @property
     def best(self) -> Judged | None:
-        """The estimator other than `Exact` that has the greatest merit; None where no cosine is large enough."""
+        """Estimator other than `Exact` with the greatest merit; None where no cosine is large enough."""
         good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
         return max(good, key=lambda judged: judged.merit, default=None)
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """The alignment for all these parameters together.
+    """Return the alignment for all these parameters together; None where they have too many components for a smoothed
+    gradient, where it has no run, and where the loss does not depend on them.
 
     None where they have too many components for a smoothed gradient, where it has no run, and where the loss
     does not depend on them.

@@ -16,12 +16,12 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 FURTHEST = 2.0**24
-"""A position that is more cells away from the grid counts as lost."""
+"""Greatest distance from the grid, in cells: a position further away counts as lost."""
 
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    """The Warp struct of a grid with the particles of each cell."""
+    """Return the Warp struct of a grid with the particles of each cell."""
     vector = precision.vector
 
     class CellGrid:
@@ -43,13 +43,13 @@ class CellFunctions:
     wrap: Any
     cell_of: Any
     below: Any
-    """From which cell to visit along an axis, and ``above`` behind which, counted from one's own."""
+    """First relative cell to visit along an axis; ``above`` is behind the last."""
     above: Any
 
 
 @cache
 def cell_functions(precision: Precision) -> CellFunctions:
-    """The functions of a grid in a precision."""
+    """Return the Warp functions of a grid of cells in a precision."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -71,12 +71,12 @@ def cell_functions(precision: Precision) -> CellFunctions:
 
     @wp.func
     def below(n: int) -> int:
-        """First cell to visit along an axis of n cells, seen from one's own: no cell is visited twice."""
+        """Return the first cell to visit along an axis of n cells, relative to one's own: no cell is visited twice."""
         return wp.where(n > 2, -1, 0)
 
     @wp.func
     def above(n: int) -> int:
-        """Behind the last cell to visit."""
+        """Return the relative cell behind the last to visit along an axis of n cells."""
         return wp.where(n > 1, 2, 1)
 
     return CellFunctions(wrap=wrap, cell_of=cell_of, below=below, above=above)
@@ -84,8 +84,8 @@ def cell_functions(precision: Precision) -> CellFunctions:
 
 @dataclass(frozen=True)
 class _CellKernels:
-    """The kernels of a sort by cell, in the order in which they are launched. Between the first two, sums of the counts
-    say where the cells start."""
+    """The kernels of a sort by cell, in the order of their launches. Between the first two, sums of the counts give the
+    start of each cell."""
 
     count: Any
     place: Any
@@ -94,9 +94,9 @@ class _CellKernels:
 
 @cache
 def cell_kernels(precision: Precision) -> _CellKernels:
-    """The kernels of a counting sort: atomic additions count the particles of each cell, and give each the next free
-    place in its cell. That leaves the particles of a cell in an order that differs from run to run; then each counts
-    those of its cell that come before it in the given order, and takes the place of that number."""
+    """Return the kernels of a counting sort: atomic additions count each cell's particles, and assign places in the
+    cell. That order differs from run to run, so each particle then counts those of its cell before it in the given
+    order, and takes the place of that number."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -104,7 +104,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
 
     @wp.func
     def is_astray(x: vector, grid: grid_type) -> bool:
-        """Whether a position is further from the grid than `FURTHEST` cells, or is not a number."""
+        """Test if a position is further from the grid than `FURTHEST` cells, or is not a number."""
         s = wp.cw_mul(x - grid.origin, grid.frequency)
         furthest = real(wp.static(FURTHEST))
         return not (wp.abs(s[0]) < furthest and wp.abs(s[1]) < furthest and wp.abs(s[2]) < furthest)
@@ -119,7 +119,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         # out
         arrivals: wp.array(dtype=wp.vec2i),
     ):
-        """``arrivals``: each particle's cell, and how many had arrived there before it. ``counts`` begins at 0."""
+        """Write to ``arrivals`` each particle's cell and its number of earlier arrivals; ``counts`` begins at 0."""
         i = wp.tid()
         member = i // particles
         cells = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -139,8 +139,8 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         placed: wp.array(dtype=wp.int32),
         before: wp.array(dtype=wp.int32),
     ):
-        """``placed``: who stands at each place; ``before``: how many of the same cell stand before it. ``counts``
-        becomes 0 for the next sort."""
+        """Write to ``placed`` the particle at each place, and to ``before`` the number of its cell's before it; clear
+        ``counts``."""
         i = wp.tid()
         arrival = arrivals[i]
         p = starts[arrival[0]] + arrival[1]
@@ -155,7 +155,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
         # out
         order: wp.array(dtype=wp.int32),
     ):
-        """Behind the last place ``before`` is -1: there the last cell ends."""
+        """Sort the particles of each cell by given order; ``before`` is -1 behind the last cell."""
         p = wp.tid()
         i = placed[p]
         first = p - before[p]
@@ -171,7 +171,7 @@ def cell_kernels(precision: Precision) -> _CellKernels:
 
 
 class CellSort:
-    """Sorts a fixed number of particles by scene and by cell, on one device and without a host read.
+    """A sort of a fixed number of particles by scene and by cell, on one device and without a host read.
 
     On a GPU the work grows with the square of how many particles are in one cell. The fill of the neighbour lists
     compares the same pairs and more, so that it takes longer still; and particles that are so far away that they cannot
@@ -180,7 +180,7 @@ class CellSort:
     """
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
-        """``particles`` of each of ``members`` scenes."""
+        """Allocate for ``particles`` in each of ``members`` scenes."""
         self._particles, self._all, self._device = particles, members * particles, device
         self._kernels = cell_kernels(precision)
         cells = members * grid.cells
@@ -198,7 +198,7 @@ class CellSort:
         self.grid.starts = wp.zeros(cells + 1, dtype=wp.int32, device=device)
 
     def __call__(self, positions: wp.array) -> None:
-        """Find the order of cells of positions (members n,) [m]; ties keep the given order."""
+        """Sort positions (members n,) [m] by cell into `order`; ties keep the given order."""
         if self._all == 0:
             return
         seen = (positions, self.order, self.grid.starts)

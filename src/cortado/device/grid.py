@@ -18,12 +18,12 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """The number of cells."""
+        """Number of cells."""
         return int(np.prod(self.shape))
 
     @classmethod
     def around(cls, lower: np.ndarray, upper: np.ndarray, period: np.ndarray, reach: float, most: int) -> "Grid":
-        """A grid over a region (d,) to (d,) [m]; at most about ``most`` cells, the rest of the region wraps around."""
+        """Make a grid over a region (d,) to (d,) [m]; beyond about ``most`` cells, the region wraps around."""
         origin, cell, shape = np.zeros(3), np.full(3, reach), [1, 1, 1]
         for axis in range(len(lower)):
             if period[axis] > 0:

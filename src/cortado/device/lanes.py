@@ -19,9 +19,9 @@ from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Up to so many particles a GPU gets so many lanes for each; beyond them one. Measured on an H200."""
+"""Pairs (greatest number of particles, lanes of a particle) on a GPU; above the last, one lane. Measured on an H200."""
 _OF_MODULES: dict[str, int] = {}
-"""The value of LANES in the kernels of a Warp module, by its name."""
+"""Value of LANES in the kernels of each Warp module, by its name."""
 
 
 def set_lanes(module: Any, lanes: int) -> None:
@@ -31,14 +31,14 @@ def set_lanes(module: Any, lanes: int) -> None:
 
 @cache
 def lanes_of(kernel: wp.Kernel) -> int:
-    """Threads that a kernel has for each particle: one, unless it divides them by LANES."""
+    """Return the number of a kernel's threads for each particle: one, unless it divides them by LANES."""
     return _OF_MODULES.get(kernel.module.name, 1) if "wp.tid() // LANES" in kernel.adj.source else 1
 
 
 @cache
 def check_lanes(kernel: wp.Kernel) -> None:
-    """Raises `TypeError` for a kernel that calls a sum which lanes share, but is not made for lanes: on a GPU each of
-    its threads would have a part of the sum, of a particle that is not its own."""
+    """Raise `TypeError` for a kernel that calls a sum shared by lanes without being made for lanes: on a GPU each
+    thread would get part of the sum of a wrong particle."""
     source = kernel.adj.source
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
@@ -51,7 +51,7 @@ def check_lanes(kernel: wp.Kernel) -> None:
 
 
 def _called(function: Any) -> Iterator[Any]:
-    """The Warp functions that a Python function names, and those that they name."""
+    """Yield the Warp functions that a Python function names, and, recursively, those that they name."""
     known = inspect.getclosurevars(function)
     for value in (*known.nonlocals.values(), *known.globals.values()):
         if isinstance(value, wp.Function) and value.func:
@@ -60,11 +60,11 @@ def _called(function: Any) -> Iterator[Any]:
 
 
 COUNTS = (1, 2, 4, 8, 16)
-"""Lanes that a particle can have."""
+"""Numbers of lanes that a particle can have."""
 
 
 def checked_lanes(lanes: Any) -> int | None:
-    """The argument ``lanes`` of a user, or None; raises `InputError` for a number of lanes that there cannot be."""
+    """Return the user's argument ``lanes``, or None; raises `InputError` for an impossible number of lanes."""
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
         wanted = ", ".join(map(str, COUNTS))
         raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
@@ -72,7 +72,7 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """How many lanes a particle gets on a device: as many as are ``wanted`` on a GPU, or as suits so many particles of
+    """Return the lanes of a particle on a device: ``wanted`` on a GPU, if given, or a number suited to the particles of
     one scene."""
     if device.is_cpu:
         return 1
@@ -81,31 +81,31 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
 
 @dataclass(frozen=True)
 class LaneFunctions:
-    """Warp functions for kernels that are made for lanes: see `lane_functions`."""
+    """Warp functions for kernels made for lanes: see `lane_functions`."""
 
     lane: Any
-    """The number of a thread's lane."""
+    """Function that returns the number of a thread's lane."""
     add_up: Any
-    """The sum over the lanes of a number."""
+    """Function that sums a number over the lanes."""
     add_up_vectors: Any
-    """The sum over the lanes of a vector."""
+    """Function that sums a vector over the lanes."""
     vote: Any
-    """Bit k is set where lane k says yes."""
+    """Function that returns a number whose bit k is set where lane k says yes."""
     ones: Any
-    """How many bits of a vote are set."""
+    """Function that counts the bits set in a vote."""
     before: Any
-    """How many bits of a vote are set of the lanes before one's own."""
+    """Function that counts the bits set in a vote by lanes before one's own."""
 
 
 @cache
 def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
-    """The functions for so many lanes, a power of 2 up to 32."""
+    """Return the Warp functions for a number of lanes, a power of 2 up to 32."""
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 
 @cache
 def sum_over_lanes(kind: Any, precision: Precision, lanes: int) -> Any:
-    """A Warp function: the sum over the lanes of a number or of a vector of any length, as ``kind`` says."""
+    """Return a Warp function that sums a number, or a vector of any length, of type ``kind`` over the lanes."""
     functions = lane_functions(precision, lanes)
     if kind is precision.real:
         return functions.add_up
@@ -158,7 +158,7 @@ def _of_one(precision: Precision) -> LaneFunctions:
 
 
 def _of_several(precision: Precision, lanes: int) -> LaneFunctions:
-    """In CUDA: threads that share a particle are neighbours in one warp, and only they wait for one another."""
+    """Return CUDA functions of lanes: threads of a particle are neighbours in one warp, and wait for each other."""
     real, vector = precision.real, precision.vector
     first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
 

@@ -19,14 +19,14 @@ from cortado.device.modules import announce
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 
 MOST_BUNDLES = 4_096
-"""Filled bundles that are kept; then all are let go, and filled anew."""
+"""Greatest number of filled bundles kept; at the limit, all are dropped."""
 _FIELDS: dict[Any, tuple[str, ...]] = {}
-"""Names of the arrays of each bundle."""
+"""Names of the arrays of each bundle type."""
 
 
 @cache
 def bundle(**entries: Any) -> Any:
-    """The Warp struct of arrays of these names, with entries of these types."""
+    """Return the Warp struct of arrays with these names, and with entries of these types."""
     words = (f"{name}_{wp.types.type_size_in_bytes(kind)}" for name, kind in entries.items())
     arrays = {name: wp.array(dtype=kind) for name, kind in entries.items()}
     made = wp.struct(type("_".join(("Bundle", *words)), (), {"__annotations__": arrays, "__module__": __name__}))
@@ -36,14 +36,14 @@ def bundle(**entries: Any) -> Any:
 
 @cache
 def bundles_of(kernel: wp.Kernel) -> dict[str, dict[str, str]]:
-    """The arguments of a kernel that are bundles, each with the names of its fields and of the arrays for them."""
+    """Return a kernel's bundle arguments, each with the names of its fields and of the arrays for them."""
     found = {a.label: _FIELDS[a.type] for a in kernel.adj.args if a.type.__hash__ and a.type in _FIELDS}
     endings = {label: f"_{label}" if label in ("dot", "bar") else "" for label in found}
     return {label: {name: name + endings[label] for name in fields} for label, fields in found.items()}
 
 
 def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
-    """The arguments of a launch, with its arrays instead of the bundles that they are in."""
+    """Yield the arguments of a launch, with each bundle replaced by its arrays."""
     for argument in arguments:
         struct = getattr(argument, "_cls", None)
         if struct in _FIELDS:
@@ -53,7 +53,7 @@ def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
 
 
 class Bundles:
-    """Bundles filled with arrays. Filling one takes longer than a launch, so that they are kept."""
+    """A cache of bundles filled with arrays, as filling one takes longer than a launch."""
 
     def __init__(self) -> None:
         self._filled: dict[tuple[Any, ...], Any] = {}
@@ -63,7 +63,7 @@ class Bundles:
         self._filled.clear()
 
     def filled(self, struct: Any, arrays: Sequence[wp.array]) -> Any:
-        """The bundle of a type with these arrays, in the order of its fields."""
+        """Return the bundle of a type with these arrays, in the order of its fields."""
         key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
         found = self._filled.get(key)
         if found is None:
@@ -80,8 +80,9 @@ Named = Mapping[str, Any]
 
 
 def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, bundles: Bundles) -> list[Any]:
-    """The arguments of a kernel in its order: out of ``given``, all of which it must have, and out of the first of the
-    ``groups`` that has them, which may hold more. A bundle is filled with the arrays that it names.
+    """Return a kernel's arguments in its order: from ``given``, all of which it must have, and from the first of the
+    ``groups`` that has each. A bundle is filled with the arrays that it names. Raises `TypeError` for missing or
+    unknown arguments, as nothing else would notice.
 
     Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
     that is missing or that the kernel does not have.
@@ -111,7 +112,7 @@ def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
 
 @cache
 def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], tuple[tuple[str, Any, tuple[str, ...]], ...]]:
-    """All names, with the arrays of bundles in their place; and each argument with its bundle's type and arrays."""
+    """Return a kernel's argument names, with bundles as their arrays; and each argument with its bundle."""
     bundled = bundles_of(kernel)
     arguments = tuple(
         (a.label, a.type if a.label in bundled else None, tuple(bundled.get(a.label, {}).values()))
@@ -121,24 +122,24 @@ def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], tuple[tuple[str, Any
 
 
 MOST_PARTS = 32
-"""Ranges of particles at most that a launch on a CPU is cut into."""
+"""Greatest number of ranges of particles into which a launch on a CPU is cut."""
 LEAST_PART = 2000
-"""Particles at least in a range: below, starting it costs more than it saves."""
+"""Least number of particles in a range: below, starting it costs more than it saves."""
 PARTS_A_CORE = 4
-"""Ranges for each core at most: one that is busy elsewhere leaves some of its own to the others."""
+"""Greatest number of ranges for each core: a core busy elsewhere leaves some to others."""
 LEAST_SHARED_PART = 10_000
-"""Particles at least in a range where there is more than one for each core."""
+"""Least number of particles in a range where each core has several."""
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
-"""Is given every launch: the name of what is launched, its threads, its arguments, and what launches it, which it must
+"""A function called for every launch with its name, threads, arguments and the function that launches, which it must
 call at least once."""
 _watchers: list[Watcher] = []
 
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Hand every launch of this process to a watcher, which times it or counts it. Captured graphs are not taken apart,
-    and launches within them are seen only while they are captured."""
+    """Pass every launch of this process in the block to a watcher, which times or counts it. Captured graphs are not
+    taken apart: launches within are seen only during capture."""
     _watchers.append(watcher)
     try:
         yield
@@ -155,15 +156,15 @@ def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[
 
 @cache
 def starts_at_first(kernel: wp.Kernel) -> bool:
-    """Whether a kernel reads ``first``, where its range of particles begins, of its first argument."""
+    """Test if a kernel reads ``first``, the start of its range of particles, from its first argument."""
     return f"{kernel.adj.args[0].label}.first" in kernel.adj.source
 
 
 def launch(
     kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
 ) -> None:
-    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: how many
-    threads of a GPU share memory, if it matters."""
+    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: threads
+    of a GPU that share memory, if it matters."""
     announce(kernel, device)
     inputs, sizes = bound(kernel, groups, arguments, Bundles()), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
@@ -171,7 +172,7 @@ def launch(
 
 
 def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> Callable[[], None]:
-    """A function that launches a kernel as `launch` does, with the same arguments each time, which are packed once."""
+    """Return a function that launches a kernel as `launch` does, with fixed arguments, packed once."""
     announce(kernel, device)
     inputs = bound(kernel, (), arguments, Bundles())
     command = wp.launch(kernel, threads, inputs=inputs, device=device, record_tape=False, record_cmd=True)
@@ -179,7 +180,7 @@ def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> 
 
 
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
-    """Do work that launches several kernels, which may only be repeated together: watchers see one launch."""
+    """Run work that launches several kernels, repeatable only as a whole: watchers see one launch."""
 
     def unwatched() -> None:
         watchers = _watchers.copy()
@@ -193,7 +194,10 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 
 class KernelLauncher:
-    """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
+    """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`). On a CPU,
+    where Warp has one thread, kernels whose first argument is the neighbourhood ``s`` are cut into ranges of particles,
+    which cores take one by one. Such a kernel works on particle ``s.first + wp.tid()``, and not on threads of its own
+    number. Sums are gathers, so their bits depend neither on the cut nor on the cores.
 
     On a CPU Warp launches in one thread. A kernel whose first argument is the neighbourhood ``s`` is cut into ranges of
     particles there, several for each core where there are many, and a core that has done one takes the next: such a
@@ -219,7 +223,7 @@ class KernelLauncher:
 
     @property
     def capturable(self) -> bool:
-        """Whether launches may be captured as a graph: those of one thread."""
+        """True if launches may be captured as a graph, which needs a single range."""
         return self.parts == 1
 
     def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
@@ -249,14 +253,14 @@ class KernelLauncher:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Launch in a second stream of a GPU: what is launched within waits for what was launched before it, and runs
-        beside what is launched after it, until `join`. On a CPU nothing changes."""
+        """Launch the block in a second stream of a GPU: after earlier launches, and beside later ones until `join`. On
+        a CPU nothing changes."""
         self._side_is_busy = self._side is not None
         with wp.ScopedStream(self._side):
             yield
 
     def join(self) -> None:
-        """Let later launches wait for those of `aside`."""
+        """Make later launches wait for those of `aside`."""
         if self._side_is_busy:  # a stream that a capture has not seen must not be waited for within it
             wp.wait_stream(self._side)
             self._side_is_busy = False
@@ -272,7 +276,7 @@ class KernelLauncher:
         in_parallel(launch_part, range(self.parts), min(self._cores, self.parts))
 
     def _part(self, neighbourhood: Any, number: int) -> Any:
-        """The neighbourhood as one range of particles sees it."""
+        """Return a copy of the neighbourhood struct for one range of particles."""
         part = neighbourhood._cls()
         for name in neighbourhood._cls.vars:
             setattr(part, name, getattr(neighbourhood, name))
@@ -281,7 +285,8 @@ class KernelLauncher:
 
 
 class CapturedGraph:
-    """Work that is done over and over with the same arrays: a captured graph from the second time on.
+    """Work repeated with fixed arrays: a captured graph from the second call on, as the first loads modules and
+    allocates. On a CPU a graph saves the packing of arguments: half of the time with a hundred particles.
 
     The first time loads modules and allocates what a capture must not. On a CPU a graph saves the packing of arguments:
     half of the time with a hundred particles.
@@ -305,14 +310,14 @@ class CapturedGraph:
 
 
 BANDS = 8
-"""Bands for each core: one may take longer than another."""
+"""Number of bands for each core, as one may take longer than another."""
 LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
 """Threads of a band, and of a launch that is cut where it is one of many that take little time each."""
 
 
 class BandLauncher:
-    """Launches kernels with so many threads on one device, with arguments by name (see `launch`). A kernel works on
-    thread ``first + wp.tid()``."""
+    """A launcher of kernels with a number of threads on one device, with arguments by name (see `launch`); on a CPU in
+    bands. A kernel works on thread ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
         self.device, self._compiled = device, set[Any]()
@@ -335,7 +340,7 @@ class BandLauncher:
     def to_and_fro(
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
     ) -> wp.array:
-        """Launch a kernel so many times, with a thread for each of the ``values``: it computes ``found`` from
+        """Launch a kernel ``rounds`` times, with a thread for each of the ``values``: it computes ``found`` from
         ``values``, and the next launch begins with what it found. ``values`` and ``other`` are written to alternately;
         returns the array of the last launch."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
@@ -349,14 +354,14 @@ class BandLauncher:
 
 
 class HostCopy:
-    """Reads a small array of a device into pinned memory of the host, which is allocated once."""
+    """A reader of a small device array into pinned host memory, which is allocated once."""
 
     def __init__(self, array: wp.array):
         self._array = array
         self._copy: Any = array if array.device.is_cpu else None
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """The array, or its first ``rows``, once the work of the device is done; the next call overwrites it."""
+        """Return the array, or its first ``rows``, after the device's work is done; the next call overwrites it."""
         if rows == 0:
             return wp.empty((0, *self._array.shape[1:]), dtype=self._array.dtype, device="cpu").numpy()
         if self._copy is None:

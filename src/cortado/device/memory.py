@@ -17,7 +17,7 @@ from cortado.errors import InputError
 _PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
 """[bytes]"""
 _WEIGHING = 1600.0
-"""[bytes] of a wall particle while its weight is computed."""
+"""Bytes of a wall particle while its weight is computed."""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
 """[numbers]"""
@@ -26,13 +26,13 @@ _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "m
 
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
-    """[bytes] of cutting a scene into particles."""
+    """Return the memory [bytes] for cutting a scene into particles, by a phrase for each part."""
     of_walls = (_WALL + _WEIGHING) * walls
     return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": of_walls}
 
 
 def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> dict[str, float]:
-    """[bytes] of a simulation with so many neighbours in each list and so many bytes in a number."""
+    """Return the memory [bytes] of a simulation, given the length of neighbour lists and the bytes of a number."""
     return {
         f"{particles:.3g} particles of fluid": particles * (_PARTICLE + 4.0 * neighbours + _REALS_OF_PARTICLE * real),
         f"{walls:.3g} wall particles": walls * (_WALL + _REALS_OF_WALL * real),
@@ -40,17 +40,17 @@ def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> 
 
 
 def step_parts(steps: int, real: int) -> dict[str, float]:
-    """[bytes] of the tables and records of a run."""
+    """Return the memory [bytes] of the tables and records of a run's steps."""
     return {f"what is kept of {steps:.3g} steps": steps * (_STEP + _REALS_OF_STEP * real)}
 
 
 def frame_parts(frames: int, numbers: int, real: int) -> dict[str, float]:
-    """[bytes] of frames in memory with so many numbers in each."""
+    """Return the memory [bytes] of frames with so many numbers each."""
     return {f"{frames:.3g} frames": frames * (_FRAME + float(numbers) * real)}
 
 
 def gradient_parts(particles: int, iterations: int, real: int) -> dict[str, float]:
-    """[bytes] of a gradient, with so many iterations of the pressure in a step."""
+    """Return the memory [bytes] of a gradient, given the pressure iterations of a step."""
     return {
         f"the gradient of {particles:.3g} particles": particles
         * real
@@ -59,29 +59,29 @@ def gradient_parts(particles: int, iterations: int, real: int) -> dict[str, floa
 
 
 def field_parts(nodes: float, real: int) -> dict[str, float]:
-    """[bytes] of a field of colours, or of its adjoint."""
+    """Return the memory [bytes] of a colour field, or of its adjoint."""
     return {f"{nodes:.3g} nodes of the field of colours": 4.0 * nodes * real}
 
 
 def picture_parts(pixels: int, real: int) -> dict[str, float]:
-    """[bytes] of a picture, and of showing it in a report."""
+    """Return the memory [bytes] of a picture, and of showing it in a report."""
     return {f"{pixels:.3g} pixels": pixels * (_PIXEL + _REALS_OF_PIXEL * real)}
 
 
 def sample_parts(samples: int, pixels: int, real: int) -> dict[str, float]:
-    """[bytes] of the adjoints of so many samples along the ray of every pixel."""
+    """Return the memory [bytes] of the adjoints of all samples along the rays of all pixels."""
     return {f"{samples} samples behind each of {pixels:.3g} pixels": 4.0 * samples * pixels * real}
 
 
 def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None:
-    """Raises `InputError` if that memory [bytes], by what it is for, is not free; ``device`` as Warp has it."""
+    """Raise `InputError` if memory [bytes], by its purpose, exceeds the free memory; ``device`` is Warp's."""
     lack = shortage(parts, device)
     if lack:
         raise InputError(f"This needs {lack}; {advice}.")
 
 
 def shortage(parts: Mapping[str, float], device: Any = None) -> str:
-    """The memory that is needed and that which is free, in words; empty if it suffices."""
+    """Return the needed and the free memory in words; empty if it suffices."""
     needed, free = sum(parts.values()), available(device)
     if needed <= free:
         return ""
@@ -91,19 +91,19 @@ def shortage(parts: Mapping[str, float], device: Any = None) -> str:
 
 
 def within(budget: float, device: Any = None) -> int:
-    """[bytes] of a budget for data that can be computed again: at most half of the free memory."""
+    """Return a memory budget [bytes] for data that can be recomputed: at most half of the free memory."""
     return int(min(budget, 0.5 * available(device)))
 
 
 def available(device: Any = None) -> float:
-    """[bytes] that are free on a device as Warp has it, or for this process on a CPU; infinite where nobody says."""
+    """Return the free memory [bytes] of a Warp device, or of this process on a CPU; infinite where unknown."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
     return max(min(float(psutil.virtual_memory().available), _of_container(), _of_process()), 0.0)
 
 
 def _of_container() -> float:
-    """The limit of the control group, less what is in use; cached files do not count, as they give way."""
+    """Return the control group's memory limit less its use [bytes], with cached files as free; infinite without one."""
     for limit, used in _LIMITS:
         with suppress(OSError, ValueError):
             stat = (_CGROUP / used).with_name("memory.stat").read_text().split()
@@ -113,7 +113,7 @@ def _of_container() -> float:
 
 
 def _of_process() -> float:
-    """The limit of the address space (``ulimit -v``), less what is in use."""
+    """Return the limit of the address space (``ulimit -v``) less its use [bytes]; infinite without one."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -28,12 +28,12 @@ from cortado.files.terminal import note, timed_note
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
 """An option of LLVM, as Warp gives it and as it is for our modules. Other flags are those of Warp's configuration."""
 UNUSED = "-DWP_NO_BFLOAT16="
-"""Leaves the functions of bfloat16 numbers out of Warp's headers, which take 1.0 s of a core of 2.5 GHz then to be
-precompiled, and not 1.7 s."""
+"""Compiler flag that leaves bfloat16 functions out of Warp's headers, whose precompilation takes 1.0 s then instead of
+1.7 s on a 2.5 GHz core."""
 
 
 def kernel_module(name: str, backward: bool = False) -> Any:
-    """The Warp module cortado_``name``. Its kernels get Warp's own adjoint, or do without."""
+    """Return the Warp module cortado_``name``, whose kernels have Warp's own adjoint only if ``backward``."""
     module = wp.get_module(f"cortado_{name}")
     module.options["enable_backward"] = backward
     flags = wp.config.cpu_compiler_flags
@@ -47,13 +47,15 @@ class Kernels:
 
     forward: Any
     tangent: Any
-    """Forward mode: from the tangents of the inputs, ``x_dot`` of an argument ``x``, to those of the outputs."""
+    """Kernel of forward mode: from tangents of the inputs, ``x_dot`` of an argument ``x``, to those of the outputs."""
     adjoint: Any
-    """Reverse mode: from the adjoints of the outputs, adds to the adjoints of the inputs, ``x_bar``."""
+    """Kernel of reverse mode: from adjoints of the outputs, adds to those of the inputs, ``x_bar``."""
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """The part of the name of a Warp module that says which kernels it has: "forward", "taped" or "derivative".
+    """Return the part of a Warp module's name that tells its kernels: "forward", "taped" or "derivative". Kernels with
+    Warp's own adjoint, which `gradients.Tape` needs, take three times as long to compile, so they are in "taped"
+    modules.
 
     Warp's own adjoint of forward kernels, which `gradients.Tape` needs, takes three times as long to compile as the
     kernels: those that a tape can differentiate are others, in modules of their own.
@@ -64,43 +66,42 @@ def kind_of(forward: bool, taped: bool) -> str:
 
 
 def is_derivative(module: Any) -> bool:
-    """Whether the kernels of a Warp module are derivatives."""
+    """Test if the kernels of a Warp module are derivatives."""
     return "_derivative_" in module.name or "_tangent_" in module.name
 
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
-"""Objects whose kernels were compiled ahead, by their identity."""
+"""Objects, by identity, whose kernels were compiled ahead."""
 _begun: dict[Any, Future[None]] = {}
-"""Modules that another thread compiles, or has compiled, which nobody has asked for yet."""
+"""Futures of modules that another thread compiles or has compiled, and that nobody has awaited yet."""
 _looked_at: set[Any] = set()
 """Modules of kernels that were launched."""
 
 
 class _Said:
-    """Whether this process has announced that it compiles."""
+    """A flag of this process that compiling has been announced."""
 
     anything = False
 
 
 def compile_ahead(owner: Any, device: Any) -> None:
-    """Compile the modules of all kernels that an object of Cortado's holds, itself or by what it is made of, but those
-    of derivatives: what a step of a solver is about to launch. Once for each object; those in the cache are left to be
-    loaded when they are launched."""
+    """Compile the modules of all kernels but derivatives that an object holds, directly or in its parts, before a
+    solver's step launches them. Once for each object; cached modules are loaded at their launch."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         _compile([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)], device)
 
 
 def compile_ahead_adjoint(owner: Any, device: Any) -> None:
-    """The same for what a step back is about to launch: those of adjoints too."""
+    """Compile an object's kernels and adjoints before a backward step launches them; see `compile_ahead`."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:
-    """Begin to compile the same in another thread, on a CPU with a core to spare, while this one goes on with something
-    else; `compile_ahead` waits for what was begun."""
+    """Begin to compile an object's kernels in another thread, on a CPU with a spare core; `compile_ahead` waits for
+    it."""
     if not device.is_cpu or usable_cores() < 2:
         return
     sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
@@ -111,7 +112,7 @@ def compile_meanwhile(owner: Any, device: Any) -> None:
 
 
 def announce(kernel: wp.Kernel, device: Any) -> None:
-    """Before a kernel is launched: say on stderr that kernels are compiled if its module has to be, once a process."""
+    """Print once a process on stderr that kernels are compiled, if a kernel about to be launched has to be."""
     module = kernel.module
     if module not in _looked_at:
         _looked_at.add(module)
@@ -121,7 +122,7 @@ def announce(kernel: wp.Kernel, device: Any) -> None:
 
 
 def kernels_of(owner: Any) -> list[wp.Kernel]:
-    """The kernels that an object of Cortado's holds, itself or by what it is made of."""
+    """Return the kernels that an object of Cortado's holds, directly or in its parts."""
     found: dict[int, Any] = {}
     seen: dict[int, Any] = {}
     waiting = [owner]
@@ -144,8 +145,8 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
 
 
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
-    """Compile and load the modules of kernels that are not in the cache, if there are several; one alone can as well be
-    compiled when it is launched."""
+    """Compile and load the kernels' modules that are not in the cache if there are several; a single one is left to its
+    launch."""
     sizes = _sizes(kernels)
     wait([_begun.pop(module) for module in sizes if module in _begun])
     missing = _missing(sizes, device)
@@ -163,8 +164,8 @@ def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
 
 
 def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
-    """The modules of kernels, and a number for each that grows with the time that it takes to compile, which is long
-    for kernels that sum over neighbours."""
+    """Return the kernels' modules, each with a number that grows with its time to compile, which is long for sums over
+    neighbours."""
     found: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
@@ -173,12 +174,12 @@ def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
 
 
 def _missing(sizes: Mapping[Any, int], device: Any) -> list[Any]:
-    """The modules that have to be compiled, those that take longest first."""
+    """Return the modules that have to be compiled, slowest first."""
     return sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
 
 
 def _is_compiled(module: Any, device: Any) -> bool:
-    """Whether a module is loaded, or in the cache."""
+    """Test if a module is loaded, or in the cache."""
     block_dim = 1 if device.is_cpu else module.options["block_dim"]
     if (device.context, block_dim) in module.execs:
         return True

@@ -24,24 +24,24 @@ class Precision:
     numpy: type
     """NumPy scalar type."""
     tiny: float
-    """A number that is far below round-off of 1, and whose reciprocal is finite."""
+    """Positive number far below round-off of 1, with a finite reciprocal."""
     furthest: float
-    """In spacings from the origin: where positions are rounded to about a thousandth of a spacing (float32) or less."""
+    """Distance from the origin, in spacings, where positions are rounded to about 0.001 spacings (float32) or less."""
     greatest: float
-    """No parameter is larger, as products of several of them must stay finite."""
+    """Greatest size of a parameter, as products of several must stay finite."""
 
     @property
     def bytes(self) -> int:
-        """Bytes of a number."""
+        """Number of bytes of a number."""
         return np.dtype(self.numpy).itemsize
 
     @property
     def six(self) -> Any:
-        """Warp vector type of six components: a symmetric matrix."""
+        """Warp vector type of six components, for a symmetric matrix."""
         return _vector_type(self.real, 6)
 
     def fractions(self, phases: int) -> Any:
-        """Warp vector type of one number for each phase."""
+        """Return the Warp vector type of one number for each phase."""
         return _vector_type(self.real, phases)
 
 
@@ -55,7 +55,7 @@ FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-20
 
 
 def precision_named(name: str) -> Precision:
-    """The precision called ``"float32"`` or ``"float64"``; raises `InputError` for any other name."""
+    """Return the precision called ``"float32"`` or ``"float64"``; raises `InputError` for any other name."""
     for precision in (FLOAT32, FLOAT64):
         if isinstance(name, str) and precision.name == name:
             return precision
@@ -64,7 +64,7 @@ def precision_named(name: str) -> Precision:
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """Warp functions of a positive number that is neither subnormal nor infinite."""
+    """Warp functions (roots and reciprocal) of a positive number that is neither subnormal nor infinite."""
 
     root: Any
     inverse_root: Any
@@ -73,7 +73,7 @@ class Arithmetic:
 
 @cache
 def arithmetic(precision: Precision, taped: bool) -> Arithmetic:
-    """The functions of a precision; a tape can differentiate ``taped`` ones, which round as IEEE 754 asks for."""
+    """Return roots and reciprocal in a precision; ``taped`` ones have derivatives, and round as IEEE 754 asks."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
@@ -96,7 +96,7 @@ def _plain(precision: Precision) -> Arithmetic:
 
 
 def _of_the_gpu() -> Arithmetic:
-    """For the CPU these are as the plain ones."""
+    """Return approximate float32 roots and reciprocal of CUDA; on the CPU they are the plain ones."""
 
     def native(cuda: str, cpu: str) -> str:
         return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"

@@ -16,13 +16,13 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BRANCHES = 32
-"""Values that one thread adds up on a CPU."""
+"""Number of values that one thread adds up on a CPU."""
 BLOCK = 1024
-"""Threads of a block on a GPU at most."""
+"""Greatest number of threads of a block on a GPU."""
 EACH = 8
-"""Values that each of them adds up before the tree."""
+"""Number of values that each thread of a block adds up before the tree."""
 SHARED = 32 * 1024
-"""[bytes] of shared memory that a block takes at most, of the 48 KiB that there are."""
+"""Greatest shared memory [bytes] of a block, of the 48 KiB that there are."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,20 @@ class ReductionKernel:
 
     kernel: Any
     threads: int
-    """For each partial value."""
+    """Number of threads for each partial value."""
     most: int
-    """Values that a partial one is made of, at most."""
+    """Greatest number of values that make up a partial one."""
 
 
 def type_name(dtype: Any) -> str:
-    """The name of a number, vector or matrix type, for the name of a Warp module."""
+    """Return the name of a number, vector or matrix type, for the name of a Warp module."""
     shape = getattr(dtype, "_shape_", ())
     return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
 
 
 @cache
 def sum_kernel(dtype: Any, is_cpu: bool) -> ReductionKernel:
-    """Sums of numbers, vectors or matrices of one type."""
+    """Return a kernel of partial sums of numbers, vectors or matrices of one type."""
 
     @wp.func
     def plus(a: dtype, b: dtype) -> dtype:
@@ -55,7 +55,7 @@ def sum_kernel(dtype: Any, is_cpu: bool) -> ReductionKernel:
 
 @cache
 def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKernel:
-    """Sums of the first and maxima of the second components of pairs."""
+    """Return a kernel that sums the first and takes the maximum of the second components of pairs."""
     pair = precision.pair
 
     @wp.func
@@ -68,7 +68,7 @@ def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKerne
 
 
 def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
-    """partial[t] from values t, t + T, t + 2 T, ... of a scene."""
+    """Return a kernel that combines values t, t + T, t + 2 T, ... of a scene into partial[t]."""
 
     def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid() % stride
@@ -82,8 +82,8 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """The kernel of `_of_threads`, with a block of threads in the place of each thread t. ``combine`` is an expression
-    of C++ in a and b, of the type T."""
+    """Return the kernel of `_of_threads` with a block of threads instead of each thread t. ``combine`` is a C++
+    expression in a and b, of the type T."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
         threads //= 2
@@ -118,7 +118,7 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
 
 
 def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
-    """A kernel of that name in a module of its own: what compiles for a GPU alone is in no module for a CPU."""
+    """Return a kernel of a name in a module of its own, as code for a GPU alone is in no module for a CPU."""
     module = kernel_module(module_name)
     function.__qualname__ = name
     return wp.kernel(function, module=module, enable_backward=False, **options)
@@ -126,7 +126,7 @@ def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
 
 @cache
 def add_kernel(dtype: Any) -> Any:
-    """total += value, element by element."""
+    """Return a kernel that computes total += value, element by element."""
     module = kernel_module(f"add_{type_name(dtype)}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -138,10 +138,10 @@ def add_kernel(dtype: Any) -> Any:
 
 
 class TreeReduction:
-    """Adds one value of each particle on the device, scene by scene, in the same order every time."""
+    """A reduction on the device of one value per particle to one per scene, in a fixed order."""
 
     def __init__(self, level: ReductionKernel, dtype: Any, particles: int, device: Any, members: int = 1):
-        """``particles`` of each of ``members`` scenes."""
+        """Allocate for ``particles`` in each of ``members`` scenes."""
         self._level, self._device, self._particles = level, device, particles
         self._partials: list[tuple[int, wp.array]] = []
         size = particles
@@ -150,7 +150,7 @@ class TreeReduction:
             self._partials.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
 
     def __call__(self, values: wp.array) -> wp.array:
-        """The sums as an array (members,), which the next call overwrites."""
+        """Return the sums as an array (members,), which the next call overwrites."""
         count, level, device = self._particles, self._level, self._device
         for size, sums in self._partials:
             arguments = {"count": count, "stride": size, "values": values, "partial": sums}
@@ -160,16 +160,16 @@ class TreeReduction:
 
 
 def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
-    """Sums of (members n,) numbers, vectors or matrices of a Warp type."""
+    """Return a reduction that sums (members n,) numbers, vectors or matrices of a Warp type."""
     return TreeReduction(sum_kernel(dtype, device.is_cpu), dtype, particles, device, members)
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
-    """Sums of first and maxima of second components of pairs (members n,)."""
+    """Return a reduction to the sum of first and the maximum of second components of pairs (members n,)."""
     level = sum_and_maximum_kernel(precision, device.is_cpu)
     return TreeReduction(level, precision.pair, particles, device, members)
 
 
 def add(values: wp.array, total: wp.array) -> None:
-    """total += values, element by element."""
+    """Add values to an array on the device, element by element: total += values."""
     launch(add_kernel(values.dtype), len(values), values.device, value=values, total=total)

@@ -17,12 +17,12 @@ from cortado.calls import told
 from cortado.errors import ComputationError, InputError, shown
 
 CORES = "CORTADO_CORES"
-"""The environment variable that limits the number of cores, for processes that share a machine."""
+"""Name of the environment variable that limits the number of cores, for processes that share a machine."""
 
 
 def usable_cores() -> int:
-    """The cores of this process where the system tells them, and those of the machine elsewhere; no more than the
-    environment variable CORTADO_CORES says. Raises `InputError` where that is no number of cores."""
+    """Return the number of cores of this process, or of the machine where the system does not tell, at most
+    CORTADO_CORES (an environment variable). Raises `InputError` where that is no number of cores."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES, "").strip()
     if not limit:
@@ -33,17 +33,19 @@ def usable_cores() -> int:
 
 
 MOST_CORES = 16
-"""Cores at most that a launch on a CPU uses."""
+"""Greatest number of cores that a launch on a CPU uses."""
 
 
 @cache
 def helpers() -> ThreadPoolExecutor:
-    """The threads that share the work of the one that launches."""
+    """Return the pool of threads that share the work of the launching one."""
     return ThreadPoolExecutor(MOST_CORES - 1, thread_name_prefix="cortado")
 
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
-    """Do work for each item, on so many cores: this thread, and those that help it, take one item after the other.
+    """Call ``work`` for each item on several cores: this thread and its helpers take one item after the other. Returns
+    once all have ended, also after an interruption, with no work left behind. After a failure, which is raised, no
+    further item is begun.
 
     Returns once all of them have ended, also after an interruption: nothing may go on behind the back of what comes
     next. After that, and after a failure, which is raised, nobody takes another item.
@@ -72,7 +74,7 @@ class WarpLock(ContextDecorator, threading.local):
 
     _lock = threading.RLock()
     _entries = 0
-    """Of this thread."""
+    """Number of times that this thread has entered the lock."""
 
     def __enter__(self) -> None:
         if not self._entries:
@@ -86,7 +88,7 @@ class WarpLock(ContextDecorator, threading.local):
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Release the lock meanwhile: around what uses none of Warp's state, or waits for another thread."""
+        """Release the lock in the block, around work that uses none of Warp's state, or waits for another thread."""
         entries = self._entries
         if entries:
             self._let_go()
@@ -105,7 +107,7 @@ class WarpLock(ContextDecorator, threading.local):
 
 
 WARP = WarpLock()
-"""The lock of this process."""
+"""Lock of this process on Warp."""
 
 
 class Turn:
@@ -140,7 +142,7 @@ class Turn:
         self._lock.release()
 
     def forked(self) -> None:
-        """In the child of a fork: only the thread that forked is still there."""
+        """Replace the lock in the child of a fork, where only the forking thread still exists."""
         if self._lock.acquire(blocking=False):
             self._lock.release()
         else:

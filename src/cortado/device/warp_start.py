@@ -31,7 +31,8 @@ VERBOSE = "CORTADO_VERBOSE"
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Warp may be started within it without a word; afterwards it only says warnings and errors.
+    """Keep Warp silent in the block, as it starts; afterwards it prints warnings and errors alone. A log level chosen
+    by the user is kept, and one below Warp's own keeps the start audible.
 
     A level that the user has chosen is left as it is; below Warp's own, where all is wanted, so is the start.
     """
@@ -49,8 +50,8 @@ def silenced() -> Iterator[None]:
 
 @contextmanager
 def c_stderr_to(file: int) -> Iterator[None]:
-    """Within it, C code writes its messages to an open file in the place of stderr: Warp's warnings of a missing CUDA
-    driver, and the errors of its compiler."""
+    """Redirect stderr of C code in the block to an open file: Warp's warnings of a missing CUDA driver, and its
+    compiler's errors."""
     try:
         stderr = os.dup(2)
     except OSError:  # there is none
@@ -66,9 +67,9 @@ def c_stderr_to(file: int) -> Iterator[None]:
 
 CACHE_PATH = "WARP_CACHE_PATH"
 _COMPILING = re.compile(r"_p\d+_t\d+$")
-"""How Warp ends the name of a folder in which a thread of a process compiles."""
+"""Pattern of the end of a folder name in which a thread of a process compiles."""
 ROOM = 16 * 2**20
-"""[bytes] that must be free for kernels; those of one run take a few MiB."""
+"""Free disk space [bytes] needed for kernels; those of one run take a few MiB."""
 
 
 @cache
@@ -98,7 +99,7 @@ def start_warp() -> None:
 
 
 def complaint(error: Exception) -> str | None:
-    """The sentence for an error that came out of loading or compiling a kernel; None for any other error."""
+    """Return a sentence for an error from loading or compiling a kernel; None for any other error."""
     frames = traceback.extract_tb(error.__traceback__)
     loading = any(frame.name == "load" and Path(frame.filename).parts[-3:-1] == ("warp", "_src") for frame in frames)
     missing = isinstance(error, RuntimeError) and str(error).startswith("Failed to find ")
@@ -112,7 +113,7 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
-    """Start Warp, unless it has started; why its cache cannot be made, None if it can."""
+    """Start Warp, unless it has started; return why its cache cannot be made, None if it can."""
     try:
         with silenced():
             wp.init()
@@ -122,7 +123,7 @@ def _start() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Why a folder has no room for kernels, or that one in it is damaged; None if all is well."""
+    """Return why a folder has no room for kernels, or that one in it is damaged; None if all is well."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
@@ -135,13 +136,13 @@ def _trouble(folder: str) -> str | None:
 
 
 def _kernels(folder: str) -> Iterator[Path]:
-    """Folders of kernels, without those that a process is compiling at the moment, which Warp renames in the end."""
+    """Yield folders of kernels, except those being compiled by a process, which Warp renames in the end."""
     return (kernel for kernel in Path(folder).glob("wp_*") if not _COMPILING.search(kernel.name))
 
 
 def _is_whole(kernel: Path) -> bool:
-    """Whether the object files of a kernel have their table of sections, which stands at the end of a file; what prints
-    more than a sentence where one has not is the loader. Elsewhere than on Linux nothing is looked at."""
+    """Test if a kernel's object files end with their table of sections, without which the loader prints at length; True
+    except on Linux."""
     if sys.platform != "linux":
         return True
     for file in kernel.glob("*.o"):
@@ -159,7 +160,7 @@ def _is_whole(kernel: Path) -> bool:
 
 
 def _replacement(folder: str) -> str:
-    """A temporary folder for kernels, with those of the cache that are whole, until the process ends."""
+    """Return a temporary folder for kernels until the process ends, with links to intact ones of the cache."""
     temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     with suppress(OSError):
@@ -170,12 +171,12 @@ def _replacement(folder: str) -> str:
 
 Version = tuple[int, int]
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-"""The environment variable that says which GPUs a process has."""
+"""Name of the environment variable that says which GPUs a process has."""
 PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
 
 
 def why_no_gpu() -> str:
-    """Why Warp, which has started, finds no GPU, in words."""
+    """Return in words why Warp, which has started, finds no GPU."""
     needed, found = _needed(), installed_driver()
     if needed is None or found is None or found >= needed:
         return "no GPU with a CUDA driver is found"
@@ -186,7 +187,7 @@ def why_no_gpu() -> str:
 
 
 def installed_driver() -> Version | None:
-    """The version of CUDA that the driver of this machine supports; None where there is none."""
+    """Return the version of CUDA that this machine's driver supports; None without a driver."""
     with suppress(OSError, AttributeError):
         library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
         version = ctypes.c_int()
@@ -196,7 +197,7 @@ def installed_driver() -> Version | None:
 
 
 def _needed() -> Version | None:
-    """The version that Warp needs; None where it does not say, or was built without CUDA."""
+    """Return the version of CUDA that Warp needs; None where unknown, or built without CUDA."""
     with suppress(ImportError, AttributeError):  # Warp keeps it for itself, and may move it
         from warp._src.context import runtime
 
@@ -209,7 +210,7 @@ def _shown(version: Version) -> str:
 
 
 def device_named(name: str) -> Any:
-    """Warp's device of that name; raises `InputError` where there is none."""
+    """Return Warp's device of a name; raises `InputError` where there is none."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     if not isinstance(name, str):
@@ -223,7 +224,7 @@ def device_named(name: str) -> Any:
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as CUDA names them."""
+    """Return the GPUs that this process may use, as CUDA names them."""
     start_warp()
     given = [name.strip() for name in os.environ.get(VISIBLE, "").split(",") if name.strip()]
     present = wp.get_cuda_device_count()

@@ -20,7 +20,7 @@ from cortado.errors import ComputationError, CortadoError, InputError, warn
 from cortado.version import __version__
 
 KEPT = 2
-"""Functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""
+"""Number of functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""
 
 _functions: OrderedDict[str, Callable[[Any], Any]] = OrderedDict()
 _one_at_a_time = threading.RLock()
@@ -39,13 +39,13 @@ class Payload:
 
     @classmethod
     def of(cls, function: Callable[[Any], Any]) -> "Payload":
-        """Pickle a function; raises `InputError` where that is impossible."""
+        """Pickle a function into a payload; raises `InputError` where that is impossible."""
         content = pickled(function, "The function")
         return cls(sha256(content).hexdigest(), versions(), content)
 
     @property
     def mention(self) -> "Payload":
-        """The same without its content."""
+        """Payload without its content."""
         return replace(self, content=None)
 
 
@@ -67,7 +67,7 @@ class Answer:
     """(text, category) of each warning."""
 
     def result(self) -> Any:
-        """What the function returned, with its warnings; raises what it raised."""
+        """Return the function's result, with its warnings given here; raises its error."""
         for text, category in self.warnings:
             warn(text, category)
         if self.error is None:
@@ -78,7 +78,7 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """A value pickled, with the code of classes and functions of the main module; raises `InputError` where that is
+    """Pickle a value with the code of classes and functions of the main module; raises `InputError` where that is
     impossible, in a sentence that begins with ``what``."""
     import cloudpickle
 
@@ -90,12 +90,13 @@ def pickled(value: Any, what: str) -> bytes:
 
 @cache
 def versions() -> str:
-    """The versions that decide about the bits of a result, in words."""
+    """Return the versions that determine the bits of a result, in words."""
     return f"Cortado {__version__}, Warp {metadata.version('warp-lang')} and NumPy {metadata.version('numpy')}"
 
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
-    """Call the function for an item, in a worker process. One call at a time: threads of a worker wait.
+    """Call the payload's function for an item, in a worker process, one call at a time. Its exceptions become part of
+    the answer, to be raised again by the caller, also one that would end the process.
 
     What the function raises is part of the answer, so that it is raised again where the function came from. So is that
     it wants to end the process, which would take the worker with it.
@@ -120,7 +121,7 @@ def call(payload: Payload, item: bytes) -> Answer | Lacking:
 
 
 def _function(payload: Payload) -> Callable[[Any], Any]:
-    """The function of a payload, made unless it is there."""
+    """Return the function of a payload, unpickled unless it is kept."""
     if payload.versions != versions():
         raise InputError(
             f"A worker has {versions()}, but must have {payload.versions}, as the process that asks, for the same bits."
@@ -147,7 +148,7 @@ def _unpickled(content: bytes) -> Any:
 
 
 def _sendable(error: Exception) -> BaseException:
-    """The error, or one with the same words if it cannot be pickled."""
+    """Return an error, or one with equal words if it cannot be pickled."""
     try:
         again = pickle.loads(pickle.dumps(error))
         if type(again) is type(error) and str(again) == str(error):
@@ -158,6 +159,6 @@ def _sendable(error: Exception) -> BaseException:
 
 
 def in_words(error: BaseException) -> str:
-    """An error in words, on one line, without the full stop."""
+    """Return an error in words, on one line, without the full stop."""
     text = " ".join(str(error).split()).rstrip(".")
     return text if isinstance(error, CortadoError) else ": ".join(filter(None, [type(error).__name__, text]))

@@ -14,8 +14,8 @@ __all__ = ["FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
-    """So many environments of a task, such as "Carry", in one launch: what `gymnasium.make_vec` makes, with the
-    arguments of `FluidVectorEnv` as ``settings``."""
+    """Make ``num_envs`` environments of a task, such as "Carry", in one launch, as `gymnasium.make_vec` does;
+    ``settings`` are arguments of `FluidVectorEnv`."""
     return FluidVectorEnv(task, num_envs, **settings)
 
 

@@ -19,16 +19,16 @@ WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [
 COFFEE = {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.20, 0.09, 0.04]}
 MILK = {"name": "milk", "rest_density": 950.0, "viscosity": 0.05, "colour": [0.95, 0.92, 0.85]}
 LED = {"motion": "path", "velocity": [0.0, 0.0], "colour": [0.6, 0.6, 0.65]}
-"""A solid that actions move."""
+"""Table of a solid that actions move along a path."""
 
 
 def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[str, Any]:
-    """The table of a box with these corners [m], and with other keys."""
+    """Return the scene table of a box with corners ``lower`` and ``upper`` [m] and other keys."""
     return {"shape": "box", "lower": lower, "upper": upper, **others}
 
 
 class Carry(Task):
-    """A cup of water is carried to a place, without spilling.
+    """The task of carrying a cup of water to a place, without spilling.
 
     Actions: velocity of the cup along x, and rate at which it leans. Goal: where its middle shall be. After
     TransportWater of SoftGym (Lin et al. 2020), with its reward: minus the distance of the cup to its goal [m], minus
@@ -44,7 +44,7 @@ class Carry(Task):
     width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
     """Of the inside of the cup, of its water, of the cup above the floor of its inside, and of its walls [m]."""
     floor = -0.15
-    """Height of what spilt water falls on: deeper than a corner of the cup ever is [m]."""
+    """Height of the floor on which spilt water falls, deeper than any corner of the cup [m]."""
     fastest, turning = 0.6, 1.0
     """[m/s], [rad/s]"""
     actuators = (
@@ -73,7 +73,7 @@ class Carry(Task):
 
 
 class Latte(Task):
-    """Milk flows from a nozzle into coffee, and shall lie where a hidden path of the nozzle would have put it.
+    """The task of pouring milk from a nozzle into coffee as a hidden path of the nozzle would have done.
 
     Actions: where the nozzle is sent to, along x. After LatteArt of FluidLab (Xian et al. 2023), with its reward but
     for scale and a constant: minus the squared distances of the milk that has been poured from where it is under the
@@ -87,7 +87,7 @@ class Latte(Task):
     radius, depth, opening, column = 0.03, 0.015, 0.0025, 0.0625
     """Of the cup, of its coffee, of the nozzle, and of the milk in it [m]."""
     height = depth + 0.005
-    """Of the nozzle above the floor [m]."""
+    """Height of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
     """How far the nozzle can be sent [m], how it follows [s], and for how many steps of the environment it pours."""
     actuators = (Position("nozzle_path", (0.0, height), (0,), (reach,), lag=lag),)
@@ -104,7 +104,7 @@ class Latte(Task):
 
     @property
     def speed(self) -> float:
-        """Of the milk in the nozzle [m/s]."""
+        """Speed of the milk in the nozzle [m/s]."""
         return self.column / (self.pouring * self.repeats * self.coarse_step)
 
     def reward(self, simulation: Simulation) -> Reward:
@@ -113,15 +113,15 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """(horizon, 1) the breadth of a heart, as somebody goes once around it, and then the middle."""
+    """Return the actions (horizon, 1) of the hidden path: once around the outline of a heart, then its middle."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Positions under the hidden path after each step of the environment (horizon, n, d) [m], and the weights of the
-    particles of milk that have been poured until then (horizon, n) [1/m2]."""
+    """Return positions (horizon, n, d) [m] on the hidden path after each step, and the weights (horizon, n) [1/m2] of
+    the milk particles poured until then."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -138,7 +138,7 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
 
 
 class Pour(Task):
-    """A jug is turned, and moved a little, so that its syrup ends in a glass.
+    """The task of turning and moving a jug until its syrup is in a glass.
 
     Actions: velocity of the jug along x, and rate at which it turns, counterclockwise. After PourWater of SoftGym (Lin
     et al. 2020), with its reward: the share of the fluid that is in the glass. SoftGym counts particles; here they
@@ -177,7 +177,7 @@ class Pour(Task):
 
 
 class Raft(Task):
-    """A paddle makes waves that bring a raft to a place, and keep it level.
+    """The task of bringing a raft to a place, and keeping it level, by the waves of a paddle.
 
     Actions: where the paddle is sent to, along x. Goal: where the middle of the raft shall be. The reward is
     -(x - x*)^2 / l^2 - 2 (1 - cos angle), with the goal x* and the length l of the raft.
@@ -190,7 +190,7 @@ class Raft(Task):
     free_solids: ClassVar[tuple[str, ...]] = ("raft",)
     goal_names: ClassVar[tuple[str, ...]] = ("x of the raft [m]",)
     length = 0.25
-    """Of the raft [m]."""
+    """Length of the raft [m]."""
     reach, lag = 0.05, 0.1
     """How far the paddle can be sent [m], and how it follows [s]."""
     actuators = (Position("paddle.displacement", (0.0, 0.0), (0,), (reach,), lag=lag),)
@@ -214,7 +214,7 @@ class Raft(Task):
 
 
 class Splash(Task):
-    """A dam breaks in a box that is shaken, until its water has the shape of the letter L.
+    """The task of shaking a box, in which a dam breaks, until its water has the shape of the letter L.
 
     Actions: the acceleration of the box along x and y, which its water feels as gravity that leans, and grows. Goal:
     where the left side of the stem is. The reward is the share of the water that is in the letter: in its foot along
@@ -249,7 +249,7 @@ class Splash(Task):
 
 @dataclass(frozen=True)
 class Letter:
-    """The boxes of the foot and of the stem, which have the area of the water."""
+    """A function from goals to the boxes of the letter's foot and stem, which together have the area of the water."""
 
     half: float
     """Side of the square that the water fills at first [m]."""
@@ -263,7 +263,7 @@ class Letter:
 
 
 class Stir(Task):
-    """Milk lies in a corner of a cup of coffee, and a spoon stirs until it is everywhere.
+    """The task of stirring milk in a corner of a cup of coffee until it is everywhere.
 
     Actions: where the spoon, a disc in the plane, is sent to. After Mixing of FluidLab (Xian et al. 2023), with its
     reward but for scale: the mean distance of all pairs of milk particles, component by component, over that of all
@@ -306,8 +306,8 @@ TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Latte, Pour, Ra
 
 
 def task_of(task: str | Task, size: str | None) -> Task:
-    """A task by its name, in a size, "small" if left out, or one of your own; raises `InputError` where there is none
-    of that name or size, and for a size of your own task."""
+    """Return the task of a name in a size ("small" if left out), or a user's `Task` itself; raises `InputError` for
+    unknown names and sizes, and for a size beside a `Task`."""
     if isinstance(task, Task):
         if size is not None:
             raise InputError(f"size is {shown(size)}, but must be left out, as the task is one of your own.")

@@ -26,12 +26,11 @@ from cortado.simulation import Simulation
 
 
 class Twin:
-    """The same scene, start and goal as an episode, as a loss of its actions (actions, a): minus the sum of the
-    rewards. Actions beyond -1 to 1 are cut off there, as in the environment, and have no derivative."""
+    """A loss of actions (actions, a) for one episode, with its scene, start and goal: minus the sum of rewards. Actions
+    beyond -1 to 1 are clipped, as in the environment, with derivative 0."""
 
     def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None):
-        """``number`` of the scene whose present episode it is; ``actions``: how many, at most as many as an episode
-        has, which is what is taken if left out."""
+        """Copy the present episode of scene ``number``; ``actions``: how many, by default those of a whole episode."""
         task, simulation = scenes.task, scenes.simulation
         count = whole_number("actions", task.horizon if actions is None else actions, 1)
         require_at_most("actions", count, task.horizon)
@@ -52,24 +51,24 @@ class Twin:
         """(actions, a)"""
 
     def named(self, actions: Any) -> Arrays:
-        """Actions by the names of the parameters that they drive."""
+        """Return actions by the names of the parameters that they drive."""
         parts = split(self._actuators, checked_actions("actions", actions, self.shape))
         return {one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}
 
     def value(self, actions: Any) -> float:
-        """Minus the return."""
+        """Return the loss of some actions: minus the sum of rewards."""
         return self.search.value(self.named(actions))
 
     def value_and_gradient(
         self, actions: Any, gradient: GradientEstimator | None = None
     ) -> tuple[float, NDArray[np.float64]]:
-        """The same, and its derivative (actions, a), by any estimator, `gradients.Exact` by default."""
+        """Return the loss and its derivative (actions, a), by any estimator, `gradients.Exact` by default."""
         value, found = self.search.value_and_gradient(self.named(actions), gradient)
         bar = np.concatenate([found[one.parameter] for one in self._actuators], axis=1)
         return value, np.where(np.abs(actions) <= 1.0, bar, 0.0)
 
     def in_jax(self, gradient: GradientEstimator | None = None) -> Any:
-        """The loss as a function of an array (actions, a) of JAX, which differentiates it: see `cortado.jax.value`."""
+        """Return the loss as a function of a JAX array (actions, a), differentiable there: see `cortado.jax.value`."""
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
@@ -80,7 +79,7 @@ class Twin:
         return lambda actions: loss(self._parameters(self._shaped(jnp.asarray(actions)).clip(-1.0, 1.0), contracted))
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
-        """The loss as a function of a tensor (actions, a) of PyTorch: see `cortado.torch.value`."""
+        """Return the loss as a function of a PyTorch tensor (actions, a): see `cortado.torch.value`."""
         from cortado.optimisation.layers.with_torch import torch
         from cortado.torch import value
 
@@ -91,7 +90,7 @@ class Twin:
         return lambda actions: loss(self._parameters(self._shaped(actions).clamp(-1.0, 1.0), contracted))
 
     def _shaped(self, actions: Any) -> Any:
-        """Actions of another library; raises `InputError` for another shape."""
+        """Return actions of another library unchanged; raises `InputError` for another shape."""
         shape = getattr(actions, "shape", None)
         if shape is None or tuple(shape) != self.shape:
             found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
@@ -99,7 +98,7 @@ class Twin:
         return actions
 
     def _parameters(self, u: Any, contracted: Any) -> dict[str, Any]:
-        """Of the scene, given actions of another library, and how it multiplies."""
+        """Return the scene's parameters under actions of another library, whose product is ``contracted``."""
         found, first = dict[str, Any](self._start), 0
         for one in self._actuators:
             last = first + len(one.axes)
@@ -124,7 +123,8 @@ Info = dict[str, Any]
 
 
 class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
-    """One scene. `gymnasium.make("cortado/Carry-v0")` makes it; see `docs/environments.md`."""
+    """A Gymnasium environment of one scene, as `gymnasium.make("cortado/Carry-v0")` makes; see
+    `docs/environments.md`."""
 
     metadata = METADATA
     instead = "but gymnasium.make makes the same one elsewhere, and reset with the same seed begins the same episode"
@@ -152,12 +152,11 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Where in an observation each of its parts is, by name."""
+        """Slices of an observation by the name of its parts."""
         return self.scenes.layout
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
-        """Begin an episode; the same seed has the same bits. Raises `InputError` for ``options``, of which there are
-        none."""
+        """Begin an episode; equal seeds give equal bits. Raises `InputError` for any ``options``."""
         if self._closed:
             raise InputError("reset is called after close(), but must come before it.")
         require_options(options)
@@ -168,9 +167,9 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), {}
 
     def step(self, action: NDArray) -> tuple[Observation, float, bool, bool, Info]:
-        """An action beyond -1 to 1 is cut off there. An episode is truncated after as many steps as its task has, or as
-        `gymnasium.make` was given as ``max_episode_steps``. Where the simulation diverges, the episode is terminated,
-        ``info["diverged"]`` says how in a sentence, and the observation is the last one before.
+        """Advance the episode by one action, clipped to -1 to 1. An episode is truncated after as many steps as its
+        task has, or as `gymnasium.make` was given as ``max_episode_steps``. Where the simulation diverges, the episode
+        is terminated, ``info["diverged"]`` says how in a sentence, and the observation is the last one before.
 
         Raises `InputError` for an action of another shape or that is not finite, and where no episode is going on."""
         if self._over:
@@ -185,21 +184,21 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         return self._observation.copy(), float(rewards[0]), bool(lost), truncated, info
 
     def close(self) -> None:
-        """No episode goes on, or begins, from now on."""
+        """End the episode for good: no other may begin."""
         self._closed, self._over = True, "after close()"
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture (rows, columns, 3) of the scene."""
+        """Return a picture (rows, columns, 3) of the scene."""
         return pictures(self.scenes)[0] if self.render_mode else None
 
     def twin(self, actions: int | None = None) -> Twin:
-        """The present episode from its beginning as a differentiable function of so many ``actions``, by default as
-        many as an episode has."""
+        """Return a differentiable copy of the present episode from its start, of so many ``actions``, by default
+        all."""
         return Twin(self.scenes, 0, actions)
 
 
 class FluidVectorEnv(Staying, VectorEnv):
-    """Scenes of one task as a batch (`docs/batches.md`): each has the bits of the single environment with its seed."""
+    """A Gymnasium vector environment: a batch of scenes, each with the bits of the single one with its seed."""
 
     instead = "but make_vec makes the same one elsewhere, and reset with the same seed begins the same episodes"
 
@@ -217,8 +216,8 @@ class FluidVectorEnv(Staying, VectorEnv):
         max_episode_steps: int | None = None,
     ):
         """``num_envs``: scenes in the batch; ``autoreset_mode`` as that of `gymnasium.vector.SyncVectorEnv`;
-        ``max_episode_steps``: after how many steps an episode is truncated, by default the horizon of the task. Others
-        as of `FluidEnv`."""
+        ``max_episode_steps``: after how many steps an episode is truncated, by default the horizon of the task. Other
+        arguments are those of `FluidEnv`."""
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
         try:
             self._mode = AutoresetMode(autoreset_mode)
@@ -240,13 +239,13 @@ class FluidVectorEnv(Staying, VectorEnv):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Where in an observation each of its parts is, by name."""
+        """Slices of an observation by the name of its parts."""
         return self.scenes.layout
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin episodes: all of them, or those of ``options={"reset_mask": (num_envs,) bool}``. A number as ``seed``
+        """Begin all episodes, or those that ``options={"reset_mask": (num_envs,) bool}`` chooses. A number as ``seed``
         gives environment b the seed + b."""
         require_options(options, "reset_mask")
         if self.closed:
@@ -271,9 +270,9 @@ class FluidVectorEnv(Staying, VectorEnv):
         return self._observations.copy(), {}
 
     def step(self, actions: NDArray) -> tuple[Observation, NDArray, NDArray, NDArray, Info]:
-        """As that of `FluidEnv`, for all. An episode that is over begins anew as the autoreset mode says: in the next
-        step, in the place of its action; in the same step, with what it ended with in ``infos["final_obs"]`` and
-        ``infos["final_info"]``; or only by `reset`."""
+        """Advance all episodes by actions (num_envs, a); see `FluidEnv.step`. An episode that is over begins anew as
+        the autoreset mode says. It does so in the next step, in the place of its action; in the same step, with what it
+        ended with in ``infos["final_obs"]`` and ``infos["final_info"]``; or only by `reset`."""
         if self.closed:
             raise InputError("step is called after close(), but must come before it.")
         actions = checked_actions("actions", actions, self._shape)
@@ -303,27 +302,27 @@ class FluidVectorEnv(Staying, VectorEnv):
         return self._observations.copy(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture (rows, columns, 3) of each scene."""
+        """Return a picture (rows, columns, 3) of each scene."""
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
     def twin(self, number: int, actions: int | None = None) -> Twin:
-        """As that of `FluidEnv`, of the environment with a number."""
+        """Return a differentiable copy of the episode of one environment; see `FluidEnv.twin`."""
         return Twin(self.scenes, number, actions)
 
     def _begin(self, which: NDArray) -> dict[int, Start]:
-        """Begin new episodes of some environments, (num_envs,) bool."""
+        """Begin new episodes in the environments that a mask (num_envs,) chooses, and return their starts."""
         starts = {b: self.scenes.drawn(self._generators[b]) for b in np.flatnonzero(which).tolist()}
         self.scenes.begin(starts)
         self._over = self._over & ~which
         return starts
 
     def _observe(self, which: NDArray) -> None:
-        """Observe some environments; of others the last observation stays."""
+        """Observe the environments that a mask (num_envs,) chooses; others keep their last observation."""
         self._observations = np.where(which[:, None], self.scenes.observed(), self._observations)
 
 
 def spaces(scenes: Scenes) -> tuple[Any, Any]:
-    """Of the observations and of the actions of one environment."""
+    """Return the Gymnasium spaces of one environment's observations and actions."""
     seen = scenes.observed().shape[1]
     actions = sum(len(one.axes) for one in scenes.task.actuators)
     everything = gymnasium.spaces.Box(-np.inf, np.inf, (seen,), np.float32)
@@ -331,14 +330,14 @@ def spaces(scenes: Scenes) -> tuple[Any, Any]:
 
 
 def checked_render_mode(mode: str | None) -> str | None:
-    """Raises `InputError` for one that there is not."""
+    """Return a render mode; raises `InputError` unless it is None or "rgb_array"."""
     if mode not in (None, *METADATA["render_modes"]):
         raise InputError(f'render_mode is {shown(mode)}, but must be None or "rgb_array".')
     return mode
 
 
 def require_options(options: Any, *known: str) -> None:
-    """Raises `InputError` for options of a reset that are no table, or that have others than the known ones."""
+    """Raise `InputError` for options of a reset that are no table, or that have unknown names."""
     require_table("options", options or {}, "{'reset_mask': array of bool}")
     for name in options or {}:
         if name not in known:
@@ -347,7 +346,7 @@ def require_options(options: Any, *known: str) -> None:
 
 
 def pictures(scenes: Scenes) -> list[NDArray[np.uint8]]:
-    """(HEIGHT, WIDTH, 3) of each scene."""
+    """Render a picture (HEIGHT, WIDTH, 3) of each scene."""
     simulation, found = scenes.simulation, []
     fields = scenes.state.arrays.numpy(simulation.dimension)
     own = ("positions", "velocities", "mass_fractions")

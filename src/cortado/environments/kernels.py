@@ -14,9 +14,9 @@ FAR = wp.constant(1.0e30)
 
 @cache
 def environment_kernels(precision: Precision) -> Any:
-    """In one precision, by name; values to be added up are in float64. ``per`` is the number of particles of a scene,
-    ``factor`` (scenes,) what a derivative is multiplied by; the ``period`` begins at ``origin`` [m], and is 0 along
-    axes without one, as its ``frequency`` [1/m]."""
+    """Return the kernels of observations and rewards in one precision, by name; they write float64 values to be summed.
+    ``per``: particles of a scene; ``factor`` (scenes,) scales derivatives; a ``period`` from ``origin`` [m], and its
+    ``frequency`` [1/m], are 0 along axes without one."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"environments_{precision.name}")
 
@@ -26,7 +26,7 @@ def environment_kernels(precision: Precision) -> Any:
 
     @wp.func
     def shortest(r: vector, period: vector, frequency: vector):
-        """The way to the nearest image."""
+        """Return a difference of positions, shortened to the nearest periodic image."""
         return r - wp.cw_mul(rounded(wp.cw_mul(r, frequency)), period)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -41,7 +41,7 @@ def environment_kernels(precision: Precision) -> Any:
         # out
         seen: wp.array(dtype=wp.float32, ndim=4),
     ):
-        """Positions and velocities of some particles."""
+        """Write positions, wrapped into the period, and velocities of some particles."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
         lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
@@ -63,8 +63,8 @@ def environment_kernels(precision: Precision) -> Any:
         lower: wp.array2d(dtype=vector),
         upper: wp.array2d(dtype=vector),
     ):
-        """From where boxes are fixed to the image of a particle that is nearest to one, in their frame, and to it from
-        the nearest point of the nearest box."""
+        """Return the place of a particle's image in the frame of the boxes, and the vector to it from the nearest point
+        of the nearest box."""
         place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
             middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
@@ -91,8 +91,8 @@ def environment_kernels(precision: Precision) -> Any:
         # out
         value: wp.array(dtype=wp.float64),
     ):
-        """1 / (1 + e^2 / w^2), where e is the distance of a particle to the nearest of some boxes, which may be fixed
-        to a solid in the plane."""
+        """Write 1 / (1 + e^2 / w^2) for each particle, with its distance e to the nearest of some boxes, which may be
+        fixed to a solid in the plane."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -135,8 +135,8 @@ def environment_kernels(precision: Precision) -> Any:
         # out
         value: wp.array2d(dtype=wp.float64),
     ):
-        """For each of some particles, its distances to the nearest images of all of them, component by component, added
-        up."""
+        """Write for each of some particles the sum of its distances |dx| + |dy| + |dz| to all of them, by the nearest
+        images."""
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
@@ -177,7 +177,7 @@ def environment_kernels(precision: Precision) -> Any:
         # out
         value: wp.array(dtype=wp.float64),
     ):
-        """Squared distance of a particle to a target of its own, times a weight; targets change from step to step."""
+        """Write each particle's weighted squared distance to its own target; targets change from step to step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]

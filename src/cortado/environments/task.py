@@ -36,38 +36,38 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 FINENESS = {"small": 1, "large": 3}
-"""By how much finer a scene of a size is: so many times more particles along each axis, and shorter steps."""
+"""Factor of refinement by size: so many times more particles along each axis, and steps shorter by it."""
 JITTER = 0.02
 """Standard deviation of the noise of first positions, in spacings."""
 
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """Drives some components of one parameter over time. Within a step of the environment its command goes evenly from
-    the former one to ``greatest`` times the action, so that nothing jumps."""
+    """A driver of some components of one parameter over time. In a step of the environment its command moves linearly
+    from the last one to ``greatest`` times the action, without jumps."""
 
     parameter: str
-    """Its name, such as "cup.displacement"."""
+    """Name of the driven parameter, such as "cup.displacement"."""
     rest: tuple[float, ...]
-    """(d,) The parameter before any action; a single entry where it is a number."""
+    """Value (d,) of the parameter before any action; a single entry where it is a number."""
     axes: tuple[int, ...]
-    """(a,) Which components are driven."""
+    """Indices (a,) of the driven components."""
     greatest: tuple[float, ...]
-    """(a,) The command of an action of 1."""
+    """Commands (a,) for an action of 1."""
     is_number: bool = False
-    """Whether the parameter is a number at each step, as a turn in the plane is."""
+    """True if the parameter is a number at each step, as a turn in the plane is."""
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """(..., a) the driven components after a step of the simulation."""
+        """Return the driven components (..., a) after a step of the simulation."""
 
     def at_rest(self, members: int) -> NDArray:
-        """(members, 2, a) the driven components, and the commands, before any action."""
+        """Return the driven components and the commands before any action, (members, 2, a)."""
         return np.zeros((members, 2, len(self.axes)))
 
     def advance(self, now: NDArray, u: NDArray, steps: int, time_step: float) -> tuple[NDArray, NDArray]:
-        """From `at_rest` or what this returned, and actions (members, a), to the same after so many steps of the
-        simulation, and the parameter after each of them, (members, steps, d) or (members, steps)."""
+        """Return the components and commands (members, 2, a) after so many steps under actions ``u`` (members, a), and
+        the parameter after each step, (members, steps, d) or (members, steps)."""
         driven, last = [now[:, 0]], now[:, 1]
         wanted = np.array(self.greatest) * u
         for j in range(steps):
@@ -75,14 +75,14 @@ class Actuator(ABC):
         return np.stack([driven[-1], wanted], axis=1), self.value(np.stack(driven[1:], axis=1))
 
     def value(self, q: NDArray) -> NDArray:
-        """(..., d) or (...) the parameter, given the driven components (..., a)."""
+        """Return the parameter, (..., d) or (...), given its driven components (..., a)."""
         found = np.tile(np.array(self.rest, dtype=np.float64), (*q.shape[:-1], 1))
         found[..., self.axes] += q
         return found[..., 0] if self.is_number else found
 
     def over(self, actions: int, steps: int, time_step: float) -> Affine:
-        """The parameter over so many actions, each of so many steps of the simulation, as a function of the actions
-        (actions, a)."""
+        """Return the parameter as an affine function of actions (actions, a), each held for ``steps`` steps of the
+        simulation."""
         a = len(self.axes)
         units = np.concatenate([np.zeros((1, actions, a)), np.eye(actions * a).reshape(-1, actions, a)])
         now, parts = self.at_rest(len(units)), []
@@ -95,7 +95,7 @@ class Actuator(ABC):
 
 @dataclass(frozen=True)
 class Velocity(Actuator):
-    """Actions are velocities: q' = c, with ``greatest`` in m/s or rad/s."""
+    """An actuator whose actions are velocities: q' = c, with ``greatest`` in m/s or rad/s."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step * command
@@ -103,10 +103,10 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """Actions are places, or any other value, that is approached with a lag: q' = (c - q) / lag."""
+    """An actuator whose actions are places, or other values, approached with a lag: q' = (c - q) / lag."""
 
     lag: float = 0.1
-    """[s]"""
+    """Time constant of the approach [s]."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step / self.lag * (command - q)
@@ -114,7 +114,7 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """In the plane, of two sizes."""
+    """A task of control in the plane: a scene, its actuators, rewards and goals, in a small or a large size."""
 
     size: str = "small"
     """"small", 100 to 200 particles for a processor, or "large", with nine times as many, for a GPU."""
@@ -122,17 +122,17 @@ class Task(ABC):
     horizon: ClassVar[int]
     """Steps of the environment after which an episode is truncated."""
     repeats: ClassVar[int]
-    """Steps of the small simulation in one of the environment."""
+    """Steps of the small simulation in one step of the environment."""
     coarse_spacing: ClassVar[float]
-    """Of the small size [m]."""
+    """Particle spacing of the small size [m]."""
     coarse_step: ClassVar[float]
     """Time step of the small size [s]."""
     lowest: ClassVar[float]
-    """No step is rewarded with less: what a diverged episode gets for each step that it lacks."""
+    """Least reward of a step, which a diverged episode gets for each step that it lacks."""
     free_solids: ClassVar[tuple[str, ...]] = ()
-    """Names of those that the fluid moves, which are observed."""
+    """Names of the solids that the fluid moves, which are observed."""
     goal_names: ClassVar[tuple[str, ...]] = ()
-    """What the numbers of a goal are, with their units."""
+    """Descriptions of the numbers of a goal, with their units."""
 
     def __post_init__(self) -> None:
         if self.size not in FINENESS:
@@ -140,7 +140,7 @@ class Task(ABC):
 
     @property
     def spacing(self) -> float:
-        """[m]"""
+        """Particle spacing of the scene [m]."""
         return self.coarse_spacing / FINENESS[self.size]
 
     @property
@@ -150,7 +150,7 @@ class Task(ABC):
 
     @property
     def substeps(self) -> int:
-        """Steps of the simulation in one of the environment."""
+        """Steps of the simulation in one step of the environment."""
         return self.repeats * FINENESS[self.size]
 
     @property
@@ -161,7 +161,7 @@ class Task(ABC):
     @property
     @abstractmethod
     def actuators(self) -> tuple[Actuator, ...]:
-        """What actions move; the numbers of an action are theirs, in this order."""
+        """Actuators, in the order of the numbers of an action."""
 
     @property
     def driven(self) -> list[str]:
@@ -170,15 +170,15 @@ class Task(ABC):
 
     @abstractmethod
     def reward(self, simulation: Simulation) -> Reward:
-        """Of a step, given a simulation of the scene."""
+        """Return the reward function of a step, given a simulation of the scene."""
 
     @property
     def goals(self) -> tuple[NDArray, NDArray]:
-        """(g,), (g,) bounds within which goals of episodes are drawn."""
+        """Lower and upper bounds (g,) within which goals of episodes are drawn."""
         return np.zeros(0), np.zeros(0)
 
     def scene_of(self, **tables: Any) -> Scene:
-        """A scene with what all have in common."""
+        """Make a scene from tables and the settings that all sizes of the task share."""
         common: dict[str, Any] = {
             "name": self.name,
             "discretisation": {"spacing": self.spacing},
@@ -188,7 +188,7 @@ class Task(ABC):
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Actions of a shape, cut off at -1 and 1; raises `InputError` for another shape and for what is not finite."""
+    """Return actions clipped to -1 and 1; raises `InputError` for another shape and for values that are not finite."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")
@@ -198,29 +198,28 @@ def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np
 
 
 def split(actuators: Sequence[Actuator], actions: NDArray) -> list[NDArray]:
-    """Of actions (..., a), those of each actuator."""
+    """Split actions (..., a) into one array for each actuator."""
     return np.split(actions, np.cumsum([len(one.axes) for one in actuators])[:-1], axis=-1)
 
 
 LANES = 1
-"""What is fastest for the large batches that environments are made for, and the same in small ones, so that a scene has
-the same bits in all."""
+"""Lanes per particle, fastest for large batches; small ones use as many, which keeps a scene's bits equal in all."""
 SEEN = 32
-"""Particles that are observed, if not said otherwise."""
+"""Number of observed particles by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """How the episode of a scene begins."""
+    """The start of an episode of one scene: positions and a goal."""
 
     positions: NDArray
-    """(n, d) of the particles [m]"""
+    """Positions (n, d) of the particles [m]."""
     goal: NDArray
-    """(g,)"""
+    """Goal (g,) of the episode."""
 
 
 class Scenes:
-    """Scenes that are stepped together, each in an episode of its own."""
+    """A batch of scenes of one task that are stepped together, each in an episode of its own."""
 
     def __init__(
         self,
@@ -231,7 +230,7 @@ class Scenes:
         seen: int,
         sensors: Mapping[str, Sensor] | None = None,
     ):
-        """``seen``: how many particles are observed, at most all."""
+        """Make ``scenes`` scenes; ``seen``: how many particles are observed, at most all."""
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
         self.simulation = Simulation(task.scene, device, precision, batch=scenes, lanes=LANES)
@@ -266,7 +265,7 @@ class Scenes:
         return len(self.step_number)
 
     def drawn(self, generator: np.random.Generator) -> Start:
-        """The start of an episode: noise on the first positions, and a goal."""
+        """Draw the start of an episode: first positions with noise, and a goal."""
         noise = generator.standard_normal(self.simulation.positions.shape)
         return Start(self.simulation.positions + self._jitters * noise, generator.uniform(*self.task.goals))
 
@@ -292,8 +291,8 @@ class Scenes:
         self.state = DeviceState(arrays, tuple(scenes))
 
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
-        """Step all scenes with actions (scenes, a) from -1 to 1; returns the rewards (scenes,), and what happened to
-        scenes that diverged, by their number. Such a scene has to begin anew before the next step."""
+        """Step all scenes with actions (scenes, a) from -1 to 1, and return the rewards (scenes,) and, by number, a
+        sentence on each scene that diverged; it has to begin anew before the next step."""
         self.advance(actions)
         rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
@@ -305,7 +304,7 @@ class Scenes:
         return rewards, lost
 
     def advance(self, actions: NDArray) -> None:
-        """The steps of the simulation in a step of the environment."""
+        """Take the steps of the simulation that make one step of the environment."""
         task, rows = self.task, {}
         for k, (one, u) in enumerate(zip(task.actuators, split(task.actuators, actions), strict=True)):
             self._now[k], rows[one.parameter] = one.advance(self._now[k], u, task.substeps, task.time_step)
@@ -316,7 +315,7 @@ class Scenes:
 
     @property
     def parts(self) -> dict[str, NDArray]:
-        """What is observed of each scene, by name, with a first axis for the scenes: see `docs/environments.md`."""
+        """Observed arrays by name, with a first axis for the scenes: see `docs/environments.md`."""
         arrays, task = self.state.arrays, self.task
         now = {one.parameter: own for one, own in zip(task.actuators, self._now, strict=True)}
         free = {name: self._free(arrays, name) for name in task.free_solids}
@@ -326,24 +325,24 @@ class Scenes:
 
     @property
     def _driven(self) -> dict[str, NDArray]:
-        """The parameters that actions drive, as they are (scenes, 1, ...)."""
+        """Present values of the parameters that actions drive, (scenes, 1, ...) by name."""
         each = zip(self.task.actuators, self._now, strict=True)
         return {one.parameter: one.value(now[:, None, 0]) for one, now in each}
 
     def observed(self) -> NDArray[np.float32]:
-        """(scenes, k) all of that; of scenes that have diverged it means nothing."""
+        """Return all observations (scenes, k) as float32; rows of diverged scenes are meaningless."""
         flat = [np.reshape(part, (len(self), -1)) for part in self.parts.values()]
         return np.concatenate(flat, axis=1, dtype=np.float32, casting="same_kind")
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Where in an observation each of its parts is."""
+        """Slices of an observation by the name of its parts."""
         ends = np.cumsum([0, *(part[0].size for part in self.parts.values())]).tolist()
         return {name: slice(*ends[k : k + 2]) for k, name in enumerate(self.parts)}
 
     @WARP
     def _particles(self, state: State) -> NDArray[np.float32]:
-        """(scenes, seen, 2, d)"""
+        """Return positions and velocities of the observed particles, (scenes, seen, 2, d)."""
         x, dimension = state.positions, self.simulation.dimension
         shape = len(self), len(self._seen), 2, dimension
         if not len(self._seen):
@@ -357,7 +356,7 @@ class Scenes:
         return seen.numpy()
 
     def _read(self, state: State) -> dict[str, NDArray]:
-        """(scenes, k) of each sensor. Parameters are those of the last step, but for those that actions drive."""
+        """Return the readings (scenes, k) of each sensor by name, with present driven parameters."""
         if not self._sensors:
             return {}
         if self._lost:  # so that all are numbers
@@ -373,7 +372,7 @@ class Scenes:
         return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}
 
     def _free(self, state: State, name: str) -> NDArray:
-        """(scenes, 7) of a free body the place, the cosine and the sine of its turn, the velocity and the rate."""
+        """Return for a free body (scenes, 7): place, cosine and sine of its turn, velocity and angular velocity."""
         fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
         place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
         rate = state[angular_velocity_name(name)].numpy()[:, None]
@@ -382,7 +381,7 @@ class Scenes:
 
 
 def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
-    """Sensors by names that are not ``taken``; raises `InputError` for anything else."""
+    """Return sensors by name; raises `InputError` for names that are ``taken`` and for anything but sensors."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):

@@ -26,53 +26,53 @@ class StepEnd:
     """The states of all scenes after a step of the environment."""
 
     state: State
-    """(scenes n,)"""
+    """Fields of all particles, (scenes n,)."""
     goal: NDArray
-    """(scenes, g) what each scene is to reach."""
+    """Goals (scenes, g) of the scenes."""
     step: NDArray
-    """(scenes,) which step of its episode it is, counted from 1."""
+    """Number of the step in each scene's episode (scenes,), counted from 1."""
     domain: Domain = WITHOUT_PERIODS
-    """Along which axes the scene repeats."""
+    """Periodic axes of the scene."""
 
     @property
     def scenes(self) -> int:
-        """How many there are."""
+        """Number of scenes."""
         return len(self.step)
 
     @property
     def per(self) -> int:
-        """Particles of a scene."""
+        """Number of particles of a scene."""
         return len(self.state.positions) // self.scenes
 
     @property
     def period(self) -> dict[str, Any]:
-        """``period`` and ``frequency``, as kernels take them."""
+        """Period and frequency of the periodic axes, as arguments for kernels."""
         _, period, frequency = self.domain.vectors(precision_of(self.state).vector)
         return {"period": period, "frequency": frequency}
 
 
 class Term(Protocol):
-    """A part of a reward."""
+    """Protocol of a part of a reward: a number for each scene, with its derivative."""
 
     def values(self, at: StepEnd) -> NDArray:
-        """(scenes,)"""
+        """Return the value of the term for each scene, (scenes,)."""
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        """Add the derivative times ``factor`` (scenes,) to an adjoint of the states."""
+        """Add ``factor`` (scenes,) times the term's derivative to an adjoint of the states."""
 
 
 Boxes = Callable[[NDArray], tuple[NDArray, NDArray]]
-"""From goals (scenes, g) to lower and upper corners (scenes, boxes, d) [m]."""
+"""A function from goals (scenes, g) to lower and upper corners of boxes (scenes, boxes, d) [m]."""
 
 
 @dataclass(frozen=True)
 class OneBox:
-    """The same box, whatever the goal."""
+    """A function from goals to boxes that returns one fixed box for every goal."""
 
     lower: tuple[float, ...]
-    """[m]"""
+    """Lower corner [m]."""
     upper: tuple[float, ...]
-    """[m]"""
+    """Upper corner [m]."""
 
     def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
         lower, upper = (np.tile(corner, (len(goal), 1, 1)) for corner in (self.lower, self.upper))
@@ -80,18 +80,18 @@ class OneBox:
 
 
 class OverParticles:
-    """A term that is a sum over particles, of a kernel whose derivative has its name and ``_adjoint``."""
+    """A reward term that sums a kernel over particles; the kernel's derivative has its name with ``_adjoint``."""
 
     kernel: str
 
     def __init__(self, *given: Any):
-        """``given``: what it is made from."""
+        """Store the arguments of the constructor, for copies and pickles."""
         self._given = given
         self._made: dict[Any, Any] = {}
         """Sums, and arrays on devices."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the term as its constructor's arguments."""
         return type(self), self._given
 
     def values(self, at: StepEnd) -> NDArray:
@@ -102,7 +102,7 @@ class OverParticles:
         return total(value.flatten()).numpy() / self._over(at)
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
-        """``others``: what the kernel of the derivative writes besides ``x_bar``."""
+        """Add ``factor`` times the derivative to ``bar``; ``others``: further arrays that the kernel writes."""
         scaled = _reals(at, factor / self._over(at))
         self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
 
@@ -112,19 +112,19 @@ class OverParticles:
         launch(getattr(kernels, name), self._threads(at), x.device, **own, **arguments)
 
     def _threads(self, at: StepEnd) -> tuple[int, ...]:
-        """One for each particle, unless said otherwise."""
+        """Return the shape of the kernel's launch: one thread for each particle by default."""
         return (at.scenes * at.per,)
 
     def _over(self, at: StepEnd) -> float:
-        """What the sum is divided by."""
+        """Return the divisor of the sum."""
         return 1.0
 
     def _arguments(self, at: StepEnd) -> dict[str, Any]:
-        """The arguments that the forward and the adjoint kernel share."""
+        """Return the arguments that the forward and the adjoint kernel share."""
         raise NotImplementedError
 
     def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
-        """What is made once for a device, a precision and a number of scenes."""
+        """Return an object made once for each device, precision and number of scenes."""
         key = key, str(at.state.positions.device), at.state.positions.dtype, at.scenes
         if key not in self._made:
             self._made[key] = make()
@@ -132,14 +132,13 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """The share of the fluid that is in some boxes, each particle counted by 1 / (1 + e^2 / w^2), where e is the
-    distance of its nearest image to the nearest box: 1 within, a half at the distance w, so that there is a gradient
-    everywhere."""
+    """A reward term: the share of the fluid in some boxes. Each particle counts 1 / (1 + e^2 / w^2) at the distance e
+    of its nearest image to the nearest box: 1 within, a half at w, with a gradient everywhere."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """``width`` w [m]; ``solid``: on whose middle boxes are placed, and with which they turn, in the plane."""
+        """Set the boxes and the width w [m]; with a ``solid``, boxes move and turn with its middle, in the plane."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -165,13 +164,13 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """The mean distance of all pairs of some particles, component by component, |dx| + |dy|, over ``everywhere``;
-    along a periodic axis to the nearest image."""
+    """A reward term: the mean distance |dx| + |dy| of all pairs of some particles, over ``everywhere``; along a
+    periodic axis to the nearest image."""
 
     kernel = "apart"
 
     def __init__(self, chosen: NDArray, everywhere: float):
-        """``chosen`` (m,) numbers of particles; ``everywhere`` [m]."""
+        """Set the indices ``chosen`` (m,) of particles, and the length ``everywhere`` [m] that divides the mean."""
         super().__init__(chosen, everywhere)
         self._chosen, self._pairs = chosen, len(chosen) ** 2 * everywhere
 
@@ -188,7 +187,8 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """The squared distances of particles to targets that change from step to step, each times a weight, added up.
+    """A reward term: the weighted sum of squared distances of particles to targets that change from step to step.
+    Targets go on beyond a period as positions do, so a lap too many counts.
 
     Targets go on beyond the end of a period, as positions do: a lap too many is a distance.
     """
@@ -196,7 +196,7 @@ class Missed(OverParticles):
     kernel = "missed"
 
     def __init__(self, targets: NDArray, weights: NDArray):
-        """``targets`` (steps, n, d) [m], those of step k, counted from 1, at k - 1; ``weights`` (steps, n)."""
+        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n), with step k, counted from 1, at index k - 1."""
         super().__init__(targets, weights)
         self._targets, self._weights = targets, weights
 
@@ -209,7 +209,7 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Distance:
-    """|x - x*| [m]: how far the middle of a solid is from its goal along the first axis."""
+    """A reward term: the distance |x - x*| [m] of a solid's middle from its goal along the first axis."""
 
     solid: str
 
@@ -222,12 +222,12 @@ class Distance:
 
 @dataclass(frozen=True)
 class Pose:
-    """(x - x*)^2 / l^2 + 2 (1 - cos angle) of a free body in the plane: how far it is from its goal along the first
-    axis, and how far from level."""
+    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), its distance from the goal along
+    the first axis and its lean."""
 
     solid: str
     length: float
-    """l [m]"""
+    """Length l of the body [m]."""
 
     def values(self, at: StepEnd) -> NDArray:
         turned = sum(_numbers(at.state, name)[:, axis] for axis, name in self._axes)
@@ -241,26 +241,26 @@ class Pose:
 
     @property
     def _axes(self) -> list[tuple[int, str]]:
-        """Fields of how far the ends of its axes have moved, of which these components are cos angle - 1."""
+        """Fields of the displaced ends of the body's axes, with the component of each that is cos angle - 1."""
         return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
 
 
 @dataclass(frozen=True)
 class Reward:
-    """A constant, and terms times their weights."""
+    """The reward of a step: a constant plus weighted terms."""
 
     terms: tuple[tuple[float, Term], ...]
     constant: float = 0.0
     domain: Domain = WITHOUT_PERIODS
-    """Along which axes the scene repeats."""
+    """Periodic axes of the scene."""
 
     def at(self, state: State, goal: NDArray, step: NDArray) -> StepEnd:
-        """What it is a function of: the states of all scenes, with ``goal`` and ``step`` as of `StepEnd`."""
+        """Return the argument of the reward: the states of all scenes with their goals and step numbers."""
         return StepEnd(state, goal, step, self.domain)
 
     @WARP
     def values(self, at: StepEnd) -> NDArray:
-        """(scenes,)"""
+        """Return the reward of each scene, (scenes,)."""
         found = np.full(at.scenes, self.constant)
         for weight, term in self.terms:
             found += weight * term.values(at)
@@ -268,7 +268,7 @@ class Reward:
 
     @WARP
     def adjoint(self, at: StepEnd, factor: float) -> State:
-        """The derivative of the reward with respect to the state, times ``factor``."""
+        """Return ``factor`` times the derivative of the reward with respect to the state."""
         bar, each = at.state.like(), np.full(at.scenes, factor)
         for weight, term in self.terms:
             term.adjoint(at, weight * each, bar)
@@ -281,13 +281,13 @@ class MinusReward:
 
     reward: Reward
     goal: NDArray
-    """(scenes, g), or (1, g) for all of them"""
+    """Goals (scenes, g), or (1, g) for all scenes."""
     step: int
-    """Which step of the episode it is, counted from 1."""
+    """Number of the step in the episode, counted from 1."""
 
     @property
     def fingerprint(self) -> str:
-        """Tells one step from another, for checkpoints."""
+        """Text that tells losses of different steps apart, for checkpoints."""
         return f"{[(weight, type(term).__name__) for weight, term in self.reward.terms]} {self.goal} {self.step}"
 
     def value(self, end: Snapshot) -> float:
@@ -297,11 +297,11 @@ class MinusReward:
         return self.value(end), self.reward.adjoint(self._at(end), -1.0)
 
     def values(self, end: SnapshotBatch) -> NDArray:
-        """See `losses.batch.BatchedLoss`."""
+        """Return the loss of each scene; see `losses.batch.BatchedLoss`."""
         return -self.reward.values(self._at(end))
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[NDArray, State]:
-        """See `losses.batch.BatchedLoss`."""
+        """Return the loss of each scene and the adjoint of the states; see `losses.batch.BatchedLoss`."""
         return self.values(end), self.reward.adjoint(self._at(end), -1.0)
 
     def _at(self, end: Any) -> StepEnd:
@@ -311,7 +311,7 @@ class MinusReward:
 
 
 def _miss(at: StepEnd, solid: str) -> NDArray:
-    """(scenes,) from the goal to the middle of a solid along the first axis, the shorter way around a period [m]."""
+    """Return the offset (scenes,) [m] of a solid's middle from its goal along axis 0, the shorter way around."""
     return apart(_numbers(at.state, position_name(solid))[:, :1] - at.goal[:, :1], at.domain.lengths[:1])[:, 0]
 
 
@@ -320,18 +320,18 @@ def _reals(at: StepEnd, values: NDArray) -> wp.array:
 
 
 def _vectors(at: StepEnd, values: NDArray) -> wp.array:
-    """A Warp array of vectors with three components, from numbers (..., d)."""
+    """Return numbers (..., d) as a Warp array of vectors with three components."""
     return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
         values.shape[:-1]
     )
 
 
 def _numbers(state: State, name: str) -> NDArray:
-    """A field with an entry for each scene, in float64."""
+    """Return a field with one entry per scene as a float64 NumPy array."""
     return state[name].numpy().astype(np.float64)
 
 
 def _add(bar: State, name: str, values: NDArray) -> None:
-    """Vectors (scenes, d) to a field with one for each scene."""
+    """Add vectors (scenes, d) to a field with one entry per scene."""
     field = bar[name]
     add(wp.array(padded(values), dtype=field.dtype, device=field.device), field)

@@ -30,12 +30,12 @@ OTHERS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-"""Kinds of files that are no regular ones, with their names in a sentence."""
+"""Tests for kinds of files that are not regular, with their names in a sentence."""
 
 
 def as_path(what: str, value: Any) -> str:
-    """A path as text, or an `InputError` in a sentence that begins with ``what``; a number is none, though Python opens
-    it as a file that is already open."""
+    """Return a path as text; raises `InputError` for anything else, also for a number, which Python would take as an
+    open file."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
         if isinstance(path, str) and path:
@@ -44,7 +44,8 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """The size and times of a file that may be read; links are followed.
+    """Return size and times of a file that may be read, with links followed. Raises `OSError` with a reason in words if
+    it is no regular file or has more than ``most`` bytes.
 
     Raises `OSError`, whose ``strerror`` says why in words, if it is no regular file, or has more bytes than ``most``.
     """
@@ -61,7 +62,7 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
 
 
 def content(path: str | os.PathLike[str], most: int) -> bytes:
-    """The bytes of a regular file; raises `OSError` as `regular_file` does."""
+    """Return the bytes of a regular file; raises `OSError` as `regular_file` does."""
     regular_file(path, most)
     with open(path, "rb") as file:
         found = file.read(most + 1)
@@ -71,7 +72,7 @@ def content(path: str | os.PathLike[str], most: int) -> bytes:
 
 
 def reason(problem: BaseException) -> str:
-    """Why a file could not be read, on one line, for a sentence."""
+    """Return the reason why a file could not be read, on one line."""
     text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
     return " ".join(text.split()).rstrip(".")
 
@@ -81,11 +82,11 @@ def _too_large(size: int, most: int) -> OSError:
 
 
 MOST_BYTES = 2**28
-"""The largest table in CSV that is read."""
+"""Greatest size in bytes of a CSV table that is read."""
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """The columns of a table in CSV, (lines,) by the names in its first line; an entry that is left out is NaN. Raises
+    """Return the columns of a CSV table, (lines,) by the names in its first line; an empty entry is NaN. Raises
     `InputError` for a file that is no such table."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
@@ -122,7 +123,7 @@ SCHEMA = _PACKAGE / "scene.schema.json"
 
 
 def examples_folder() -> Path:
-    """The folder of examples, in the package where a wheel was installed, or in the repository."""
+    """Return the folder of examples: in an installed package, or in the repository."""
     installed = _PACKAGE / "examples"
     return installed if installed.is_dir() else _PACKAGE.parents[1] / "examples"
 
@@ -134,7 +135,7 @@ _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def unfinished(path: Path) -> Path:
-    """A name beside `path` that nobody can guess; open it with "x", which follows no links."""
+    """Return an unguessable temporary name beside `path`; open it with "x", which follows no links."""
     return path.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
 
 
@@ -160,8 +161,8 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Whether something of that name is there, also a link that leads nowhere. Raises `InputError` where nothing can be
-    looked for, as with a name that is too long."""
+    """Test if anything exists at a path, also a link that leads nowhere. Raises `InputError` where the test is
+    impossible, as with a name that is too long."""
     with sentences(path):
         try:
             path.lstat()
@@ -171,14 +172,14 @@ def is_taken(path: Path) -> bool:
 
 
 def write_fully(file: Any, content: bytes) -> None:
-    """Writes to a file without a buffer, which may take a part at a time."""
+    """Write all bytes to an unbuffered file, which may accept a part at a time."""
     rest = memoryview(content)
     while rest:
         rest = rest[file.write(rest) :]
 
 
 def parsed_json(text: bytes) -> Any:
-    """The value of a text in JSON; raises `ValueError`, also for one that is nested too deeply."""
+    """Return the value of a JSON text; raises `ValueError`, also for nesting too deep."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -187,7 +188,7 @@ def parsed_json(text: bytes) -> Any:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Within it, errors of the disk become errors with a sentence about this file or folder.
+    """Turn errors of the disk in the block into errors with a sentence about this file or folder.
 
     Raises:
         ComputationError: the disk is full or broken.
@@ -205,11 +206,11 @@ def sentences(path: Path) -> Iterator[None]:
 
 
 BEYOND = 2**30
-"""The byte that Windows locks, far behind what the file holds, which others may then read."""
+"""Offset of the byte that Windows locks, far behind the file's content, which others may thus read."""
 
 
 def lock(file: int) -> None:
-    """Lock a file by its descriptor, until it is closed or its process dies; raises `BlockingIOError` where another
+    """Lock a file by its descriptor, until it is closed or its process dies; raises `BlockingIOError` if another
     process has it. The package filelock does not tell who has a lock, which `locked` reads in the file."""
     if sys.platform != "win32":
         import fcntl
@@ -227,13 +228,13 @@ def lock(file: int) -> None:
 
 
 LOCK = ".lock"
-"""Name of the file that is locked; it is there while a process writes the folder, or was killed."""
+"""Name of the locked file in a folder; it exists while a process writes the folder, or after it was killed."""
 _NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Makes the folder, and refuses it to every other process until the block ends.
+    """Make a folder, and lock it against every other process until the block ends.
 
     The system takes the lock from a process that dies, so that none is left behind. On file systems without
     locks, as some networks have them, folders are not protected.
@@ -255,7 +256,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _open_locked(path: Path) -> int:
-    """The file descriptor of the locked file, which names this process."""
+    """Open and lock a folder's lock file, write this process into it, and return its descriptor."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
@@ -285,7 +286,7 @@ def _lock(file: int, folder: Path) -> None:
 
 
 def _is_at(path: Path, file: int) -> bool:
-    """Whether a path still names the open file, which another process may have removed as it ended."""
+    """Test if a path still names the open file, which another process may have removed as it ended."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(file))
     except FileNotFoundError:

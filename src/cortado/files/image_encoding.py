@@ -22,16 +22,16 @@ from cortado.files.disk import sentences, unfinished, write_atomically
 from cortado.files.interruption import held
 
 ROWS = 32
-"""Rows of a picture that are converted at a time, so that they stay in the processor's cache."""
+"""Number of rows of a picture converted at a time, few enough for the processor's cache."""
 MOST_LIGHT = 2.0
-"""The largest value of a picture of a user, as noise may leave 0 to 1: more is taken for values of a file, to 255."""
+"""Greatest value of a user's picture, as noise may leave 0 to 1; above it, values are taken for bytes to 255."""
 STEPS = 1 << 14
-"""Equal parts of the light from 0 to 1, each much shorter than the light that has one of 256 values."""
+"""Number of equal parts of the light from 0 to 1, each much shorter than any of the 256 values."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
 def check_light(what: str, image: ArrayLike) -> None:
-    """Raises `InputError`, in a sentence that begins with ``what``, for a picture with values of a file, up to 255."""
+    """Raise `InputError`, in a sentence that begins with ``what``, for a picture of byte values up to 255."""
     if np.asarray(image).dtype.kind in "iu":
         raise InputError(f"{what} is made of whole numbers, but must be {LIGHT}.")
     light = as_numbers(what, image)
@@ -41,8 +41,8 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
-    """The values (rows, columns, 3) in 0..255 of a linear image of that shape; light below 0 and above 1 is clipped.
-    ``each`` maps a function over parts of it, such as ``map`` of an executor, whose threads share them.
+    """Return sRGB bytes (rows, columns, 3) of a linear image, clipped to 0..1. ``each`` maps a function over parts, as
+    ``map`` of an executor does. Raises: InputError: another shape, or values that are not finite.
 
     Raises:
         InputError: another shape, or values that are not finite.
@@ -73,7 +73,7 @@ def _values(light: NDArray[Any]) -> NDArray[np.uint8]:
 
 @cache
 def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """(256,) the least light of each value but 0, and (STEPS + 1,) the value at the beginning of each step."""
+    """Return the least light of each byte but 0, (256,), and the byte at the start of each step, (STEPS + 1,)."""
     middles = (np.arange(1, 257) - 0.5) / 255.0
     exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
     rounded = exact.astype(dtype)
@@ -82,13 +82,13 @@ def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
 
 
 def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Linear light from 0 to 1, from values in 0..255 of any shape."""
+    """Return the linear light, 0 to 1, of sRGB bytes of any shape."""
     curved = values / 255.0
     return np.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)
 
 
 def png(image: ArrayLike) -> bytes:
-    """The bytes of a PNG file with 8 bits of sRGB, of a linear image (rows, columns, 3), clipped to 0..1; errors as of
+    """Return the bytes of an 8-bit sRGB PNG file of a linear image (rows, columns, 3), clipped to 0..1; raises as
     `to_srgb` and `check_light`."""
     from PIL import Image
 
@@ -99,36 +99,35 @@ def png(image: ArrayLike) -> bytes:
 
 
 class ShadedPicture(np.ndarray):
-    """A picture (rows, columns, 3), linear from 0 to 1: an array that a notebook shows as a picture."""
+    """A linear picture (rows, columns, 3) from 0 to 1: a NumPy array that notebooks show as a picture."""
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:
-        """A view of the same numbers."""
+        """Return a view of an image's numbers as a picture."""
         return np.asarray(image).view(cls)
 
     def _repr_png_(self) -> bytes | None:
-        """The PNG of it; None for a part of another shape, such as one row."""
+        """Return the picture as PNG bytes; None for a part of another shape, such as one row."""
         return png(self) if self.ndim == 3 and self.shape[2] == 3 else None
 
 
 VIDEO_QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
 BITS = 1.2e6
-"""A second at most of 1920 x 1080 pixels, over some seconds: 9.6 MB in the first minute."""
+"""Greatest bit rate [1/s] for 1920 x 1080 pixels, averaged over seconds: 9.6 MB in the first minute."""
 THREADS = 8
-"""Threads of the encoder, each at a frame of its own while others are drawn; however many cores there are, as the file
-depends on it."""
+"""Number of encoder threads, each at its own frame; it is fixed, as the file's bytes depend on it."""
 HELPERS = 4
-"""Threads that convert the parts of a frame."""
+"""Number of threads that convert the parts of a frame."""
 TICKS = 90_000
-"""Parts of a second in which times of frames are counted."""
+"""Parts of a second that are the unit of frame times."""
 
 
 class MovingPicture(Protocol):
-    """A film that grows by a frame at a time."""
+    """Protocol of a film that grows by a frame at a time."""
 
     frames: int
-    """The number of frames so far."""
+    """Number of frames so far."""
 
     def add(self, image: ArrayLike, time: float) -> None:
         """Add a frame, a linear image (rows, columns, 3), shown from a time [s] on."""
@@ -148,7 +147,7 @@ class Video:
         """The number of frames so far."""
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """See `MovingPicture`. The last row or column is repeated where a side is odd."""
+        """Add a frame shown from a time [s] on; an odd side is padded by repeating its last row or column."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
@@ -169,7 +168,7 @@ class Video:
             self.frames += 1
 
     def copy(self, other: Any) -> None:
-        """Copy the frames of an open video that was written by this class, before others are added."""
+        """Copy the frames of an open video written by this class, before others are added."""
         from av.bitstream import BitStreamFilterContext
 
         source = other.streams.video[0]
@@ -181,13 +180,13 @@ class Video:
         self.frames = source.frames
 
     def finish(self) -> None:
-        """Write what the encoder still holds."""
+        """Write the frames that the encoder still holds."""
         self._helpers.shutdown()
         if self._stream is not None:
             self._container.mux(self._stream.encode())
 
     def _stream_of(self, width: int, height: int) -> Any:
-        """The stream, made for the first frame. No frame depends on a later one, so that others can follow a copy."""
+        """Return the stream, made for the first frame. No frame depends on a later one, so others can follow a copy."""
         if self._stream is None:
             most = BITS * (width * height / (1920 * 1080)) ** 0.75
             options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
@@ -204,8 +203,8 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """A video that appears under its path when the block ends. Where it is interrupted, the frames so far appear, and
-    the next call with the same ``note`` and ``count`` begins with them.
+    """Open a video for writing; it appears under its path when the block ends. Where it is interrupted, the frames so
+    far appear, and the next call with the same ``note`` and ``count`` begins with them.
 
     Args:
         path: ends in .mp4.
@@ -255,7 +254,7 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
 
 
 def _copy_interrupted(av: Any, video: Video, path: Path, note: str, count: int) -> None:
-    """Copy the frames of the video that is there, if it was interrupted and has the same note."""
+    """Copy the frames of an existing video if it was interrupted and has an equal note."""
     if not note or not path.is_file():
         return
     try:
@@ -277,7 +276,7 @@ def _end(video: Video, container: Any, file: Any) -> None:
 
 
 def pyav() -> Any:
-    """The library; raises `InputError` where it is missing."""
+    """Import and return PyAV; raises `InputError` where it is missing."""
     try:
         import av
     except ModuleNotFoundError as problem:
@@ -290,11 +289,11 @@ def pyav() -> Any:
 ANIMATION_QUALITY = 80
 """Quality of lossy WebP, from 0 to 100."""
 REST = 1.5
-"""Seconds that the last frame is shown before the first one comes again."""
+"""Seconds for which the last frame is shown before the loop restarts."""
 
 
 class Animation:
-    """The frames of an animated WebP, in memory until all of them are there."""
+    """An animated WebP whose frames stay in memory until it is encoded."""
 
     def __init__(self) -> None:
         self._images: list[NDArray[np.uint8]] = []
@@ -303,13 +302,13 @@ class Animation:
         """The number of frames so far."""
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """See `MovingPicture`."""
+        """Add a frame, a linear image (rows, columns, 3), shown from a time [s] on."""
         self._images.append(to_srgb(image))
         self._times.append(time)
         self.frames += 1
 
     def encoded(self) -> bytes:
-        """The content of the file, which repeats for ever."""
+        """Return the bytes of the WebP file, which loops for ever."""
         from PIL import Image
 
         first, *others = [Image.fromarray(pixels) for pixels in self._images]
@@ -322,8 +321,8 @@ class Animation:
 
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[MovingPicture]:
-    """An animation of a path that ends in .webp, and else a video: see `writing`. An animation appears under its path
-    when the block ends; where it is interrupted, with the frames so far."""
+    """Open a film for writing: an animated WebP for a path that ends in .webp, else a video as by `writing`. An
+    animation appears when the block ends; where it is interrupted, with the frames so far."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
             yield video

@@ -15,14 +15,14 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = 0.01
-"""[s] after which an interruption is tried again that came where Python drops exceptions, such as in a finaliser."""
+"""Delay [s] before an interruption is retried that came where Python drops exceptions, as in a finaliser."""
 
 _stderr = 2
-"""A copy of the descriptor, as stderr is silenced for a while when Warp starts."""
+"""Descriptor of a copy of stderr, as stderr is silenced for a while when Warp starts."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal that interrupts a command; takes its number and the end of the sentence, which says what is kept."""
+    """An exception for a signal that interrupts a command; takes its number and words on what is kept."""
 
     def __init__(self, number: int, kept: str = ""):
         super().__init__(number, kept)
@@ -35,7 +35,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def leave_at_once() -> None:
-    """From now on end the process at a signal; one that is ignored stays so (nohup, background jobs)."""
+    """Make signals end the process at once from now on; ignored signals stay ignored (nohup, background jobs)."""
     global _stderr
     with suppress(OSError):  # it may be closed
         _stderr = os.dup(2)
@@ -46,15 +46,15 @@ def leave_at_once() -> None:
 
 
 def finish() -> None:
-    """From now on ignore signals, as the command has ended."""
+    """Ignore signals from now on, as the command has ended."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Within it an interruption is an exception; ``kept`` then gives the end of its sentence: what is there, and where,
-    or nothing. Of several within each other, the innermost one that gives something does."""
+    """Turn signals in the block into exceptions; ``kept`` returns the end of their sentence, on what is kept and where,
+    or nothing. Of nested blocks, the innermost with a text counts."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
@@ -70,8 +70,8 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """Delays signals for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal sends
-    to all of them."""
+    """A delay of signals for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal
+    sends to all of them."""
 
     def __init__(self) -> None:
         self._late: list[int] = []
@@ -86,7 +86,7 @@ class Hold:
             self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
 
     def end(self) -> None:
-        """Deliver the signals that came; it may be called again."""
+        """Deliver the signals that came; repeated calls do nothing."""
         if self._handler is not None:
             signal.signal(signal.SIGTERM, self._handler)
             self._handler = None
@@ -99,7 +99,7 @@ class Hold:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Within it signals wait, so that what is written is whole; other threads than the first never hear of them."""
+    """Delay signals in the block, to leave written files whole; threads other than the first never get them."""
     late, before = list[int](), dict[int, Any]()
     if threading.current_thread() is threading.main_thread():
         heard = [number for number in SIGNALS if callable(signal.getsignal(number))]
@@ -114,7 +114,7 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """The end of the sentence of an interruption, or of the one that was being handled as it came."""
+    """Return the end of an interruption's sentence, or of one that was being handled as it came."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

@@ -15,7 +15,8 @@ from cortado.errors import ComputationError
 
 
 def printable(text: str) -> str:
-    """The text on one line, without characters that would steer a terminal: each becomes its escape, such as ``\\x1b``.
+    """Return a text on one line, with characters that would steer a terminal as escapes, such as ``\x1b``. A byte of a
+    file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
 
     A byte of a file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
     """
@@ -23,19 +24,19 @@ def printable(text: str) -> str:
 
 
 def say(sentence: str, end: str = "\n") -> None:
-    """Print one line on stderr, such as an error or a warning; the beginning of one with another ``end``."""
+    """Print one line on stderr, such as an error or a warning; with another ``end``, only its beginning."""
     print(printable(sentence), end=end, file=sys.stderr, flush=True)
 
 
 def note(sentence: str, end: str = "\n") -> None:
-    """Print what is being done on stderr, unless `quietly`."""
+    """Print a line on the present work on stderr, unless `quietly`."""
     if not is_quiet():
         say(sentence, end)
 
 
 @contextmanager
 def timed_note(what: str) -> Iterator[None]:
-    """Print one line on stderr, unless `quietly`: what is done within, and at the end how long it took."""
+    """Print a line on stderr with the block's work, and the time that it took, unless `quietly`."""
     begun = time.monotonic()
     note(what, end="")
     try:
@@ -47,13 +48,13 @@ def timed_note(what: str) -> Iterator[None]:
 
 
 def is_quiet() -> bool:
-    """Whether only results, warnings and errors are wanted."""
+    """Test if only results, warnings and errors are wanted."""
     return _Quiet.depth > 0
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Within it all threads write only results, warnings and errors."""
+    """Suppress all output of the block, in all threads, but results, warnings and errors."""
     _Quiet.depth += 1
     try:
         yield
@@ -62,7 +63,7 @@ def quietly() -> Iterator[None]:
 
 
 class _Quiet:
-    """How often `quietly` was entered and not left."""
+    """A counter of `quietly` blocks that are open."""
 
     depth = 0
 
@@ -75,7 +76,7 @@ def tell(result: str) -> None:
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """Within it, prints that do not arrive raise `ComputationError`, or `BrokenPipeError` if nobody reads them."""
+    """Raise `ComputationError` for prints in the block that fail, or `BrokenPipeError` if nobody reads them."""
     try:
         try:
             yield
@@ -90,9 +91,8 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr of this process usable: streams that are closed go nowhere, but a result that is written
-    to a closed stdout fails; characters that the terminal cannot show are escaped; and a stderr that nobody reads any
-    more is no reason to stop."""
+    """Make stdout and stderr usable: closed streams discard their input, but a result written to a closed stdout fails;
+    characters unknown to the terminal are escaped; and a broken stderr is ignored."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
@@ -103,7 +103,7 @@ def steady_streams() -> None:
 
 
 class _Steady(io.TextIOWrapper):
-    """Goes on where the stream that it writes to is broken."""
+    """A text stream that ignores errors of the broken stream to which it writes."""
 
     def write(self, text: str) -> int:
         try:
@@ -129,17 +129,17 @@ def _escape(letter: str) -> str:
 
 
 LINE_INTERVAL = 10.0
-"""[s] between two lines when the stream is no terminal."""
+"""Seconds between two lines of progress when the stream is no terminal."""
 
 
 def announce(result: str) -> None:
-    """Print a result on stdout before the work has ended, unless progress is not shown."""
+    """Print a result on stdout before the work has ended, unless progress is hidden."""
     if not _hidden.get() and not is_quiet():
         tell(result)
 
 
 class Advance(Protocol):
-    """Reports `n` more steps done, with the latest values of anything worth seeing (loss=0.1)."""
+    """A function that reports `n` more steps as done, with latest values to show (loss=0.1)."""
 
     def __call__(self, n: int = 1, **fields: Any) -> None: ...
 
@@ -149,7 +149,7 @@ _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 @contextmanager
 def untracked() -> Iterator[None]:
-    """Within it no computation of this thread shows its progress, as each is a part of a larger one."""
+    """Hide the progress of all computations of this thread in the block, as each is a part of a larger one."""
     token = _hidden.set(True)
     try:
         yield
@@ -161,8 +161,8 @@ def untracked() -> Iterator[None]:
 def track(
     total: int, description: str, *, stream: TextIO | None = None, interval: float | None = None
 ) -> Iterator[Advance]:
-    """Shows the progress of `total` steps on a stream, stderr when none is given; where that is no terminal, by a line
-    every `interval` seconds, `LINE_INTERVAL` when none is given.
+    """Show the progress of `total` steps on a stream, stderr by default; without a terminal, by a line every `interval`
+    seconds, `LINE_INTERVAL` when none is given.
 
     Use:
         with track(120, "optimise") as advance:
@@ -202,8 +202,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """Writes at most one line every `interval` seconds, and one for the last step. The time left follows from the steps
-    after the first report, before which kernels are compiled, or what an earlier process has done is skipped."""
+    """A progress report of at most one line every `interval` seconds, and one for the last step. The time left follows
+    from the steps after the first report, before which kernels are compiled, or earlier work is skipped."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -230,6 +230,6 @@ class _Lines:
 
 
 def _text(fields: dict[str, Any]) -> str:
-    """Fields as words: loss 0.1235, step 7."""
+    """Return fields as words: loss 0.1235, step 7."""
     words = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in fields.items()}
     return ", ".join(f"{name} {word}" for name, word in words.items())

@@ -27,7 +27,7 @@ from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frame_check
 
 
 class TrajectoryWriter:
-    """Writes frames as they are computed; a context manager.
+    """A writer of a trajectory's frames to one VTKHDF file; a context manager.
 
     The file appears at `path` with its first frame, or with those that are `kept`, and can be opened, by ParaView too,
     while it grows: frames that are not written yet, or never were as the run ended early, have no particles there.
@@ -190,7 +190,7 @@ class TrajectoryWriter:
         self.steps_written, self._steps_checksum = last, checksum
 
     def close(self) -> None:
-        """Ends the file; without any frame, or all that are kept, none is left behind."""
+        """End the file; without any frame, or without all that are kept, none is left behind."""
         self._file.close()
         if self.frames_written < self._kept:
             self._unfinished.unlink(missing_ok=True)
@@ -210,7 +210,7 @@ class TrajectoryWriter:
         return array
 
     def _vectors(self, name: str, values: ArrayLike) -> NDArray[Any]:
-        """The values as (n, 3), with z = 0 in 2-D."""
+        """Return the values as (n, 3), with z = 0 in 2-D."""
         array = self._checked(name, values, self._layout.shape)
         return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
 
@@ -220,7 +220,7 @@ class TrajectoryWriter:
 
     @contextmanager
     def _refusal(self) -> Iterator[None]:
-        """Any trouble with the disk within ends the computation, in a sentence."""
+        """Turn errors of the disk in the block into a `ComputationError` with a sentence."""
         try:
             yield
         except OSError as problem:
@@ -261,7 +261,7 @@ def read(path: str | Path) -> dict[str, Any]:
 
 
 def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
-    """None where a checksum is wrong."""
+    """Return the arrays of an open file's completed frames and steps; None where a checksum is wrong."""
     vtk, own = file["VTKHDF"], file["cortado"]
     (frames, frames_checksum), (steps, steps_checksum) = own["progress"][:].tolist()
     dimension, particles = int(own.attrs["dimension"]), int(vtk["NumberOfPoints"][0])
@@ -298,7 +298,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
 
 
 def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:
-    """(steps,) records from one array for each of their names."""
+    """Return structured records (steps,) from one array for each field name."""
     arrays = {name: np.atleast_1d(column) for name, column in columns.items()}
     records = np.zeros(max((len(array) for array in arrays.values()), default=0), record)
     for name, array in arrays.items():
@@ -307,7 +307,7 @@ def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray
 
 
 def _require_room(layout: FileLayout, path: Path, expected: int | None) -> None:
-    """Raise ComputationError if the disk has no room for the frames that are expected."""
+    """Raise `ComputationError` if the disk has no room for the expected frames."""
     free = shutil.disk_usage(path.absolute().parent).free
     frames = len(layout.times) if expected is None else min(expected, len(layout.times))
     if (needed := layout.size * frames / len(layout.times)) > free:

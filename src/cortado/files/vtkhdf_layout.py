@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from cortado.files.disk import write_fully
 
 FORMAT = 3
-"""Of the group "cortado"; the first had no checksums, the second no states to go on from."""
+"""Version of the group "cortado"; the first had no checksums, the second no states to go on from."""
 WRITTEN, MISSING = 0, 1
 """The parts of a frame that is there, and of one that is not."""
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
@@ -35,32 +35,32 @@ _PAGE = 4096
 
 @dataclass(frozen=True)
 class FileLayout:
-    """What a file has room for."""
+    """The fields, types and sizes of a trajectory file, with room for every frame."""
 
     times: NDArray[np.float64]
-    """(frames,) [s]"""
+    """Times of the frames (frames,) [s]."""
     shape: tuple[int, int]
-    """n, d"""
+    """Numbers of particles n and of dimensions d."""
     dtype: np.dtype[Any]
-    """Of positions, velocities and scalars."""
+    """Type of positions, velocities and scalars."""
     steps: int
     scalars: tuple[str, ...]
     vectors: tuple[str, ...]
     """Further fields of three components, besides the velocity."""
     others: Mapping[str, NDArray[Any]]
-    """Further arrays of every frame, as they are in the first."""
+    """Further arrays of every frame, with the types and shapes of the first."""
     constants: Mapping[str, NDArray[Any]]
     """Arrays of any shape that hold for the whole run."""
     diagnostics: Mapping[str, np.dtype[Any]]
-    """Numbers of every step."""
+    """Types of the numbers kept of every step, by name."""
     origin: str
-    """What the particles are of, in JSON; empty where nothing is known."""
+    """JSON text on the particles' origin; empty where nothing is known."""
     marks: tuple[float, ...] = ()
-    """From which time on [s] frames are due, and how many in a second; empty where steps choose them."""
+    """Time [s] of the first due frame, and frames per second; empty where steps choose the frames."""
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
-        """The datasets that have n rows a frame, in the order of their checksum, with the shape of a row."""
+        """Shapes of a row of each dataset with n rows a frame, by name, in the order of their checksum."""
         fields: dict[str, tuple[int, ...]] = {
             **dict.fromkeys(("velocity", *self.vectors), (3,)),
             **dict.fromkeys(self.scalars, ()),
@@ -69,12 +69,12 @@ class FileLayout:
 
     @property
     def records(self) -> np.dtype[Any]:
-        """What is kept of a step."""
+        """Structured type of the record kept of a step."""
         return np.dtype(sorted(self.diagnostics.items()))
 
     @property
     def seed(self) -> int:
-        """The checksum of no frames."""
+        """Checksum of a file without frames."""
         particles = self.shape[0]
         kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
         kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
@@ -82,7 +82,7 @@ class FileLayout:
 
     @property
     def size(self) -> int:
-        """About how many bytes the file takes when it is full."""
+        """Approximate size in bytes of the full file."""
         numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
         others, constants = (sum(a.nbytes for a in arrays.values()) for arrays in (self.others, self.constants))
         frame = (
@@ -91,7 +91,7 @@ class FileLayout:
         return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.shape[0] + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
-        """The empty file, and the byte at which each dataset begins."""
+        """Return the empty file, and the byte at which each dataset begins."""
         import h5py
 
         pages = Pages()
@@ -154,27 +154,27 @@ def frames_seed(
     origin: str,
     marks: tuple[float, ...],
 ) -> int:
-    """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
-    holds for all of them. ``kinds``: type and shape of each field of a frame."""
+    """Return the checksum from which those of frames start: it depends on the frames' format, ``kinds`` (type and shape
+    of each field), and on all constants."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
 
 
 def frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
-    """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
+    """Return the CRC-32 of the frames so far and one more: its time [s], its number of steps, and its fields."""
     for content in (time.tobytes(), number.tobytes(), *rows):
         checksum = zlib.crc32(content, checksum)
     return checksum
 
 
 def steps_seed(records: np.dtype[Any]) -> int:
-    """The checksum of no steps, of which such records are kept."""
+    """Return the checksum of no steps, with records of this type."""
     return zlib.crc32(repr(records.descr).encode())
 
 
 def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
-    """Creates a contiguous dataset with its place in the file, unwritten; returns where it begins [byte]."""
+    """Create a contiguous, unwritten dataset at its place in the file, and return its first byte."""
     from h5py import h5d, h5p, h5s, h5t
 
     options = h5p.create(h5p.DATASET_CREATE)
@@ -185,7 +185,7 @@ def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
 
 
 def _write_cells(group: Any, cells: int) -> None:
-    """One cell per point for all frames (their offsets into it are zero), and none for the empty part."""
+    """Write one cell per point for all frames (their offsets into it are zero), and none for the empty part."""
     group["NumberOfConnectivityIds"] = np.array([cells, 0])
     group["NumberOfCells"] = np.array([cells, 0])
     group["Connectivity"] = np.arange(cells)
@@ -193,48 +193,48 @@ def _write_cells(group: Any, cells: int) -> None:
 
 
 class Pages(io.RawIOBase):
-    """A file in memory of which only the pages that were written to take room."""
+    """A file in memory that stores only pages that were written to."""
 
     def __init__(self) -> None:
         self._pages: dict[int, bytearray] = {}
         self._place = self._end = 0
 
     def save(self, file: Any) -> None:
-        """Writes it to a file on disk, which stays sparse."""
+        """Write the file to one on disk, which stays sparse."""
         file.truncate(self._end)
         for number, page in sorted(self._pages.items()):
             file.seek(number * _PAGE)
             write_fully(file, bytes(page[: self._end - number * _PAGE]))
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a byte."""
+        """Move to a byte, and return its offset."""
         self._place = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._end}[whence]
         return self._place
 
     def tell(self) -> int:
-        """The byte at which the next operation begins."""
+        """Return the byte at which the next operation begins."""
         return self._place
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the size [byte]."""
+        """Set the size [byte], by default to the present place."""
         self._end = self._place if size is None else size
         return self._end
 
     def write(self, content: Any) -> int:
-        """Write all of it."""
+        """Write all bytes of ``content``, and return their number."""
         for page, place, part in self._parts(content):
             page[place : place + len(part)] = part
         self._end = max(self._end, self._place)
         return len(content)
 
     def readinto(self, buffer: Any) -> int:
-        """Fill the buffer, with zeros where nothing was written."""
+        """Fill the buffer, with zeros where nothing was written, and return its length."""
         for page, place, part in self._parts(buffer):
             part[:] = page[place : place + len(part)]
         return len(buffer)
 
     def _parts(self, content: Any) -> Iterator[tuple[bytearray, int, memoryview]]:
-        """Page by page: the page, where in it, and the part of the content; moves on."""
+        """Yield page by page: the page, the place in it, and the part of the content; moves on."""
         rest = memoryview(content)
         while rest:
             number, place = divmod(self._place, _PAGE)

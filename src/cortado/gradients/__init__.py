@@ -49,7 +49,8 @@ def estimate(
     estimator: GradientEstimator | None = None,
     observe: Observer | None = None,
 ) -> Estimate:
-    """The loss of a problem and its gradient by an estimator, `Exact` if none is given.
+    """Return the loss of a problem and its gradient by an estimator, `Exact` by default. Raises `InputError` for
+    anything but an estimator, or one that does not return the gradient of every parameter.
 
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """

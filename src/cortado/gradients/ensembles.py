@@ -27,9 +27,9 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values
 
 MOST_SAMPLES = 100_000
-"""Samples of an ensemble; more are taken for a mistake."""
+"""Greatest number of samples of an ensemble; more are taken for a mistake."""
 _RUN = 1000.0
-"""[bytes] of what is kept of a run besides numbers."""
+"""Bytes kept of a run besides its numbers."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Ensemble:
     """Width of the ensemble in each parameter, in its units, one for all or by name. It is sqrt((N + 2) / N) times the
     standard deviation of a component."""
     samples: int = 8
-    """At most 100,000; all their results are kept until they are averaged, for which there has to be memory."""
+    """Number of samples, at most 100,000; all their results are kept until they are averaged, which needs memory."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
     executor: Executor = field(default=InProcess(), compare=False, repr=False, kw_only=True)
-    """Where the members of the ensemble are computed, which changes no bit of the result."""
+    """Executor that computes the members of the ensemble, which changes no bit of the result."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.samples) or self.samples < 2:
@@ -69,8 +69,8 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """The ensemble around these parameters of a problem; another ``draw`` has other samples, independent of these.
-        Raises `InputError` for a batch, for no parameters, and for spreads that round-off swallows."""
+        """Return the ensemble around these parameters of a problem; another ``draw`` has independent samples. Raises
+        `InputError` for a batch, for no parameters, and for spreads that round-off swallows."""
         if problem.simulation.batch is not None:
             raise InputError(
                 f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
@@ -88,13 +88,13 @@ class Ensemble:
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Estimates at points, in their order. Where ``observe`` is given they are computed in this process, which has
-        the states that it is called with."""
+        """Return estimates at points, in their order. With ``observe``, they are computed in this process, which has
+        the states for it."""
         executor = self.executor if observe is None else InProcess()
         return evaluated(problem, points, executor, observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raises `InputError` unless there is memory for what so many runs leave, so many numbers each."""
+        """Raise `InputError` unless there is memory for the results of ``runs`` runs of ``numbers`` numbers each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
     def _spread(self, name: str) -> float:
@@ -109,42 +109,42 @@ class Sampler:
 
     values: Arrays
     spreads: np.ndarray
-    """(numbers,) the spread of every component of the values, as one vector."""
+    """Spread of every component of the values, as one vector (numbers,)."""
     start: np.ndarray
-    """(n, d) first positions of the simulation [m]"""
+    """First positions (n, d) of the simulation [m]."""
     position_noise: float
-    """[m]"""
+    """Standard deviation of the perturbations of first positions [m]."""
     random: np.random.Generator
 
     def rotation(self) -> np.ndarray:
-        """(numbers, numbers) rows of a random orthonormal basis, uniform over all of them."""
+        """Return a random orthonormal basis, its vectors as rows (numbers, numbers), uniform over all rotations."""
         q, r = np.linalg.qr(self.random.standard_normal((len(self.spreads), len(self.spreads))))
         return (q * np.sign(np.diag(r))).T
 
     def offset(self) -> np.ndarray:
-        """(numbers,) uniform in the ball, in spreads."""
+        """Return a random point (numbers,) uniform in the ball, in spreads."""
         direction, numbers = self.random.standard_normal(len(self.spreads)), len(self.spreads)
         radius = np.sqrt(numbers) * self.random.random() ** (1.0 / numbers)
         return radius / np.linalg.norm(direction) * direction
 
     def displacement(self) -> np.ndarray:
-        """(n, d) a random displacement of the first positions [m]"""
+        """Return a random displacement (n, d) of the first positions [m]."""
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Sample:
-        """The parameters moved by ``u`` (numbers,), in spreads, and displaced first positions."""
+        """Return a sample with parameters moved by ``u`` (numbers,), in spreads, and displaced first positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
         return Sample(values, estimator)
 
     def named(self, numbers: np.ndarray) -> Arrays:
-        """One vector of numbers (numbers,) as arrays by the parameters' names."""
+        """Split one vector of numbers (numbers,) into arrays by the parameters' names."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
 
 
 def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:
-    """Raises `InputError` where a spread is lost in round-off, so that all samples would be the same."""
+    """Raise `InputError` where round-off swallows a spread, which would make all samples equal."""
     lost = np.asarray(value, precision.numpy) == np.asarray(value + spread, precision.numpy)
     if lost.any():
         wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
@@ -152,24 +152,26 @@ def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Prec
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Values plus a change (numbers,), which is one vector for all of them."""
+    """Return values plus a change (numbers,), one vector for all of them."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
 
 
 MOST_LEFT_OUT = 0.25
-"""Share of what is averaged that may be left out; with more the average would be that of another ensemble."""
+"""Greatest share of the members that an average may leave out; with more it would be that of another ensemble."""
 ADVICE = "take a smaller spread, or a logarithm (cortado.optimisation.transforms)"
 
 
 class LeftOutWarning(CortadoWarning):
-    """An average is one over fewer runs than were asked for."""
+    """A warning that an average is over fewer runs than asked for."""
 
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
-    """(members,) whether each member of an ensemble can be averaged, given the runs of one member after the other.
-    Where one of them diverged its member is left out: the others are as symmetric about the parameters as before.
+    """Return masks (members,) of ensemble members to average, given their runs one member after the other. A member
+    with a diverged run is left out: the others are as symmetric about the parameters as before. ``what``: the members
+    in words, in the plural. Warns of left out members; with more than a quarter of them, it raises the error of the
+    first diverged run.
 
     ``what``: the members in words, in the plural. Warns of those that are left out; where they are more than a quarter
     of all, it raises the error of the first run that diverged.
@@ -193,12 +195,13 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
 
 SMOOTHING, SURROGATE = AdjointViscosity(order=2), AdjointViscosity()
 MOST_NUMBERS = 64
-"""Components that differences are taken along at most: each costs two runs a sample."""
+"""Greatest number of components to take differences along: each costs two runs a sample."""
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """Central differences, averaged over an ensemble of parameters and first states: the reference for long runs.
+    """A gradient estimator: central differences, averaged over an ensemble of parameters and first states: the
+    reference for long runs.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
 
@@ -218,7 +221,7 @@ class RandomizedSmoothing(Ensemble):
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is not called, as there are no adjoints."""
+        """Return the loss and its smoothed gradient; ``observe`` is not called, as there are no adjoints."""
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
@@ -252,7 +255,7 @@ class RandomizedSmoothing(Ensemble):
 
 @dataclass(frozen=True)
 class EnsembleMean(Ensemble):
-    """The mean of another estimator's gradients over an ensemble of parameters and first states.
+    """A gradient estimator: the mean of another estimator's gradients over an ensemble of parameters and first states.
 
     Formula: g = mean over points of the ensemble of the estimator's gradient there. It is the gradient of the loss that
     `RandomizedSmoothing` differentiates, as far as the estimator is right, and its cost does not depend on the number
@@ -267,7 +270,7 @@ class EnsembleMean(Ensemble):
     """
 
     samples: int = 4
-    """An even number, as samples are drawn in antithetic pairs."""
+    """Number of samples, an even one, as they are drawn in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
     """The estimator whose gradients are averaged."""
 
@@ -277,7 +280,7 @@ class EnsembleMean(Ensemble):
         checked_estimator(self.estimator)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is called with the adjoints of one sample after the other."""
+        """Return the loss and the mean gradient; ``observe`` is called with the adjoints of each sample."""
         ensemble = self.around(problem, parameters)
         displaced = ensemble.start.size if self.position_noise else 0
         self.require_memory(self.samples, 2 * len(ensemble.spreads) + displaced)
@@ -297,19 +300,19 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The average (numbers,) of the gradients of the samples (samples, numbers), and its standard error: that of
-        the means of antithetic pairs, which follow each other."""
+        """Return the average (numbers,) of gradients (samples, numbers), and its standard error, from the means of
+        antithetic pairs, which are neighbours."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
 def require_pairs(samples: int) -> None:
-    """Raises `InputError` unless there are two antithetic pairs of samples or more, to know how they scatter."""
+    """Raise `InputError` unless there are two antithetic pairs of samples or more, which shows their scatter."""
     if samples % 2 or samples < 4:
         raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of the rows and its standard error, also of numbers whose squares overflow; no number where one is
+    """Return the mean of the rows and its standard error, also where squares overflow; NaN where a number is
     infinite."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
@@ -318,13 +321,14 @@ def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
-    """The gradient with respect to these parameters as one vector."""
+    """Return the gradient with respect to these parameters as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])
 
 
 @dataclass(frozen=True)
 class Guided(Ensemble):
-    """The mean of a surrogate's gradients over an ensemble, each of its parts scaled by differences of the loss.
+    """A gradient estimator: the mean of a surrogate's gradients over an ensemble, each of its parts scaled by
+    differences of the loss.
 
     Formula: in units of the spreads, the mean of the surrogate's gradients is cut along the first axis of each
     parameter, the steps or knots, into equal parts: p_1 ... p_K are their directions, of length 1, and
@@ -345,11 +349,11 @@ class Guided(Ensemble):
     """
 
     samples: int = 4
-    """Gradients of the surrogate, an even number."""
+    """Number of gradients of the surrogate, an even one."""
     parts: int = 4
-    """Of each parameter; fewer where it has fewer rows, and one for a vector or a number."""
+    """Number of parts of each parameter; fewer where it has fewer rows, and one for a vector or a number."""
     differences: int = 2
-    """Samples of each difference."""
+    """Number of samples of each difference."""
     surrogate: GradientEstimator = SURROGATE
     """The estimator whose gradients give the directions."""
 
@@ -363,7 +367,7 @@ class Guided(Ensemble):
         checked_estimator(self.surrogate)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is called with the adjoints of the surrogate's samples."""
+        """Return the loss and its gradient; ``observe`` is called with the adjoints of the surrogate's samples."""
         ensemble = self.around(problem, parameters, draw=1)
         surrogate = EnsembleMean(
             self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
@@ -393,8 +397,8 @@ class Guided(Ensemble):
         return Estimate(surrogate.loss, gradient, error, freedom, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; and its
-        standard error. Parts without a gradient are left out."""
+        """Return directions (numbers,) of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere;
+        and their standard errors. Parts without a gradient are left out."""
         places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
@@ -415,12 +419,12 @@ class Guided(Ensemble):
 
 
 def _places(value: np.ndarray, parts: int) -> np.ndarray:
-    """(size,) for each number of a parameter, the part that its row belongs to; 0 for a vector and a number."""
+    """Return for each number of a parameter, (size,), the part that its row belongs to; 0 for a vector and a number."""
     rows = len(value) if value.ndim > 1 else 1
     return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
 
 
 def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
-    """Degrees of freedom of the sum of two errors (2, numbers) that have their own (Welch 1947)."""
+    """Return the degrees of freedom of the sum of two errors (2, numbers), given theirs (Welch 1947)."""
     shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
     return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))

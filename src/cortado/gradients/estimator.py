@@ -23,22 +23,21 @@ class Estimate:
     """A loss and its gradient, with what the estimator knows about its accuracy."""
 
     loss: Any
-    """A float, of a batch (batch,)."""
+    """Loss: a float, of a batch (batch,)."""
     gradient: Arrays
-    """For each parameter given, an array of its shape (float64), of a batch with a first axis for the scenes."""
+    """Gradient by parameter in its shape (float64), of a batch with a first axis for the scenes."""
     standard_error: Arrays | None = None
-    """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`, `Guided`)."""
+    """Standard error of every component of the gradient, where it is an average over samples."""
     degrees_of_freedom: float | None = None
-    """Of the standard error: the number of independent samples less one; of `Guided` those of its two parts."""
+    """Degrees of freedom of the standard error: independent samples less one; of `Guided` those of its two parts."""
     left_out: int = 0
-    """Runs of an ensemble that the average leaves out, as they, or runs that they belong to, diverged or are out of
-    range."""
+    """Number of an ensemble's runs left out of the average, as they or their partners diverged or are out of range."""
     diverged: Exception | None = None
-    """Why there was no run, of a point of `cortado.evaluate`: a `DivergedError`, or an `OutOfRangeError`. Its loss and
-    its gradient are then no numbers."""
+    """Error for which a point of `cortado.evaluate` had no run, `DivergedError` or `OutOfRangeError`; loss and gradient
+    are then NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
-        """The lower and the upper end, by parameter, of an interval for each component of the gradient.
+        """Return the lower and the upper end, by parameter, of an interval for each component of the gradient.
 
         With this probability it contains the mean that the estimator would have over endlessly many samples: by
         Student's distribution, as the scatter is known from few samples. A bias of the estimator comes on top.
@@ -60,7 +59,7 @@ class Estimate:
         return lower, {name: value + reach * errors[name] for name, value in self.gradient.items()}
 
     def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
-        """That of one scene of a batch, with gradients of these shapes."""
+        """Return the estimate of one scene of a batch, with gradients of these shapes."""
         gradient = {name: bar[number].reshape(shapes[name]) for name, bar in self.gradient.items()}
         return replace(self, loss=float(self.loss[number]), gradient=gradient)
 
@@ -72,59 +71,59 @@ class Estimate:
 
 
 class ForwardPass(Protocol):
-    """A forward run with its loss. Any number of reverse passes may follow, until the problem is run again."""
+    """Protocol of a forward run with its loss, from which reverse passes may start until the problem is run again."""
 
     @property
     def loss(self) -> float:
-        """The loss of the run."""
+        """Loss of the run."""
 
     def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
-        """The gradient by an estimator; ``observe`` is called with the number and the adjoint of every state, from the
-        last to the first."""
+        """Return the gradient by an estimator; ``observe`` is called with the number and the adjoint of every state,
+        from the last to the first."""
 
 
 class Differentiable(Protocol):
-    """What an estimator uses of a `Problem`."""
+    """Protocol of a problem as estimators need it."""
 
     simulation: Any
 
     def value(self, parameters: Values) -> float:
-        """The loss of these parameters, by a run forward only."""
+        """Return the loss of these parameters, by a run forward only."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """A forward run that reverse passes may follow."""
+        """Run forward, and return a run from which reverse passes may start."""
 
 
 @runtime_checkable
 class Batchable(Protocol):
-    """A problem that can be evaluated at many points in one launch."""
+    """Protocol of a problem that can be evaluated at many points in one launch."""
 
     def room(self, estimator: "AdjointEstimator | None" = None) -> int:
-        """How many points `together` takes at a time, for a gradient by an estimator or for losses alone."""
+        """Return how many points `together` takes at once, for gradients by an estimator or for losses alone."""
 
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Estimates at points that have the same parameters in the same shapes, in one launch for all, each with the
-        bits that it has alone; without an estimator of the loss alone. Where a particle is lost there is the error."""
+        """Return estimates at points with equal names and shapes of parameters, in one launch, each with the bits that
+        it has alone; without an estimator of the loss alone. A lost particle's error takes the place of an estimate."""
 
 
 class GradientEstimator(Protocol):
-    """Computes a gradient, exact or approximate."""
+    """Protocol of an object that computes a gradient, exact or approximate."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """The loss and its gradient; estimators that compute adjoints of states call ``observe`` with each of them."""
+        """Return the loss and its gradient, calling ``observe`` with each adjoint of a state, if any."""
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
-    """The estimator; raises `InputError` for anything else, such as the class of an estimator."""
+    """Return the estimator; raises `InputError` for anything else, such as the class of an estimator."""
     if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
         raise InputError(f"estimator is {shown(estimator)}, but must be an object such as cortado.gradients.Exact().")
     return estimator
 
 
 def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
-    """The estimator; raises `InputError` for anything but one that goes back through a run."""
+    """Return the estimator; raises `InputError` for anything but one that goes back through a run."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
         raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
@@ -132,8 +131,8 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """What an estimator has returned, in float64; raises `InputError` unless it has a gradient of the shape of every
-    parameter that was given, of a batch with a first axis for the scenes."""
+    """Return an estimator's result in float64; raises `InputError` unless it has a gradient in the shape of every given
+    parameter, of a batch with a first axis for the scenes."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -154,25 +153,25 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """Whether it treats each scene of a batch by itself; one of your own has to say so."""
+        """True if it treats each scene of a batch by itself; a user's own has to say so."""
         return False
 
     @abstractmethod
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """The backward step for one rollout."""
+        """Return the backward step for one rollout."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """See `GradientEstimator`."""
+        """Return the loss and its gradient by a forward and a reverse pass; see `GradientEstimator`."""
         forward_pass = problem.forward_pass(parameters)
         return Estimate(forward_pass.loss, forward_pass.back(self, observe))
 
 
 class Filtered:
-    """The backward step of another estimator, followed by a filter of the adjoint."""
+    """A backward step that applies another estimator's, then filters the adjoint."""
 
     only_launches: ClassVar[bool] = False
-    """Whether `filter` does nothing but launch kernels, always the same ones. Only then may a backward step be captured
-    as a graph, which repeats launches, and not what Python or NumPy do between them."""
+    """True if `filter` does nothing but launch kernels, always in equal form. Only then may a backward step be captured
+    as a graph, which does not repeat the work of Python or NumPy between them."""
 
     def __init__(self, base: BackwardStep):
         self._base, self.rollout, self.solver = base, base.rollout, base.solver
@@ -194,22 +193,22 @@ class Filtered:
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors that say that there is no run at a point, which is no mistake where the point is one of many."""
+"""Errors that say that a point has no run, which is no mistake where it is one of many."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """Parameters, and how the gradient is computed there."""
+    """A set of parameter values, and the estimator of the gradient there."""
 
     values: Values
     estimator: GradientEstimator | None = None
-    """None for the loss alone."""
+    """Estimator of the gradient; None for the loss alone."""
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
-    """Those after which it has this loss."""
+    """Errors in place of a run that give the point its substitute loss."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """The loss of a problem there, and its gradient, which is empty without an estimator."""
+        """Return the loss of a problem at the point, and its gradient, which is empty without an estimator."""
         try:
             found = self.found(problem, observe)
             return found if self.estimator is None else checked_estimate(found, self.values, problem.simulation.batch)
@@ -217,13 +216,13 @@ class Point:
             return self.without_a_run(error, self.loss_if_diverged)
 
     def found(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """What the estimator says, unchecked."""
+        """Return the estimator's result at the point, unchecked."""
         if self.estimator is None:
             return Estimate(problem.value(self.values), {})
         return self.estimator.estimate(problem, self.values, observe)
 
     def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
-        """The estimate where no run is possible: its gradient is no number."""
+        """Return the estimate for a point without a run: its gradient is NaN."""
         names = self.values if self.estimator is not None else ()
         return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
 
@@ -233,8 +232,8 @@ class Sample(Point):
     """A point that an ensemble has drawn, at which there may be no run."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """See `Point.found`, as a gradient with respect to perturbed first positions need not be there; an `InputError`
-        says that the user did not choose this point."""
+        """Return the estimate at the sample, unchecked, as perturbed first positions need no gradient; an `InputError`
+        then says that the user did not choose this point."""
         try:
             return self.found(problem, observe)
         except NO_RUN as error:
@@ -244,7 +243,7 @@ class Sample(Point):
 
 
 Group = tuple[Point, ...]
-"""Points that are evaluated together."""
+"""A tuple of points that are evaluated together."""
 
 
 @dataclass(frozen=True)
@@ -270,8 +269,8 @@ class Evaluation:
         ]
 
     def groups(self, points: Iterable[Point], threads: Callable[[], int]) -> Iterator[Group]:
-        """The points in their order, as many at a time as one launch of the problem takes, shared out among the threads
-        of workers that there are when a group is asked for."""
+        """Yield the points in their order, in groups that fit one launch of the problem, shared out among the threads
+        of present workers."""
         for (estimator, _), alike in groupby(points, _kind):
             room = 1
             if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
@@ -287,7 +286,7 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Estimates at points, in their order, computed where an executor says, as many at a time as one launch takes."""
+    """Return estimates at points, in their order, computed by an executor, as many at once as one launch takes."""
     evaluation, firsts = Evaluation(problem, observe), [0]
 
     def groups() -> Iterator[Group]:
@@ -304,12 +303,12 @@ def evaluated(
 
 
 def without_runs(errors: Sequence[Exception], of: str) -> str:
-    """How many of something had no run, and why, in words: "2 of 4 points diverged"."""
+    """Return in words how many of something had no run, and why: "2 of 4 points diverged"."""
     diverged = sum(isinstance(error, DivergedError) for error in errors)
     why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
     return f"{len(errors)} of {of} {' or '.join(why)}"
 
 
 def _kind(point: Point) -> tuple[Any, ...]:
-    """Points of one kind can be evaluated in one launch."""
+    """Return a key of a point; points with equal keys can be evaluated in one launch."""
     return point.estimator, {name: np.shape(value) for name, value in point.values.items()}

@@ -22,14 +22,14 @@ from cortado.scene.parameter_values import Values
 from cortado.solvers.solver import Counts, ResumingAdjoint, Solver
 
 STRONGEST = 0.6
-"""Strength s of the viscosity at most: waves of two spacings are damped by a factor, and do not change their sign."""
+"""Greatest strength s of the viscosity, at which waves of two spacings are damped and keep their sign."""
 
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
-    """The kernels of `AdjointViscosity`, which has their formulas, by name. Adjoints are in the scene's order, and
-    ``sort`` sorts them for ``viscosity``, which needs ``crowd`` and ``strength`` before it. Owing to the division by S
-    it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it where
+    """Return the kernels of `AdjointViscosity`, which has their formulas, by name. Adjoints are in the scene's order,
+    and ``sort`` sorts them for ``viscosity``, which needs ``crowd`` and ``strength`` before it. Owing to the division
+    by S it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it where
     particles hardly touch."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -46,7 +46,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
 
     @fluid_sum(discretisation)
     def strain(x_ij: vector, v_ij: vector, most_i: real, most_j: real, s: neighbourhood) -> real:
-        """gamma_i^2"""
+        """Return the squared strain rate gamma_i^2 as a sum over neighbours."""
         return weight(x_ij, s) / wp.max(most_i, most_j) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
 
     @fluid_sum(discretisation)
@@ -70,7 +70,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         # out
         most: wp.array(dtype=real),
     ):
-        """max(S_i, W(h / 2))"""
+        """Write max(S_i, W(h / 2)) with the sum S_i of weights over neighbours."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -88,7 +88,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         # out
         strengths: wp.array(dtype=real),
     ):
-        """s_i, of sorted particles as all arguments"""
+        """Write the strength s_i of the viscosity for sorted particles, from sorted arguments."""
         i = s.first + wp.tid() // LANES
         total = strain(i, x, v, most, s)
         if lane() > 0:
@@ -121,7 +121,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         a: wp.array(dtype=vector),
         b: wp.array(dtype=vector),
     ):
-        """Two fields of an adjoint at once, which are written in the scene's order."""
+        """Blend two fields of an adjoint at once, written in the scene's order."""
         i = s.first + wp.tid() // LANES
         a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
         if lane() > 0:
@@ -136,7 +136,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         # out
         found: wp.array(dtype=wp.vec2d),
     ):
-        """|a_i|^2 and |b_i|^2, in float64: adjoints grow beyond what a square in float32 may be."""
+        """Write |a_i|^2 and |b_i|^2 in float64, as adjoints may have squares beyond float32."""
         i = wp.tid()
         a_i = wp.vec3d(a[i])
         b_i = wp.vec3d(b[i])
@@ -153,8 +153,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         a: wp.array(dtype=vector),
         b: wp.array(dtype=vector),
     ):
-        """``squares`` of every particle, of a and of b; their ``sums`` over each scene, and that of all strengths of
-        the viscosity: a flow without strain is not limited."""
+        """Limit a and b, given their ``squares`` by particle, their ``sums`` over each scene, and the sum of the
+        viscosity's strengths: a flow without strain is not limited."""
         i = wp.tid()
         if strengths[i // particles] == real(0.0):
             return
@@ -169,8 +169,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
 
 
 class EddyViscosity:
-    """Blends the adjoints of positions and of velocities with their averages over the neighbours that the solver holds,
-    the more the faster the forward flow strains there."""
+    """A filter that blends adjoints of positions and velocities with averages over neighbours, the more the faster the
+    forward flow strains there."""
 
     def __init__(self, solver: Solver, coefficient: float):
         self._solver, self._coefficient = solver, coefficient
@@ -181,8 +181,8 @@ class EddyViscosity:
         self._sorted = {"a_sorted": a, "b_sorted": b}
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Blend the adjoint of the state whose step the solver has replayed last. ``strengths`` are then those of its
-        particles, sorted."""
+        """Blend the adjoint of the state whose step the solver has replayed last, and set ``strengths`` for its sorted
+        particles."""
         context, kernels = self._solver.context(parameters), self._kernels
         fields = {"a": bar.positions, "b": bar.velocities, **self._sorted}
         flow = {"most": self._most, "strengths": self.strengths}
@@ -193,7 +193,7 @@ class EddyViscosity:
 
 
 class Limit:
-    """Limits the vector of each particle in an adjoint to a number of times the root mean square over all particles."""
+    """A filter that limits each particle's vector in an adjoint to a multiple of the root mean square over all."""
 
     def __init__(self, solver: Solver, times: float):
         layout, self._times = solver.layout, times
@@ -226,15 +226,15 @@ class AdjointNorms:
         wp.copy(self._history, self._sum(self._squares), dest_offset=step * members, count=members)
 
     def numpy(self) -> np.ndarray:
-        """(steps + 1, 2), in a batch (steps + 1, batch, 2), norms over all particles of a scene of the adjoints of
-        positions and of velocities, state by state."""
+        """Return the norms (steps + 1, 2), in a batch (steps + 1, batch, 2), of the adjoints of positions and of
+        velocities over all particles of a scene, state by state."""
         norms = np.sqrt(self._history.numpy())
         return norms if self._layout.batch is None else norms.reshape(-1, self._layout.batch, 2)
 
 
 @dataclass(frozen=True)
 class Exact(AdjointEstimator):
-    """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
+    """A gradient estimator: the exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
 
     Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories diverge it grows as
     fast as they do, by a constant factor a step. Cost: every step is computed once more forward, and the backward step
@@ -249,7 +249,7 @@ class Exact(AdjointEstimator):
 
 @dataclass(frozen=True)
 class Tape(AdjointEstimator):
-    """The exact adjoint by Warp's own automatic differentiation of the forward kernels.
+    """A gradient estimator: the exact adjoint by Warp's own automatic differentiation of the forward kernels.
 
     It is slower than `Exact`, with atomics on a GPU, and is kept to check it. Only for scenes with the solver
     ``"pcisph"``; others say so.
@@ -309,7 +309,8 @@ class _TapeStep:
 
 @dataclass(frozen=True)
 class ImplicitPressure(AdjointEstimator):
-    """The adjoint of the projection with its pressure as a fixed point, instead of iteration by iteration.
+    """A gradient estimator: the adjoint of the projection with its pressure as a fixed point, instead of iteration by
+    iteration.
 
     Formula: an iteration k' = Phi(k, u) of the pressure k from the inputs u, velocities and positions, has the fixed
     point k = Phi(k, u), and so the adjoint u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
@@ -324,10 +325,10 @@ class ImplicitPressure(AdjointEstimator):
     """
 
     tolerance: float = 0.1
-    """The solve ends where its residual has fallen to this part of the first, in the norm of its diagonal; at least 0,
-    where `iterations` are done in any case."""
+    """Ratio of the residual to the first, in the norm of its diagonal, at which the solve ends; at least 0, where all
+    `iterations` are done."""
     iterations: int = 100
-    """At most, for each step."""
+    """Greatest number of iterations for each step."""
 
     batches = True
 
@@ -344,7 +345,7 @@ class ImplicitPressure(AdjointEstimator):
 
 
 class _ResumingStep(AdjointStep):
-    """The same, where the step is taken once more from what is known of its result."""
+    """An exact backward step that repeats the forward step from what is known of its result."""
 
     def __init__(self, rollout: Rollout, adjoint: ResumingAdjoint):
         super().__init__(rollout, adjoint)
@@ -364,7 +365,7 @@ EXACT = Exact()
 
 @dataclass(frozen=True)
 class AdjointViscosity(AdjointEstimator):
-    """The adjoint with an eddy viscosity that follows the strain rate of the forward flow.
+    """A gradient estimator: the adjoint with an eddy viscosity that follows the strain rate of the forward flow.
 
     Formula: after each backward step the adjoints a of positions and of velocities are blended with their averages over
     fluid neighbours,
@@ -399,11 +400,11 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """C, at least 0, with which it is the base estimator."""
+    """Coefficient C of the viscosity, at least 0, with which it equals the base estimator."""
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none."""
     order: int = 1
-    """1, or 2 for an extrapolation. As the base of another estimator this one is not extrapolated."""
+    """Order 1, or 2 for an extrapolation, which is not done as the base of another estimator."""
     base: AdjointEstimator = EXACT
     """The estimator whose adjoint is filtered."""
 
@@ -426,7 +427,7 @@ class AdjointViscosity(AdjointEstimator):
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is called with the adjoints of the smaller coefficient."""
+        """Return the loss and its gradient; ``observe`` is called with the adjoints of the smaller coefficient."""
         forward_pass, once = problem.forward_pass(parameters), replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 2:

@@ -27,8 +27,8 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets, which
-    are the same for every scene of a batch."""
+    """Return kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets,
+    which all scenes of a batch share."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
 
@@ -59,10 +59,10 @@ def matching_kernels(precision: Precision) -> tuple[Any, Any]:
 
 @fixed
 class FinalPositions:
-    """Mean over particles of the squared distance to their targets [m2]."""
+    """A loss: the mean over particles of the squared distance to their targets [m2]."""
 
     def __init__(self, target: np.ndarray):
-        """``target`` (n, d) [m], in the scene's order."""
+        """Set the ``target`` positions (n, d) [m], in the scene's order."""
         self.target = read_only("target", target)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
@@ -72,7 +72,7 @@ class FinalPositions:
         """The target and the sum over particles, by device, precision and number of scenes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the loss as its target."""
         return FinalPositions, (self.target,)
 
     def value(self, end: Snapshot) -> float:
@@ -82,11 +82,11 @@ class FinalPositions:
         return self.value(end), self._adjoint(end)
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """See `losses.loss.BatchedLoss`."""
+        """Return the loss of each scene of a batch; see `losses.loss.BatchedLoss`."""
         return self._mean_squares(end)
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """See `losses.loss.BatchedLoss`."""
+        """Return the losses and adjoints of a batch; see `losses.loss.BatchedLoss`."""
         return self.values(end), self._adjoint(end)
 
     @WARP
@@ -118,10 +118,10 @@ class FinalPositions:
 
 @fixed
 class CentreOfMass:
-    """Squared distance of the centre of mass to a target [m2]."""
+    """A loss: the squared distance of the centre of mass to a target [m2]."""
 
     def __init__(self, target: Any, masses: np.ndarray | None = None):
-        """``target`` (d,) [m]; ``masses`` (n,) of the particles in any unit, None where they are all the same."""
+        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit, None where all are equal."""
         self.target, self._weights = _finite("target", target), _weights(masses)
         self.fingerprint = _checksum(self.target, self._weights)
         """Tells one target from another, for checkpoints."""
@@ -141,10 +141,10 @@ class CentreOfMass:
 
 @fixed
 class CentreOfMassAlong:
-    """Component of the centre of mass along a direction [m]: its gradient is that of the centre of mass itself."""
+    """A loss: the centre of mass along a direction [m], whose gradient is that of the centre of mass itself."""
 
     def __init__(self, direction: Any, masses: np.ndarray | None = None):
-        """``direction`` (d,) [-]; ``masses`` as those of `CentreOfMass`."""
+        """Set the ``direction`` (d,) [-], and ``masses`` as for `CentreOfMass`."""
         self.direction, self._weights = _finite("direction", direction), _weights(masses)
         self.fingerprint = _checksum(self.direction, self._weights)
         """Tells one direction from another, for checkpoints."""
@@ -162,7 +162,7 @@ class CentreOfMassAlong:
 
 
 def _finite(what: str, value: Any) -> np.ndarray:
-    """A read-only copy in float64, or an `InputError`."""
+    """Return a read-only vector in float64; raises `InputError` unless it is finite."""
     array = read_only(what, value)
     if array.ndim != 1 or not np.isfinite(array).all():
         raise InputError(f"{what} has shape {array.shape}, but must have 1 dimension and be finite.")
@@ -179,7 +179,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
-    """(n,) of the particles in the mass of all."""
+    """Return the shares (n,) of the particles in the total mass."""
     n = len(end.positions)
     if weights is None:
         return np.full(n, 1.0 / n)
@@ -189,18 +189,18 @@ def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
 
 
 def _checksum(*parts: Any) -> str:
-    """Of arrays and bytes, None for those that are left out."""
+    """Return a checksum of arrays and bytes, with None for parts that are left out."""
     return sha256(b" ".join(b"" if one is None else bytes(memoryview(one)) for one in parts)).hexdigest()
 
 
 @fixed
 class SolidPose:
-    """Of a solid that moves, |x - x*|^2 + l^2 (3 - tr R*^T R) [m2]: the squared distance of its middle to where it
-    should be, and, for a rotation that is off by a small angle, the squared angle times that of a length l."""
+    """A loss of a moving solid, |x - x*|^2 + l^2 (3 - tr R*^T R) [m2]. To its middle's squared distance from a target
+    it adds, for small angles off a target rotation, the squared angle times l^2."""
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
-        """``name`` of the solid; ``position`` (d,) of its middle [m] and ``rotation``, in 3-D a rotation vector (3,),
-        in 2-D a number, [rad], either or both; ``length`` l [m], greater than 0."""
+        """Set the ``name`` of the solid; targets ``position`` (d,) of its middle [m] and ``rotation`` [rad], a vector
+        (3,) in 3-D and a number in 2-D, or one of them; ``length`` l [m], greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:
@@ -236,7 +236,7 @@ class SolidPose:
         return value, bars
 
     def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
-        """The part of the rotation, and its adjoint; t is that of a further turn of R."""
+        """Return the rotation's part of the loss, and its adjoint by field."""
         assert self.rotation is not None
         pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
         R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
@@ -245,21 +245,21 @@ class SolidPose:
 
 
 class Pictures(Protocol):
-    """What makes pictures, such as `cortado.render.renderer.Renderer`."""
+    """Protocol of a renderer of pictures, such as `cortado.render.renderer.Renderer`."""
 
     def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
-        """The picture (rows, columns, 3)."""
+        """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """``positions``, ``fractions`` and ``colours``: derivatives of a function of the last picture."""
+        """Return derivatives of a function of the last picture: ``positions``, ``fractions``, ``colours``."""
 
 
 @fixed
 class Image:
-    """How far the picture of a state is from a target picture."""
+    """A loss: the distance of the picture of a state from a target picture."""
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
-        """``target`` (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
+        """Set the ``target`` picture (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
         `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
         that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
         require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
@@ -272,7 +272,7 @@ class Image:
         """Tells one target, or one view of it, from another, for checkpoints."""
 
     def image(self, end: Snapshot) -> np.ndarray:
-        """The picture (rows, columns, 3) of a state."""
+        """Return the picture (rows, columns, 3) of a state."""
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
     @WARP
@@ -290,7 +290,7 @@ class Image:
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
-    """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
+    """Return a float64 copy (rows, columns, 3) of a target, of that ``shape`` if given; raises `InputError`."""
     image = read_only("target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
@@ -305,16 +305,16 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
 
 
 SAME = 1e-6
-"""Relative: time steps that differ by less are the same, as one of them may have been rounded to float32."""
+"""Relative difference below which time steps count as equal, as one may have been rounded to float32."""
 
 
 @fixed
 class SensorMatch:
-    """Sum of the squared differences of what a sensor reads from what it should read, over squared scales."""
+    """A loss: the weighted sum of squared differences between a sensor's reading and a target, over squared scales."""
 
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
-        """``target`` (k,), a number for each column of the sensor, NaN for one that does not count; ``weight`` of the
-        sum; ``scale``, a number or (k,)."""
+        """Set the ``target`` (k,), a number for each column of the sensor, NaN for one that does not count; the
+        ``weight`` of the sum; and the ``scale``, a number or (k,)."""
         self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
         self.target = np.atleast_1d(read_only("target", target))
         self.scale = np.broadcast_to(as_numbers("scale", scale), self.target.shape)
@@ -341,17 +341,17 @@ class SensorMatch:
 
 @fixed
 class Series(Frames):
-    """A sensor against a measured series: the mean over steps of the squared difference of the two, all columns added
-    up.
+    """A loss of a sensor against a measured series: the mean over steps of the squared difference of the two, all
+    columns added up.
 
     The series is interpolated linearly to the times of the steps; steps before its first and after its last time do not
     count.
     """
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):
-        """``times`` (m,) [s], rising; ``values`` (m,) or (m, k), a number for each column of the sensor, NaN for one
-        that does not count; ``time_step`` of the problem [s]; ``every``: take only every so many steps into account;
-        ``scale``: what a difference is divided by, a number or (k,)."""
+        """Set the series: ``times`` (m,) [s], rising; ``values`` (m,) or (m, k), a number for each column of the
+        sensor, NaN for one that does not count; ``time_step`` of the problem [s]; ``every``: take only every so many
+        steps into account; ``scale``: what a difference is divided by, a number or (k,)."""
         moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series
         if moments.ndim != 1 or len(moments) < 2 or not (np.diff(moments) > 0.0).all():
@@ -380,7 +380,7 @@ class Series(Frames):
         super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
 
     def check(self, time_steps: np.ndarray) -> None:
-        """The states are of the times that their numbers of steps stand for in the series."""
+        """Raise `InputError` unless the run's time step is that of the series."""
         other = time_steps[np.abs(time_steps - self.time_step) > SAME * time_steps]
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"

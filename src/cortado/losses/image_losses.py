@@ -16,28 +16,29 @@ from cortado.errors import InputError
 __all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
 
 Image = NDArray[np.float64]
-"""(rows, columns, 3) red, green and blue, linear"""
+"""A linear picture: array (rows, columns, 3) of red, green and blue."""
 SMALLEST = 2
-"""Both sides of the coarsest level of a pyramid are at most so many pixels long."""
+"""Greatest side of the coarsest level of a pyramid, in pixels."""
 
 
 class ImageLoss(Protocol):
-    """A differentiable number of an image and its target."""
+    """Protocol of a differentiable number of an image and its target."""
 
     @property
     def fingerprint(self) -> str:
-        """Tells one loss from another, for checkpoints."""
+        """Text that tells losses apart, for checkpoints."""
 
     def value(self, image: ArrayLike, target: ArrayLike) -> float:
-        """The loss of an image (rows, columns, 3)."""
+        """Return the loss of an image (rows, columns, 3)."""
 
     def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
-        """(rows, columns, 3) derivative of the loss with respect to the image."""
+        """Return the derivative (rows, columns, 3) of the loss with respect to the image."""
 
 
 @dataclass(frozen=True)
 class SquaredDifference:
-    """Mean over pixels and channels of the squared difference: the squared L2 distance for one value.
+    """An image loss: the mean over pixels and channels of the squared difference. Shapes must overlap to feel each
+    other.
 
     Shapes that do not overlap do not feel each other; `Pyramid` is for these.
     """
@@ -56,16 +57,18 @@ class SquaredDifference:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Sum over the levels of a Gaussian pyramid (Burt and Adelson 1983) of weight * mean squared difference.
+    """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
+    Adelson 1983). The first is the image itself, every other one the level before, blurred by a binomial and reduced by
+    2 (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.
 
     The first level is the image itself, every other one the level before, blurred by a binomial and reduced by 2
     (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.
     """
 
     levels: int | None = None
-    """How many; None: as many as the weights or, without weights, until no side is longer than 2 pixels."""
+    """Number of levels; None: that of the weights or, without weights, until no side is longer than 2 pixels."""
     weights: tuple[float, ...] | None = None
-    """(levels,) from fine to coarse; None: 1, 2, 4 ..., as a shape is fainter the more it is blurred."""
+    """Weights (levels,) from fine to coarse; None: 1, 2, 4 ..., as a shape is fainter the more it is blurred."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:
@@ -102,7 +105,7 @@ class Pyramid:
         return bar
 
     def _levels(self, difference: Image) -> list[Image]:
-        """The pyramid of the difference, which is the difference of the pyramids."""
+        """Return the pyramid of the difference, which equals the difference of the pyramids."""
         wanted = self.levels or (len(self.weights) if self.weights else None)
         levels = [difference]
         while len(levels) < wanted if wanted else max(levels[-1].shape[:2]) > SMALLEST:
@@ -114,26 +117,26 @@ class Pyramid:
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
-    """Peak signal-to-noise ratio [dB] for a peak of 1; infinite for two equal images."""
+    """Return the peak signal-to-noise ratio [dB] for a peak of 1; infinite for two equal images."""
     error = SquaredDifference().value(image, target)
     return float(-10.0 * np.log10(error)) if error > 0.0 else float("inf")
 
 
 def reduce(image: Image) -> Image:
-    """(ceil(rows / 2), ceil(columns / 2), 3) the next level of a Gaussian pyramid."""
+    """Return the next level (ceil(rows / 2), ceil(columns / 2), 3) of a Gaussian pyramid."""
     rows, columns = image.shape[:2]
     return _along_columns(_along_rows(image, reduction(rows)), reduction(columns))
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """The transpose of `reduce`: of the adjoint of a next level, an image of that shape (rows, columns)."""
+    """Return the adjoint of an image (rows, columns) from that of its next level: `reduce` transposed."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 
 
 @lru_cache(maxsize=64)
 def reduction(size: int) -> Any:
-    """(ceil(size / 2), size) sparse matrix that blurs a line of pixels by a binomial and keeps every other one.
+    """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every other one.
 
     Where the size is odd, Burt and Adelson's 1 4 6 4 1 about every other pixel, the first and the last among them.
     Where it is even, that would treat the two ends differently and make a level prefer shapes at one of them; there,
@@ -161,7 +164,7 @@ def _along_columns(image: Image, matrix: Any) -> Image:
 
 
 def _difference(image: ArrayLike, target: ArrayLike) -> Image:
-    """image - target, (rows, columns, 3) float64"""
+    """Return image - target as a float64 array (rows, columns, 3)."""
     image, target = as_numbers("The image", image), as_numbers("The target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"The image has shape {image.shape}, but must be (rows, columns, 3).")

@@ -23,23 +23,22 @@ from cortado.words import counted
 
 
 def precision_of(state: State) -> Precision:
-    """Of the arrays of a state."""
+    """Return the precision of a state's arrays."""
     return FLOAT64 if state.positions.dtype == FLOAT64.vector else FLOAT32
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
+    """A state of a rollout, usually the last, as NumPy arrays or as Warp arrays, in the scene's order."""
 
     state: State
-    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and what else the solver carries from
-    step to step."""
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields that the solver
+    carries from step to step."""
     dimension: int
     colours: np.ndarray
-    """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    """Colours of the phases, (phases, 3): red, green and blue, linear, from 0 to 1."""
     moment: Moment | None = None
-    """The state with the parameters of the step after it, which its quantities follow from; None where they are not
-    known."""
+    """State with the parameters of the step after it, which determine its quantities; None where unknown."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -51,23 +50,23 @@ class Snapshot:
 
     @cached_property
     def positions(self) -> np.ndarray:
-        """(n, d) [m], float64, read-only"""
+        """Positions of the particles, (n, d) [m], float64, read-only."""
         return self._field("positions")
 
     @cached_property
     def velocities(self) -> np.ndarray:
-        """(n, d) [m / s], float64, read-only"""
+        """Velocities of the particles, (n, d) [m / s], float64, read-only."""
         return self._field("velocities")
 
     @cached_property
     def mass_fractions(self) -> np.ndarray:
-        """(n, phases) [-], float64, read-only"""
+        """Mass fractions of the particles, (n, phases) [-], float64, read-only."""
         return self._field("mass_fractions")
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """A field of the state by its name, such as "velocities", or a quantity of its particles, such as "density" or
-        "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`); float64, read-only. Raises
-        `InputError` for any other name."""
+        """Return a field of the state by its name, such as "velocities", or a quantity of its particles, such as
+        "density" or "pressure", or the load on a solid, such as "rotor.load" (see `docs/sensors.md`); float64,
+        read-only. Raises `InputError` for any other name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
         if isinstance(name, str) and name in self.state.names:
@@ -82,7 +81,7 @@ class Snapshot:
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Those of the scene, as they begin; where one that moves is now, fields of the state say."""
+        """Tables of the scene's solids as they begin; fields of the state say where a moving one is now."""
         return moment_of(self).solids
 
     @property
@@ -98,14 +97,14 @@ class Snapshot:
 
 
 def _read_only(values: np.ndarray) -> np.ndarray:
-    """A copy in float64 that a loss cannot change by mistake for what is computed from it next."""
+    """Return a read-only copy in float64, which a loss cannot change by mistake."""
     found = values.astype(np.float64)
     found.flags.writeable = False
     return found
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """What quantities of a state follow from; raises `InputError` where it is not known."""
+    """Return the state and parameters that determine quantities; raises `InputError` where they are unknown."""
     if end.moment is None:
         raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
     return end.moment
@@ -116,10 +115,10 @@ class StepBar:
     """Derivatives of a loss with respect to the parameters of one step."""
 
     row: int
-    """Which of a run's steps it is, or how many there are: one after the last (`row_of` of
+    """Number of the step in the run, or the number of steps: one after the last (`row_of` of
     `cortado.runs.quantity_values`)."""
     parameters: Mapping[str, np.ndarray]
-    """By name, with a first axis for the scenes of a batch, and one row of those over time."""
+    """Derivatives by parameter name, with a first axis for the scenes of a batch, and one row of those over time."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,16 +126,16 @@ class SnapshotAdjoint:
     """Derivatives of a loss that also looks at the colours."""
 
     state: State
-    """With respect to positions, velocities and mass fractions, as Warp arrays."""
+    """Derivatives with respect to positions, velocities and mass fractions, as Warp arrays."""
     colours: np.ndarray
-    """(phases, 3)"""
+    """Derivatives with respect to the phases' colours, (phases, 3)."""
     quantities: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """With respect to quantities of the particles, by name."""
+    """Derivatives with respect to quantities of the particles, by name."""
     step: StepBar | None = None
-    """With respect to the parameters of the step after the state, once that of quantities is in it."""
+    """Derivatives with respect to the parameters of the step after the state, once those of quantities are included."""
 
     def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
-        """With respect to the state and the parameters alone: quantities follow from these."""
+        """Return the derivatives with respect to the state and the parameters alone, from which quantities follow."""
         if not self.quantities:
             return self
         moment = moment_of(end)
@@ -149,7 +148,7 @@ class SnapshotAdjoint:
 
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
-"""What the arrays of an adjoint are derivatives with respect to, in their order."""
+"""Names of the fields that the arrays of an adjoint tuple differentiate by, in their order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
 """Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
 fractions (n, phases); or by the names of fields of a state and of quantities, what is left out being 0; or as Warp
@@ -157,8 +156,7 @@ arrays."""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """An adjoint as arrays by the fields of a state, and the quantities, that they are derivatives with respect to,
-    vectors (n, d)."""
+    """Return an adjoint as arrays by the names of state fields and quantities, with vectors (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -167,7 +165,7 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
 
 
 def adjoint_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    """Any adjoint of a state, as Warp arrays and, of quantities, by name."""
+    """Return any form of a state's adjoint as Warp arrays, and that of quantities by name."""
     if isinstance(bar, SnapshotAdjoint):
         return bar
     no_colours = np.zeros_like(end.colours)
@@ -180,8 +178,8 @@ def adjoint_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
 
 
 def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
-    """The derivative of a loss along tangents of fields, quantities and ``colours`` (phases, 3), by name, what is left
-    out being 0: a number, or of a batch in the shape ``leading``, (batch,). Vectors are (n, d), or all (n, 3)."""
+    """Return the derivative of a loss along tangents of fields, quantities and ``colours`` (phases, 3), by name, 0
+    where left out: a number, or of a batch in the shape ``leading``, (batch,). Vectors are (n, d), or all (n, 3)."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
     products = [
@@ -193,27 +191,27 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 
 
 class Loss(Protocol):
-    """A differentiable number of the end of a trajectory.
+    """Protocol of a loss: a differentiable number of the end of a trajectory.
 
     A loss of your own may have a method ``adjoint(end)``, of the derivatives alone, in the place of
     `value_and_adjoint`.
     """
 
     def value(self, end: Snapshot) -> float:
-        """The value of the loss for a run."""
+        """Return the value of the loss for the end of a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a table of
-        them by the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays, which
+        """Return the loss and its derivatives, which often share work: a tuple of NumPy arrays, or a table of them by
+        the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays, which
         ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
 
 
 @fixed
 class Frames:
-    """The sum of losses of several states on the way, by the number of steps before each."""
+    """A sum of losses of several states of a run, by the number of steps before each."""
 
     def __init__(self, losses: Mapping[int, Loss]):
-        """``losses`` {number of steps: loss}; 0 is the first state."""
+        """Set ``losses`` {number of steps: loss}; 0 is the first state."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         for step in losses:
@@ -222,30 +220,30 @@ class Frames:
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raises `InputError` where it does not fit a run with these time steps (scenes,) [s]."""
+        """Raise `InputError` where the losses do not fit a run with these time steps (scenes,) [s]."""
 
     @property
     def fingerprint(self) -> str:
-        """Tells one set of targets from another, for checkpoints."""
+        """Text that tells sets of targets apart, for checkpoints."""
         return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
 
 
 def fingerprint(loss: Any) -> str:
-    """A text that tells one loss from another: its own ``fingerprint``, the code of a function, or else the type."""
+    """Return a text that tells losses apart: the loss's ``fingerprint``, the code of a function, or the type."""
     return getattr(loss, "fingerprint", code_words(loss) if callable(loss) else type(loss).__qualname__)
 
 
 @dataclass(frozen=True, eq=False)
 class SnapshotBatch(Sequence[Snapshot]):
-    """A state of a rollout of a batch: ``end[b]`` is the `Snapshot` of scene b."""
+    """A state of a batch's rollout: ``end[b]`` is the `Snapshot` of scene b."""
 
     state: State
     """Warp arrays (batch n,), in the scenes' order; `State.numbers` shows them as (batch, n, ...)."""
     dimension: int
     colours: np.ndarray
-    """(batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    """Colours of the phases, (batch, phases, 3): red, green and blue, linear, from 0 to 1."""
     moment: Moment | None = None
-    """As that of `Snapshot`."""
+    """State with the parameters of the step after it; see `Snapshot.moment`."""
 
     def __repr__(self) -> str:
         particles = counted(len(self.state.positions) // len(self), "particle")
@@ -275,17 +273,17 @@ class SnapshotBatch(Sequence[Snapshot]):
 
     @property
     def positions(self) -> np.ndarray:
-        """(batch, n, d) [m], float64, read-only"""
+        """Positions of the particles, (batch, n, d) [m], float64, read-only."""
         return self.on_host["positions"]
 
     @property
     def velocities(self) -> np.ndarray:
-        """(batch, n, d) [m / s], float64, read-only"""
+        """Velocities of the particles, (batch, n, d) [m / s], float64, read-only."""
         return self.on_host["velocities"]
 
     @property
     def mass_fractions(self) -> np.ndarray:
-        """(batch, n, phases) [-], float64, read-only"""
+        """Mass fractions of the particles, (batch, n, phases) [-], float64, read-only."""
         return self.on_host["mass_fractions"]
 
     @cached_property
@@ -296,7 +294,7 @@ class SnapshotBatch(Sequence[Snapshot]):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
-    """One scene of a batch, whose arrays come to the host with those of the others."""
+    """A snapshot of one scene of a batch, whose arrays come to the host with those of the others."""
 
     batch: SnapshotBatch
     number: int
@@ -310,19 +308,19 @@ class _Member(Snapshot):
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """A loss that looks at all scenes of a batch at once, which saves a launch and a look of the host for each. Scene b
-    gets the bits that it would get alone."""
+    """Protocol of a loss of all scenes of a batch at once, which saves a launch and a host read for each. Scene b gets
+    the bits that it would get alone."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """(batch,) the losses; of scenes that were lost they mean nothing."""
+        """Return the losses (batch,); those of lost scenes are meaningless."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """The same, and the derivatives with respect to the states, as Warp arrays: ``end.state.like()`` makes them,
-        all 0, and ``set({"positions": array})`` of it writes an array (batch, n, d)."""
+        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays:
+        ``end.state.like()`` makes them, all 0, and its ``set({"positions": array})`` writes an array (batch, n, d)."""
 
 
 def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
-    """(batch,) the losses of some scenes; NaN for others."""
+    """Return the losses (batch,) of some scenes; NaN for others."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         found[members] = loss.values(end)[members]
@@ -334,7 +332,7 @@ def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.n
 def batch_values_and_adjoints(
     loss: Loss, end: SnapshotBatch, members: Sequence[int]
 ) -> tuple[np.ndarray, SnapshotAdjoint]:
-    """(batch,) the losses of some scenes, NaN for others, and the adjoints of their states, 0 for others."""
+    """Return the losses (batch,) of some scenes, NaN for others, and the adjoints of their states, 0 for others."""
     found = np.full(len(end), np.nan)
     if isinstance(loss, BatchedLoss):
         all_found, state = loss.values_and_adjoint(end)

@@ -30,12 +30,12 @@ from cortado.scene.quantity_names import check_readable
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"
-"""Its arguments, in words."""
+"""Descriptions of the arguments of a loss that is a function of Warp arrays."""
 
 
 @fixed
 class Recorded:
-    """A loss that is any function of Warp arrays, differentiated by Warp's tape.
+    """A loss made of any function of Warp arrays, differentiated by Warp's tape.
 
     ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
     the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
@@ -48,7 +48,7 @@ class Recorded:
 
     @property
     def fingerprint(self) -> str:
-        """Tells the loss from one of another function, or of other numbers, for searches that go on."""
+        """Text that tells losses of other functions or numbers apart, for searches that go on."""
         return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP
@@ -72,21 +72,21 @@ class Recorded:
 
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
-"""What the arrays of an adjoint are derivatives with respect to, in words."""
+"""Names in words of the fields that the arrays of an adjoint differentiate by."""
 
 
 class CheckedLoss:
-    """A loss whose value is a number, and whose adjoint fits the state."""
+    """A wrapper of a loss that checks that its value is a number, and that its adjoint fits the state."""
 
     def __init__(self, loss: Any):
-        """A `Loss`; an ``adjoint`` of its own takes the place of ``value_and_adjoint``."""
+        """Wrap a `Loss`; its own ``adjoint``, if any, takes the place of ``value_and_adjoint``."""
         self._loss = loss
 
     def value(self, end: Snapshot) -> float:
         return as_one_number("the loss's value", self._loss.value(end))
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """As that of `Loss`; arrays come in float64."""
+        """Return the loss and its derivatives, checked, with NumPy arrays in float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
@@ -112,7 +112,7 @@ class CheckedLoss:
 
 
 class CheckedBatchedLoss(CheckedLoss):
-    """The same of a loss that looks at all scenes of a batch at once."""
+    """A wrapper of a `BatchedLoss` that checks its results."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
         return _checked_array("values", self._loss.values(end), (len(end),))
@@ -123,7 +123,7 @@ class CheckedBatchedLoss(CheckedLoss):
 
 
 def as_loss(loss: Any) -> Loss:
-    """A loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
+    """Return a loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -152,7 +152,7 @@ def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
 
 
 def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
-    """Adjoints by the names of fields of a state and of quantities."""
+    """Return adjoints by the names of state fields and quantities, checked."""
     for name in bar:
         check_readable(name, "a name in the loss's adjoint", end.state.names)
     return {name: _checked_share(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
@@ -174,17 +174,17 @@ def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _layout(array: wp.array) -> str:
-    """What has to be the same for one array to be copied onto another."""
+    """Return a Warp array's type, shape and device in words, which decide if one array can be copied to another."""
     return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"
 
 
 class LossesByStep(dict[int, Loss]):
-    """The losses of a run by the number of steps before the states that they judge."""
+    """The losses of a run, each by the number of steps before the state that it judges."""
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
-        """``loss`` of the state after all ``steps``, or `Frames` of several. Raises `InputError` for what is no loss,
-        for frames that a run of so many steps does not have, and where the steps are ``chosen`` for frames at times of
-        their own."""
+        """Take a ``loss`` of the state after all ``steps``, or `Frames` of several. Raises `InputError` for what is no
+        loss, for frames that a run of so many steps does not have, and where the steps are ``chosen`` for frames at
+        times of their own."""
         if chosen and getattr(loss, "time_step", None) is not None:
             raise InputError(
                 f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
@@ -200,14 +200,14 @@ class LossesByStep(dict[int, Loss]):
         self._frames = loss if isinstance(loss, Frames) else None
 
     def _check(self, ends: Mapping[int, Any]) -> None:
-        """Raises `InputError` for states of a run that the losses do not fit."""
+        """Raise `InputError` for states of a run that the losses do not fit."""
         if self._frames is not None:
             end = next(iter(ends.values()))
             self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Their sum, given states by the number of steps before them; of a batch (batch,), NaN but for the scenes that
-        are ``going``, which is None of a single scene."""
+        """Return the sum of the losses, given states by the number of steps before them; of a batch (batch,), NaN
+        except for the scenes ``going``, which is None for a single scene."""
         self._check(ends)
         if going is None:
             return sum(loss.value(ends[step]) for step, loss in self.items())
@@ -216,7 +216,7 @@ class LossesByStep(dict[int, Loss]):
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """The same, and the adjoints of the states by the number of steps before them."""
+        """Return the sum of the losses, as `total`, and the states' adjoints by number of steps."""
         self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}

@@ -31,23 +31,23 @@ from cortado.render.rays import camera_tangent_type, camera_type, interpolation_
 from cortado.render.views import View, ViewTangent
 
 SAMPLES_PER_CELL = 2
-"""Samples of a ray on one node distance."""
+"""Number of samples of a ray per node distance."""
 
 
 @cache
 def pose_type(precision: Precision) -> Any:
-    """Warp vector type of the adjoint of a pose: for the position (3), for a turn about it (3)."""
+    """Return the Warp vector type of a pose's adjoint: three numbers for the position, three for a turn about it."""
     return wp.types.vector(length=6, dtype=precision.real)
 
 
 @cache
 def brightness_functions(precision: Precision) -> tuple[Any, Any]:
-    """Warp functions ``brightness`` E(u) and ``brightness_derivative`` E'(u); both take exp(-u) besides."""
+    """Return Warp functions E(u) = (1 - exp(-u)) / u and E'(u); both take exp(-u) besides."""
     real = precision.real
 
     @wp.func
     def brightness(u: real, passed: real) -> real:
-        """Below 0.1, where the formula cancels, the series sum_n (-u)^n / (n + 1)!: its rest is below 1e-17."""
+        """Return E(u); below 0.1, where the formula cancels, by the series sum_n (-u)^n / (n + 1)!, to 1e-17."""
         if u > real(0.1):
             return (real(1.0) - passed) / u
         total = real(1.0)
@@ -57,7 +57,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
     @wp.func
     def brightness_derivative(u: real, passed: real) -> real:
-        """Below 0.1 the series -sum_n (n + 1) (-u)^n / (n + 2)!."""
+        """Return E'(u); below 0.1 by the series -sum_n (n + 1) (-u)^n / (n + 2)!."""
         if u > real(0.1):
             return (passed * (real(1.0) + u) - real(1.0)) / (u * u)
         total = real(1.0)
@@ -70,15 +70,15 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class AbsorptionKernels(Kernels):
-    """The kernels that march along rays."""
+    """The kernels that march along rays through the colour field, with their derivatives."""
 
     gather: Any
-    """From the adjoints of samples to those of nodes."""
+    """Kernel from the adjoints of samples to those of nodes."""
 
 
 @cache
 def absorption_kernels(precision: Precision) -> AbsorptionKernels:
-    """``forward``, ``tangent`` and ``adjoint`` are kernels over pixels, ``gather`` is one over nodes."""
+    """Return the ray marching kernels: ``forward``, ``tangent`` and ``adjoint`` over pixels, ``gather`` over nodes."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     camera_tangent = camera_tangent_type(precision)
@@ -94,7 +94,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
 
     @wp.func
     def diagonal(nodes: nodes_struct) -> vector:
-        """The diagonal of one cell [m]."""
+        """Return the diagonal vector of one cell [m]."""
         return vector(nodes.cell, nodes.cell, nodes.cell)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -108,7 +108,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         image: wp.array(dtype=vector),
         spans: wp.array(dtype=wp.vec2i),
     ):
-        """``spans`` are the samples that may lie in the field: all others are empty."""
+        """Write the image of a field, and as ``spans`` the range of samples of each ray that may lie in the field."""
         pixel = wp.tid()
         o = start(pixel, camera)
         d = direction(pixel, camera)
@@ -177,7 +177,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         samples_bar: wp.array2d(dtype=rgba),
         pose_bar: wp.array(dtype=pose),
     ):
-        """``samples_bar`` [sample of the span, pixel]; ``pose_bar`` gathers the adjoint of the pose ray by ray."""
+        """Write the adjoints of samples, [sample of the span, pixel], and of the pose, ray by ray."""
         pixel = wp.tid()
         bar = image_bar[pixel]
         o = start(pixel, camera)
@@ -215,7 +215,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         # out
         field_bar: wp.array3d(dtype=rgba),
     ):
-        """Every node gathers from the samples in the eight cells around it, found by way of the screen."""
+        """Sum each node's adjoint from the samples in the eight cells around it, found by way of the screen."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -237,7 +237,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
 
 
 def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
-    """The struct by which kernels know a camera whose samples are so far apart [m]."""
+    """Return the Warp struct of a camera with samples ``step`` [m] apart."""
     struct = camera_type(precision)()
     struct.position = precision.vector(*camera.position)
     struct.orientation = type(struct.orientation)(*camera.orientation.ravel())
@@ -249,7 +249,7 @@ def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
 
 
 def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any:
-    """The struct by which kernels know the change of a view whose samples are so far apart [m]."""
+    """Return the Warp struct of the change of a view with samples ``step`` [m] apart."""
     struct = camera_tangent_type(precision)()
     struct.position, struct.turn = precision.vector(*along.translation), precision.vector(*along.rotation)
     struct.half_width, struct.growth = along.half_width
@@ -258,10 +258,10 @@ def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any
 
 
 class RayMarcher:
-    """Makes pictures of one view of fields. What `adjoint` returns is overwritten by its next call."""
+    """A renderer of fields to pictures of one view by ray marching; `adjoint` overwrites its last result."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
-        """``nodes`` as `ColourField.nodes`."""
+        """Allocate for a view of a grid of nodes, which is `ColourField.nodes`."""
         self._step = step = nodes.cell / SAMPLES_PER_CELL
         self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
@@ -284,11 +284,11 @@ class RayMarcher:
         self._sum = sum_of(self._pose, self.pixels, device)
 
     def march(self, field: wp.array) -> None:
-        """Make the image of a field (nz, ny, nx)."""
+        """Compute the image of a field (nz, ny, nx)."""
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
-        """The tangent (pixels,) of the image of the field, along that of the field and that of the view. The next call
+        """Return the tangent (pixels,) of the image, along that of the field and that of the view. The next call
         overwrites it, and so does `adjoint`."""
         camera_dot = camera_tangent(along, self._step, self._precision)
         given = {"background": self._background, "field": field, "field_dot": field_dot, "camera_dot": camera_dot}
@@ -296,8 +296,8 @@ class RayMarcher:
         return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
-        """The derivative with respect to the field and to the pose (6,), from that with respect to the image (pixels,
-        3) of the field."""
+        """Return the derivative with respect to the field and to the pose (6,), from that with respect to the image
+        (pixels, 3)."""
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)
@@ -306,8 +306,8 @@ class RayMarcher:
 
     @cached_property
     def _samples_bar(self) -> wp.array:
-        """(samples, pixels): the greatest array by far, made when it is first needed. No ray has more samples in the
-        field than its diagonal has room for."""
+        """Adjoints of samples (samples, pixels): by far the greatest array, made when first needed. No ray has more
+        samples in the field than its diagonal has room for."""
         cells = np.linalg.norm(np.array(self._nodes.shape) + 1)
         samples = min(int(cells * SAMPLES_PER_CELL) + 4, self._camera.samples)
         parts = sample_parts(samples, self.pixels, self._precision.bytes)

@@ -13,7 +13,7 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Finite numbers as a tuple of that length, or an `InputError` that calls them ``name``."""
+    """Return finite numbers as a tuple of a length; raises an `InputError` that calls them ``name``."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -21,7 +21,7 @@ def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> 
 
 
 def positive(name: str, value: float) -> None:
-    """An `InputError` where a number is not."""
+    """Raise `InputError` for a number that is not positive and finite."""
     if not 0 < as_one_number(name, value) < np.inf:
         raise InputError(f"{name} is {shown(value)}, but must be a positive number.")
 
@@ -31,13 +31,13 @@ class Camera:
     """The base of all cameras. Samples along a ray stand at fixed distances between ``near`` and ``far``."""
 
     position: Vector
-    """[m], (3,)"""
+    """Position of the camera [m], (3,)."""
     look_at: Vector
-    """The point in the middle of the picture [m], (3,)."""
+    """Point in the middle of the picture [m], (3,)."""
     up: Vector
-    """A direction that points upwards in the picture, not along the view, (3,)."""
+    """Direction (3,) that points upwards in the picture, not along the view."""
     resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
-    """Columns and rows; pixels are square."""
+    """Numbers of columns and rows; pixels are square."""
     near: float = field(default=0.0, kw_only=True)
     """Distance of the first sample's layer [m]."""
     far: float | None = field(default=None, kw_only=True)
@@ -61,13 +61,13 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """``far``, which is a number once the camera is made."""
+        """Distance at which samples end [m]: ``far``, which is a number once the camera is made."""
         assert self.far is not None
         return self.far
 
     @property
     def orientation(self) -> np.ndarray:
-        """A rotation (3, 3) whose columns point to the right, upwards and backwards in the picture."""
+        """Rotation matrix (3, 3) whose columns point to the right, upwards and backwards in the picture."""
         back = np.subtract(self.position, self.look_at)
         back /= np.linalg.norm(back)
         right = np.cross(self.up, back)
@@ -76,11 +76,12 @@ class Camera:
 
     @property
     def half_width(self) -> tuple[float, float]:
-        """Half of the width seen at the camera [m] and how much wider that is per depth [-]."""
+        """Half of the width seen at the camera [m], and its growth per depth [-]."""
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
-        """The camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,) [rad].
+        """Return the camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,)
+        [rad]. The renderer gives derivatives with respect to the pose in these coordinates, at zero.
 
         These are the coordinates, at zero, in which the renderer gives the derivative with respect to the pose.
         """
@@ -95,10 +96,10 @@ class Camera:
 @public
 @dataclass(frozen=True)
 class Orthographic(Camera):
-    """Parallel rays."""
+    """A camera with parallel rays."""
 
     width: float
-    """What the width of the picture shows [m]."""
+    """Width of the region that the picture shows [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,10 +113,10 @@ class Orthographic(Camera):
 @public
 @dataclass(frozen=True)
 class Perspective(Camera):
-    """Rays from one point."""
+    """A camera with rays from one point."""
 
     field_of_view: float
-    """The angle that the width of the picture spans [degree]."""
+    """Angle that the width of the picture spans [degree]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +129,7 @@ class Perspective(Camera):
 
 
 def check_resolution(resolution: tuple[int, int]) -> None:
-    """An `InputError` unless these are numbers of columns and rows."""
+    """Raise `InputError` unless ``resolution`` is two positive whole numbers, columns and rows."""
     whole = isinstance(resolution, Sequence) and all(is_whole(n) and n > 0 for n in resolution)
     if not whole or len(resolution) != 2:
         raise InputError(

@@ -30,20 +30,20 @@ from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
 
 MOST_NODES = 2**27
-"""Of a colour field: 2 GiB in float32."""
+"""Greatest number of nodes of a colour field: 2 GiB in float32."""
 MOST_CELLS = 2**20
-"""Of the grid in which particles are sorted."""
+"""Greatest number of cells of the grid in which particles are sorted."""
 
 
 @cache
 def rgba_type(precision: Precision) -> Any:
-    """Warp vector type of (P, A): the colour times the coverage, three components, and the coverage."""
+    """Return the Warp vector type of (P, A): colour times coverage, three components, and coverage."""
     return wp.types.vector(length=4, dtype=precision.real)
 
 
 @cache
 def nodes_type(precision: Precision) -> Any:
-    """The Warp struct of a regular grid of nodes; arrays over nodes are [z, y, x]."""
+    """Return the Warp struct of a regular grid of nodes; arrays over nodes are [z, y, x]."""
     real, vector = precision.real, precision.vector
 
     class Nodes:
@@ -69,8 +69,8 @@ def nodes_type(precision: Precision) -> Any:
 
 @cache
 def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Warp functions ``place`` (where a node is [m]), ``nearest`` (a separation from the nearest image) and ``image``
-    (where one of the images of a particle is that nodes may feel)."""
+    """Return Warp functions ``place`` (position of a node [m]), ``nearest`` (a separation to the nearest image) and
+    ``image`` (position of an image of a particle that nodes may feel)."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -87,7 +87,7 @@ def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
     @wp.func
     def image(number: int, x: vector, h: real, nodes: nodes_struct) -> vector:
-        """The first is the lowest that reaches up to the first node along every axis; h is the support."""
+        """Return an image of x, from the lowest whose support h reaches the first node along every axis."""
         t = wp.cw_mul(x - nodes.origin + vector(h, h, h), nodes.turn)
         n_x = nodes.images[0]
         n_y = nodes.images[1]
@@ -99,13 +99,13 @@ def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 @cache
 def colours_type(precision: Precision, phases: int) -> Any:
-    """Warp matrix type (phases, 3)."""
+    """Return the Warp matrix type (phases, 3) of phase colours."""
     return wp.types.matrix(shape=(phases, 3), dtype=precision.real)
 
 
 @cache
 def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
-    """Kernels ``forward`` and ``tangent`` (which sort positions besides), and ``adjoint``."""
+    """Return kernels of particle colours: ``forward`` and ``tangent`` (which also sort), and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
     module = kernel_module(f"phase_colour_{phases}_{precision.name}")
@@ -151,7 +151,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
         c_scene_bar: wp.array(dtype=fractions),
         colours_bar: wp.array(dtype=colours_matrix),
     ):
-        """``colours_bar`` gathers the adjoint of the colours particle by particle."""
+        """Write the adjoint of mass fractions, and particle by particle that of the phase colours."""
         j = wp.tid()
         bar = colour_scene_bar[j]
         c_scene_bar[j] = colours[0] * bar
@@ -162,7 +162,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
 
 @cache
 def colour_field_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward`` and ``tangent``, over nodes, and ``adjoint``, over sorted particles."""
+    """Return kernels of the field: ``forward`` and ``tangent``, over nodes, ``adjoint``, over sorted particles."""
     precision = discretisation.precision
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
@@ -185,7 +185,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
         per_h: real,
         sigma: real,
     ) -> rgba:
-        """Over the particles of the cells c_x - 1, c_x and c_x + 1 of one row."""
+        """Return a node's sum over the particles of cells c_x - 1, c_x and c_x + 1 of one row."""
         n = grid.shape[0]
         total = rgba()
         for o in range(below(n), above(n)):
@@ -257,7 +257,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.func
     def first_node(s: real, n: int) -> int:
-        """The first of n nodes that is not below s, in node distances."""
+        """Return the first of n nodes that is not below s, in node distances."""
         return int(wp.clamp(wp.ceil(s), real(0.0), real(n)))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -301,8 +301,8 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 def nodes_over(
     lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
 ) -> Any:
-    """The struct of nodes of that distance [m] over a region (d,) to (d,) [m], and beyond as far as particles in it
-    are felt, but not along axes with a period [m]. In 2-D they are one layer."""
+    """Return the struct of nodes ``cell`` [m] apart over a region (d,) to (d,) [m], and as far beyond as its particles
+    are felt, except along axes with a period [m]. In 2-D nodes are one layer."""
     margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
@@ -323,7 +323,7 @@ def nodes_over(
 
 
 class ColourField:
-    """Gathers a fixed number of particles into a field. What `adjoint` returns is overwritten by its next call."""
+    """A map from a fixed number of particles to a field on a grid; `adjoint` overwrites its last result."""
 
     def __init__(
         self,
@@ -339,7 +339,7 @@ class ColourField:
         precision: Precision,
         device: Any,
     ):
-        """Of particles in a region (d,) to (d,) [m]; arguments as those of the `Renderer`."""
+        """Allocate for particles in a region (d,) to (d,) [m]; arguments are those of the `Renderer`."""
         self._particles = particles
         self._tint = phase_colour_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
@@ -368,7 +368,7 @@ class ColourField:
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
 
     def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:
-        """Make the field of positions (n,) [m], mass fractions (n,) [-] and the colours (phases, 3) of the phases."""
+        """Compute the field from positions (n,) [m], mass fractions (n,) [-] and the phases' colours (phases, 3)."""
         self._sort(positions)
         wp.copy(self._fractions, fractions)
         self._colours.assign(colours[None])
@@ -380,8 +380,8 @@ class ColourField:
         )
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
-        """The tangent (nz, ny, nx) of the last field, along those of positions (n,), fractions (n,) and colours
-        (phases, 3). The next call overwrites it, and what `adjoint` returned."""
+        """Return the tangent (nz, ny, nx) of the last field, along tangents of positions (n,), fractions (n,) and
+        colours (phases, 3). The next call overwrites it, and the result of `adjoint`."""
         own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
         along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
         self._colours_dot.assign(colours_dot[None])
@@ -396,8 +396,8 @@ class ColourField:
         return wp.zeros_like(self.values)
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
-        """The derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with respect
-        to the field."""
+        """Return the derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with
+        respect to the field."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
         bars = {
             "x_scene_bar": self._x_bar,

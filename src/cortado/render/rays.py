@@ -23,7 +23,7 @@ from cortado.render.colour_field import nodes_type, rgba_type
 
 @cache
 def camera_type(precision: Precision) -> Any:
-    """The Warp struct of a camera."""
+    """Return the Warp struct of a camera."""
     real, vector = precision.real, precision.vector
     matrix = wp.types.matrix(shape=(3, 3), dtype=real)
 
@@ -50,7 +50,7 @@ def camera_type(precision: Precision) -> Any:
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
-    """The Warp struct of how a view changes; see `cortado.render.views.ViewTangent`."""
+    """Return the Warp struct of a view's change; see `cortado.render.views.ViewTangent`."""
     real, vector = precision.real, precision.vector
 
     class CameraTangent:
@@ -79,16 +79,16 @@ class RayFunctions:
 
 @cache
 def ray_functions(precision: Precision) -> RayFunctions:
-    """Warp functions ``start`` and ``direction`` of a pixel's ray, ``distance`` of a sample along it,
-    ``start_tangent`` and ``direction_tangent`` as the view changes,
-    ``samples_within`` a box, and ``pixels_before`` a box: the range of pixels whose rays may hit it."""
+    """Return Warp functions of rays: ``start`` and ``direction`` of a pixel's, ``distance`` of a sample along it,
+    ``start_tangent`` and ``direction_tangent`` as the view changes. ``samples_within`` gives samples in a box, and
+    ``pixels_before`` the pixels whose rays may hit it."""
     real, vector = precision.real, precision.vector
     camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
 
     @wp.func
     def on_screen(pixel: int, c: camera_struct) -> vector:
-        """(u, v, 0) of the middle of a pixel; row 0 is at the top."""
+        """Return the screen point (u, v, 0) of a pixel's middle; row 0 is at the top."""
         column = pixel % c.columns
         row = pixel // c.columns
         return vector(real(2 * column + 1 - c.columns), real(c.rows - 2 * row - 1), real(0.0)) / real(c.columns)
@@ -120,7 +120,7 @@ def ray_functions(precision: Precision) -> RayFunctions:
 
     @wp.func
     def samples_within(o: vector, d: vector, lower: vector, upper: vector, c: camera_struct) -> wp.vec2i:
-        """First sample in a box and the one behind the last; up to one more at either end, never one too few."""
+        """Return the first sample in a box and the one behind the last; up to one more at either end, never too few."""
         t_in = -huge
         t_out = huge
         for axis in range(3):
@@ -138,7 +138,9 @@ def ray_functions(precision: Precision) -> RayFunctions:
 
     @wp.func
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
-        """First column, the one behind the last, first row, the one behind the last; never one too few.
+        """Return the first column, the one behind the last, first row, and the one behind the last; never too few.
+        Where the map to the screen is regular, over the whole box, its extremes are at corners. A box that reaches
+        behind a camera with a point of view may be anywhere on the screen.
 
         Where the map to the screen is regular, over the whole box, its extremes are at corners. A box that
         reaches behind a camera with a point of view may be anywhere on the screen.
@@ -195,7 +197,7 @@ class InterpolationFunctions:
 
 @cache
 def interpolation_functions(precision: Precision) -> InterpolationFunctions:
-    """Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
+    """Return Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
     direction) and ``trilinear_weight`` (of one node)."""
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
@@ -213,7 +215,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def cell(x: vector, nodes: nodes_struct):
-        """The node at which the cell of a point begins, and how far the point is from it, in node distances."""
+        """Return the first node of a point's cell, and the point's offset from it, in node distances."""
         s = nodes.frequency * (x - nodes.origin)
         i = int(wp.floor(s[0]))
         j = int(wp.floor(s[1]))
@@ -234,7 +236,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def slope(f: vector, a: int, b: int, c: int) -> vector:
-        """The gradient of a corner's weight, in node distances."""
+        """Return the gradient of a corner's weight, in node distances."""
         return vector(
             real(2 * a - 1) * part(f[1], b) * part(f[2], c),
             real(2 * b - 1) * part(f[2], c) * part(f[0], a),
@@ -243,7 +245,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
-        """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
+        """Return the gradient of bar . value; where it jumps, that of the cell which begins there."""
         i, j, k, f = cell(x, nodes)
         total = vector()
         for a in range(2):
@@ -254,7 +256,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
-        """The derivative of the value at a point that moves; on the face of a cell as `gradient`."""
+        """Return the derivative of the value at a point that moves; on the face of a cell as `gradient`."""
         i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):
@@ -265,7 +267,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
 
     @wp.func
     def trilinear_weight(x: vector, x_g: vector, nodes: nodes_struct) -> real:
-        """The weight of the node at x_g in the value at x."""
+        """Return the weight of the node at x_g in the value at x."""
         s = nodes.frequency * (x - x_g)
         w_x = wp.max(real(1.0) - wp.abs(s[0]), real(0.0))
         w_y = wp.max(real(1.0) - wp.abs(s[1]), real(0.0))

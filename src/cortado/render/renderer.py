@@ -28,21 +28,21 @@ class RenderAdjoint:
     them."""
 
     positions: wp.array
-    """(n,) vectors [1 / m]."""
+    """Derivative with respect to positions, (n,) vectors [1 / m]."""
     fractions: wp.array
-    """(n,) vectors of one number for each phase [-]."""
+    """Derivative with respect to mass fractions, (n,) vectors of one number for each phase [-]."""
     colours: np.ndarray
-    """(phases, 3) [-]"""
+    """Derivative with respect to the phases' colours, (phases, 3) [-]."""
     translation: np.ndarray
-    """(3,) with respect to the position of the camera [1 / m]."""
+    """Derivative (3,) with respect to the camera's position [1 / m]."""
     rotation: np.ndarray
-    """(3,) with respect to a rotation vector that turns the camera about its position [1 / rad]."""
+    """Derivative (3,) with respect to a rotation vector of the camera about its position [1 / rad]."""
 
 
 @public
 @fixed
 class Renderer:
-    """Renders a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.
+    """A renderer of a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.
 
     They are smooth functions of positions, fractions and colours, and piecewise smooth ones of the camera's pose: where
     samples lie on faces between cells of the colour field, as those of a view along an axis may, the derivative with
@@ -123,49 +123,49 @@ class Renderer:
         return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the renderer as its constructor's arguments."""
         settings = {**self._settings, "device": self._device.alias}
         return _made_again, (self.view, settings, self._precision.name)
 
     @property
     def fingerprint(self) -> str:
-        """Tells one view from another, for checkpoints, and one grid of nodes."""
+        """Text that tells views and grids of nodes apart, for checkpoints."""
         nodes = self._field.nodes
         return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)} {tuple(nodes.period)}"
 
     def in_precision(self, precision: Precision) -> "Renderer":
-        """Another one, of the same pictures in that precision."""
+        """Return a renderer of equal pictures in another precision."""
         return Renderer(self.view, **self._settings, precision=precision)
 
     def seen_by(self, view: View) -> "Renderer":
-        """Another one, of the same particles as another view shows them."""
+        """Return a renderer of equal particles in another view."""
         return Renderer(view, **self._settings, precision=self._precision)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """The shape of a picture: rows, columns, 3."""
+        """Shape of a picture: rows, columns, 3."""
         columns, rows = self.view.camera.resolution
         return rows, columns, 3
 
     @property
     def precision(self) -> Precision:
-        """The precision that it computes in."""
+        """Precision of the computation."""
         return self._precision
 
     @property
     def device(self) -> Any:
-        """The device on which the renderer computes."""
+        """Device on which the renderer computes."""
         return self._device
 
     @property
     def inputs(self) -> dict[str, tuple[int, ...]]:
-        """The shapes of what `render` takes, by name."""
+        """Shapes of the arguments of `render`, by name."""
         n, phases = self._particles, self._phases
         return {"positions": (n, self._dimension), "fractions": (n, phases), "colours": (phases, 3)}
 
     @WARP
     def render(self, positions: Any, fractions: Any = None, colours: Any = None) -> np.ndarray:
-        """The picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.
+        """Return the picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.
 
         Args:
             positions: a frame, such as ``trajectory[k]`` or ``problem.end(parameters)``, which brings its own mass
@@ -187,7 +187,7 @@ class Renderer:
     def tangent(
         self, positions: Any = None, fractions: Any = None, colours: Any = None, view: ViewTangent | None = None
     ) -> np.ndarray:
-        """The derivative (rows, columns, 3) of the last picture along a direction; what is left out of it is 0.
+        """Return the derivative (rows, columns, 3) of the last picture along a direction, whose omitted parts are 0.
 
         Args:
             positions: (n, d) [m], the direction of the positions.
@@ -209,8 +209,8 @@ class Renderer:
 
     @WARP
     def adjoint(self, image_bar: np.ndarray) -> RenderAdjoint:
-        """The derivative of a function of the last picture, from its derivative with respect to that picture (rows,
-        columns, 3)."""
+        """Return the derivative of a function of the last picture, from its derivative with respect to that picture
+        (rows, columns, 3)."""
         self._require_picture("adjoint")
         image_bar = _of_shape("image_bar", image_bar, self.shape)
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
@@ -218,12 +218,13 @@ class Renderer:
 
     @WARP
     def field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coverage (nx, ny, nz) and colour times coverage (nx, ny, nz, 3) [-] at the nodes, of the last picture."""
+        """Return coverage (nx, ny, nz) and colour times coverage (nx, ny, nz, 3) [-] at the nodes of the last
+        picture."""
         found = self._field.values.numpy().astype(np.float64).transpose(2, 1, 0, 3)
         return found[..., 3].copy(), found[..., :3].copy()
 
     def nodes(self) -> np.ndarray:
-        """Where the nodes are (nx, ny, nz, 3) [m]."""
+        """Return the positions of the nodes (nx, ny, nz, 3) [m]."""
         nodes = self._field.nodes
         indices = np.moveaxis(np.indices(tuple(nodes.shape)), 0, -1)
         return np.array(nodes.origin, dtype=np.float64) + nodes.cell * indices
@@ -233,7 +234,7 @@ class Renderer:
             raise InputError(f"There is no picture to differentiate; call render before {method}.")
 
     def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
-        """The arguments of `render`, a frame taken apart, and what was left out filled in."""
+        """Return the arguments of `render` with a frame taken apart, and defaults filled in."""
         if hasattr(positions, "positions"):
             frame, positions = positions, positions.positions
             fractions = frame.mass_fractions if fractions is None else fractions
@@ -248,7 +249,7 @@ class Renderer:
         return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
-        """A Warp array (n,) of vectors as it is, or one of an array (n, components)."""
+        """Return a Warp array (n,) of vectors, checked as it is, or made of an array (n, components)."""
         if not isinstance(values, wp.array):
             array = _of_shape(name, values, (self._particles, components))
             if not np.isfinite(array).all():

@@ -16,18 +16,18 @@ from cortado.scene.scene import Scene
 from cortado.scene.tables import sentences
 
 UP = {2: 2, 3: 1}
-"""The axis that points upwards, by dimension; in 2-D the one that the plane lacks."""
+"""Axis that points upwards, by dimension; in 2-D the one perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
 """Node distance over particle spacing, by dimension. On coarser nodes a particle's picture depends on where it lies
 between them, which catches single particles; in 2-D finer nodes cost next to nothing."""
 CLEARNESS = 8.0
-"""A volume is seen into as far as the scene is wide over this, unless the scene says more."""
+"""Width of the scene over the depth to which one sees into a volume, unless the scene sets it."""
 CAMERA = ("position", "look_at", "field_of_view", "extinction")
 """Keys of the table [render] that belong to one view."""
 
 
 class Pictured(Protocol):
-    """A `cortado.Simulation` as its renderer knows it."""
+    """Protocol of a `cortado.Simulation` as its renderer needs it."""
 
     scene: Scene
     positions: np.ndarray
@@ -39,11 +39,13 @@ class Pictured(Protocol):
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Number of space dimensions, 2 or 3."""
 
 
 def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above.
+    """Make a renderer for the particles of a simulation, after its scene's table [render], or from above. The
+    extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
+    `Simulation.renderer`.
 
     The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
     `Simulation.renderer`.
@@ -73,7 +75,7 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
 
 
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:
-    """The table [render] of a scene with some of its keys replaced; a camera stays with its view."""
+    """Return a scene's table [render] with some keys replaced; a camera stays with its view."""
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
     view = settings.get("view")
     if isinstance(view, str) and view != given.get("view"):

@@ -18,36 +18,36 @@ from cortado.render.cameras import Camera, Orthographic, Perspective, Vector, ch
 WHITE = (1.0, 1.0, 1.0)
 ZERO = (0.0, 0.0, 0.0)
 NUDGE = 1e-6
-"""Of a rotation vector [rad], for the direction in which a turned camera turns further."""
+"""Step of a rotation vector [rad], for the direction in which a turned camera turns further."""
 
 
 class View(Protocol):
-    """A view as the renderer knows it."""
+    """Protocol of a view as the renderer needs it: camera, extinction and background."""
 
     @property
     def camera(self) -> Camera: ...
 
     @property
     def extinction(self) -> float:
-        """The extinction of filled fluid [1 / m]."""
+        """Extinction of filled fluid [1 / m]."""
         ...
 
     @property
     def background(self) -> Vector:
-        """Linear RGB, (3,)."""
+        """Background in linear RGB, (3,)."""
         ...
 
 
 @public
 @dataclass(frozen=True)
 class Volume:
-    """Fluid that one can look into, from any camera."""
+    """A view of translucent fluid, from any camera."""
 
     camera: Camera
     extinction: float
-    """Of filled fluid [1 / m]: after 1 / extinction, 1 / e of the light is left."""
+    """Extinction of filled fluid [1 / m]: after 1 / extinction, 1 / e of the light is left."""
     background: Vector = WHITE
-    """Linear RGB, (3,)."""
+    """Background in linear RGB, (3,)."""
 
     def __post_init__(self) -> None:
         positive("extinction", self.extinction)
@@ -57,7 +57,7 @@ class Volume:
 @public
 @dataclass(frozen=True)
 class TopView:
-    """The colour at the free surface from above, as who pours latte art sees it.
+    """A view of the free surface's colour from above, as who pours latte art sees it.
 
     The picture shows the whole container, seen along the axis downwards; it is not mirrored. Columns run along the
     first of the other two axes, left to right. Then, with y upwards, rows run along z: row 0 has the lowest z, and the
@@ -69,14 +69,14 @@ class TopView:
     """Corner of the container [m], (2,) or (3,); in 2-D, where one looks at the plane, ``up_axis`` is 2."""
     upper: Vector
     spacing: float
-    """Of the particles [m]."""
+    """Spacing of the particles [m]."""
     resolution: tuple[int, int] = (256, 256)
-    """Columns and rows."""
+    """Numbers of columns and rows."""
     up_axis: int = 1
     opacity: float = 4.0
     """Extinction times spacing [-]: how well the first layer of particles hides the second."""
     background: Vector = WHITE
-    """Linear RGB, (3,)."""
+    """Background in linear RGB, (3,)."""
 
     def __post_init__(self) -> None:
         length = 2 if np.shape(self.lower) == (2,) else 3
@@ -96,7 +96,7 @@ class TopView:
 
     @cached_property
     def camera(self) -> Camera:
-        """High enough that all of the field lies below it."""
+        """Camera above the whole field, looking down."""
         lower, upper = np.array(self.lower), np.array(self.upper)
         back = np.eye(3)[self.up_axis]
         right = np.eye(3)[1 if self.up_axis == 0 else 0]
@@ -122,23 +122,23 @@ class TopView:
 
 @dataclass(frozen=True)
 class ViewTangent:
-    """The change of a view: the direction of a derivative."""
+    """A change of a view, as the direction of a derivative."""
 
     translation: Vector = ZERO
-    """Of the camera (3,) [m]."""
+    """Translation of the camera (3,) [m]."""
     rotation: Vector = ZERO
-    """Of the camera about its position, a rotation vector (3,) [rad]."""
+    """Rotation vector (3,) of the camera about its position [rad]."""
     half_width: tuple[float, float] = (0.0, 0.0)
-    """Of `Camera.half_width`: at the camera [m], and its growth with depth [-]."""
+    """Change of `Camera.half_width`: at the camera [m], and of its growth with depth [-]."""
     extinction: float = 0.0
-    """Of filled fluid [1 / m]."""
+    """Change of the extinction of filled fluid [1 / m]."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The view that was aimed at, and which of its numbers are searched: "translation" (3,) [m] and "rotation" (3,)
-    [rad] of the camera from where it was aimed at, its "field_of_view" [degrees] or, of parallel rays, its "width" [m],
-    and the "extinction" of the fluid [1/m]."""
+    """The search for unknown numbers of a view, from an aimed one. Names are "translation" (3,) [m] and "rotation" (3,)
+    [rad] of the camera, its "field_of_view" [degrees] or, with parallel rays, "width" [m], and the "extinction" of the
+    fluid [1/m]."""
 
     aimed: View
     names: tuple[str, ...] = ()
@@ -151,13 +151,13 @@ class Calibration:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """The values as the view was aimed."""
+        """Values of the searched numbers in the aimed view."""
         return {name: self._values[name] for name in self.names}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """By name, true for the numbers that no picture shows: how far a camera of parallel rays, which look along an
-        axis, is moved along them."""
+        """Masks by name, true for numbers that no picture shows: the shift of a camera with parallel rays along an
+        axis-aligned sight."""
         camera = self.aimed.camera
         if "translation" not in self.names or not isinstance(camera, Orthographic):
             return {}
@@ -165,7 +165,7 @@ class Calibration:
         return {"translation": np.isclose(np.abs(sight), np.linalg.norm(sight))}
 
     def view(self, values: Mapping[str, np.ndarray]) -> View:
-        """The view with these values; raises `InputError` where there is none."""
+        """Return the view with these values; raises `InputError` for impossible ones."""
         if not self.names:
             return self.aimed
         all_values = {**self._values, **values}
@@ -177,7 +177,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """The change of the view with these values along directions of some of them."""
+        """Return the change of the view with these values along directions of some of them."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO
@@ -194,7 +194,7 @@ class Calibration:
 
     @property
     def _values(self) -> dict[str, np.ndarray]:
-        """All numbers of the view that was aimed at."""
+        """All numbers of the aimed view, by name."""
         camera = self.aimed.camera
         found = {"translation": np.zeros(3), "rotation": np.zeros(3), "extinction": np.array(self.aimed.extinction)}
         if isinstance(camera, Perspective):

@@ -12,12 +12,12 @@ from cortado.particles.state import State, StateSeries
 from cortado.rollout.step_sizes import StepSizes
 
 MEMORY_BUDGET = 8 * 2**30
-"""Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
+"""Bytes of memory for checkpoints; a run that needs more keeps fewer states and recomputes the others."""
 
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Steps from one checkpoint to the next: the fewest with which no more states than affordable are alive at a time,
-    those between two checkpoints included; about the square root of the steps where that cannot be."""
+    """Return the steps between checkpoints: the fewest for which at most ``affordable`` states, with those between two
+    checkpoints, are alive at once; about the square root of the steps where none is."""
     if steps <= affordable:
         return 1
     intervals = range(1, isqrt(steps) + 2)
@@ -25,10 +25,10 @@ def checkpoint_interval(steps: int, affordable: int) -> int:
 
 
 class Checkpoints:
-    """Of one evaluation of a rollout."""
+    """The states that one forward run of a rollout keeps, from which a backward pass recomputes the others."""
 
     def __init__(self, first: State, interval: int):
-        """``interval``: steps from one to the next."""
+        """Begin with the first state alone; a checkpoint is kept every ``interval`` steps."""
         self._first, self._interval = first, interval
         self._states: dict[int, Callable[[], State]] = {0: lambda: first}
         """By their number, each as what gives the state."""
@@ -39,8 +39,8 @@ class Checkpoints:
         return len(self._states)
 
     def keep(self, step: int, chunk: list[State], series: StateSeries, length: int, spare: list[StateSeries]) -> None:
-        """Keep some of the states after a step. A chunk of the greatest ``length`` is all of a ``series``, and is
-        copied at once, to one of those that are ``spare``."""
+        """Keep every interval-th state of a chunk of steps; a chunk of full ``length`` is copied whole into one of the
+        ``spare`` series."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == length:
             copy = spare.pop() if spare else series.like()
@@ -54,8 +54,8 @@ class Checkpoints:
             self._states[n] = partial(_itself, state)
 
     def state(self, n: int, next_state: Callable[[int, State], State]) -> State:
-        """State n, asked for from the last to the first: a checkpoint, or computed once more from the one before, with
-        the states in between, by ``next_state(m, state m)``."""
+        """Return state ``n``, recomputed from the last checkpoint with ``next_state(m, state m)`` if need be; called
+        from the last to the first."""
         if n not in self._states:
             for m in range(n - n % self._interval, n):
                 self._states[m + 1] = partial(_itself, next_state(m, self._states[m]()))
@@ -64,7 +64,7 @@ class Checkpoints:
         return self._states[n]()
 
     def release(self) -> list[StateSeries]:
-        """The copies of whole chunks, which nobody may come back to any more."""
+        """Hand over the copies of whole chunks for reuse; no checkpoint may be read afterwards."""
         copies, self._copies = self._copies, []
         return copies
 
@@ -75,19 +75,19 @@ def _itself(state: State) -> State:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far an earlier process came with the same first state, parameters and steps of a single scene. The rest of
-    the run has the same bits as if that process had not stopped."""
+    """The point at which an earlier process stopped a run with equal first state, parameters and steps; a run resumed
+    here has the bits of an unbroken one."""
 
     step: int = 0
-    """Steps that it took."""
+    """Number of steps that the earlier process took."""
     state: State | None = None
-    """The state after them; None of the first one."""
+    """State after the steps of the earlier process; None for the first state of the run."""
     diagnostics: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """(step,) by name, what was noted of these steps."""
+    """Diagnostics of the earlier steps: arrays (step,) by name."""
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
-        """The state to go on from, its number, and whether the run ends with it. Raises `InputError` where states shall
-        be kept for a backward pass, as those before are not known."""
+        """Return the state to resume at, its step number, and True if the run ends there. Raises `InputError` where
+        ``keep`` asks for a backward pass, as earlier states are unknown."""
         if self.state is None:
             return initial, 0, False
         if keep:
@@ -95,7 +95,7 @@ class Progress:
         return self.state, self.step, sizes.go_on(self.step, self.state, self.diagnostics.get("time_steps"))
 
     def whole(self, found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """What was noted of all steps, given what the present process has noted, whose first steps mean nothing."""
+        """Return the diagnostics of all steps: those of the earlier process, then those just ``found``."""
         if self.state is None:
             return dict(found)
         n = self.step

@@ -26,13 +26,13 @@ from cortado.scene.parameters import Axis, Role
 from cortado.scene.restart import Clock, RestartState
 
 OfLost = Mapping[int, float]
-"""By the numbers of the scenes of a batch that were lost what derivatives of them are: 0 where only zeros were given,
+"""For each lost scene of a batch, by number, the value of its derivatives: 0 where the given derivatives are all zero,
 else NaN."""
 
 
 def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Parameters | None = None) -> OfLost:
-    """Of derivatives that are linear in those that were ``given`` of a state and its time, (batch,), and of
-    parameters."""
+    """Return, for each lost scene of a batch, 0 if all derivatives given of its state, time (batch,) and parameters are
+    0, else NaN."""
     found = {}
     for b in rollout.lost:
         own = [array.numpy() for array in given.member(b).arrays()]
@@ -42,7 +42,7 @@ def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Param
 
 
 def without_lost(lost: OfLost, found: Arrays) -> Arrays:
-    """Derivatives, of a batch with a first axis for the scenes, without numbers for scenes that were lost."""
+    """Overwrite the rows of lost scenes in the derivatives of a batch with NaN or 0, as ``lost`` says."""
     for b, number in lost.items():
         for array in found.values():
             array[b] = number
@@ -50,28 +50,28 @@ def without_lost(lost: OfLost, found: Arrays) -> Arrays:
 
 
 States = RestartState | tuple[RestartState, ...]
-"""Of a batch one for each scene."""
+"""One restart state, or a tuple with one for each scene of a batch."""
 Given = RestartState | Sequence[RestartState] | None
-"""A state to go on from, of a batch one for each scene; None for the scene's first."""
+"""A restart state to go on from, or a sequence with one for each scene of a batch; None for the scene's first state."""
 
 
 class HostStates:
-    """Takes states as a `RestartState`, of a batch one for each scene, and derivatives as NumPy arrays, and gives
-    them so, derivatives in float64."""
+    """The interface of steps to states on the host: it takes and gives a `RestartState` (one for each scene of a
+    batch), and derivatives as float64 NumPy arrays."""
 
     def __init__(self, simulation: Simulated):
         self._simulation = simulation
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """Give a rollout a state to begin at and checked parameters; raises `InputError` for a state of another
+        """Set the first state and the checked parameters of a rollout; raises `InputError` for a state of another
         simulation."""
         states = one_for_each(state, self._simulation.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, varied, states)
 
     def state(self, rollout: Rollout, state: State, steps: int) -> Any:
-        """A state of the rollout, after so many steps, which nobody can change; of a scene that is lost it has no
-        numbers, with which the scene may go on."""
+        """Return the state of a rollout after ``steps`` steps as read-only restart states; a lost scene of a batch has
+        NaN in all fields."""
         scenes = zip(clocks_after(rollout, steps), rollout.origins, strict=True)
         found = self.states(state, [RestartState({}, clock, origin) for clock, origin in scenes], rollout.lost)
         self._simulation.judged_states.update(found)
@@ -80,7 +80,7 @@ class HostStates:
     def states(
         self, state: State, scenes: Sequence[RestartState], lost: Container[int] = ()
     ) -> tuple[RestartState, ...]:
-        """The states of all scenes, with clocks and origins of ``scenes``."""
+        """Copy a device state to read-only restart states with clocks and origins of ``scenes``; lost ones are NaN."""
         fields, batch = state.numpy(self._simulation.dimension), self._simulation.batch
         found = []
         for b, scene in enumerate(scenes):
@@ -93,8 +93,8 @@ class HostStates:
         return tuple(found)
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives of a state's fields, 0 for those that are left out, and return that of its time; raises
-        `InputError`."""
+        """Write derivatives by field name to a device state, 0 for fields left out, and return the derivative of the
+        time; raises `InputError`."""
         fields, shapes = require_fields(what, given, to), shapes_of_fields(self._simulation, to.batch)
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
@@ -108,20 +108,20 @@ class HostStates:
         return times
 
     def _require_finite(self, what: str, array: np.ndarray) -> None:
-        """But for scenes of a batch that have no numbers at all, as those that are lost."""
+        """Raise `InputError` for derivatives that are not finite, except scenes of a batch that are all NaN."""
         for scene in [array] if self._simulation.batch is None else array:
             lost = self._simulation.batch is not None and np.isnan(scene).all()
             if not lost and not np.isfinite(scene).all():
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Derivatives of a state's fields, by name."""
+        """Return the derivatives of a state's fields by name, in float64, with NaN or 0 for lost scenes."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:
-    """A table of derivatives with respect to fields of a state, without that of its time, which is none.
+    """Return a table of derivatives by field name without its time. Raises `InputError` for other names and types.
 
     Raises `InputError` for anything but a table, and for names that are not fields of the state."""
     if not isinstance(given, Mapping):
@@ -134,7 +134,7 @@ def require_fields(what: str, given: Values, state: State) -> Values:
 
 
 def time_of(what: str, given: Values, state: State) -> np.ndarray:
-    """The derivative of a state's time, () or (batch,)."""
+    """Return the derivative with respect to a state's time, () or (batch,), from a table; 0 where left out."""
     members = () if state.batch is None else (state.batch,)
     found = as_numbers(f"{what} {STATE_TIME}", given.get(STATE_TIME, np.zeros(members)))
     if found.shape != members:
@@ -143,7 +143,7 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 
 
 def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
-    """Of each scene of a rollout, after so many steps. Scenes with one clock keep having one."""
+    """Return each scene's clock after ``steps`` steps of a rollout. Scenes that share a clock share its successor."""
     made: dict[tuple[int, float], Clock] = {}
     for clock, size in zip(rollout.clocks, rollout.time_steps.tolist(), strict=True):
         if (id(clock), size) not in made:
@@ -162,12 +162,12 @@ class DeviceState:
     """
 
     arrays: State
-    """All fields."""
+    """All fields of the state, on the device."""
     scenes: tuple[RestartState, ...]
-    """The clock and the origin of each scene of a batch, without fields."""
+    """Clock and origin of each scene of a batch, as restart states without fields."""
 
     def __getitem__(self, name: str) -> wp.array:
-        """A field by name: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...)."""
+        """Return a field by name: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...)."""
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
@@ -181,17 +181,17 @@ class DeviceState:
 
 
 class DeviceStates(HostStates):
-    """Takes states as a `DeviceState` and derivatives as arrays that speak DLPack, and gives them so."""
+    """The interface of steps to states on the device: a `DeviceState`, and derivatives as arrays of DLPack."""
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """Give a rollout a state on the device to begin at; see `HostStates.begin`."""
+        """Set the first state of a rollout from a `DeviceState`, and its parameters; see `HostStates.begin`."""
         self._require_taken(state)
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes, state.arrays)
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:
-        """Give a rollout a first state, and leave its parameters as they are."""
+        """Set the first state of a rollout from a `DeviceState`, and leave its parameters unchanged."""
         self._require_taken(state)
         rollout.begin_evaluation()
         rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
@@ -199,7 +199,7 @@ class DeviceStates(HostStates):
         rollout.step_sizes.begin_at(rollout.initial)
 
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
-        """As `HostStates.state`, in arrays of its own."""
+        """Return the state of a rollout after ``steps`` steps as a `DeviceState` with arrays of its own."""
         made: dict[tuple[int, int], RestartState] = {}
         """One for all scenes of a clock and an origin: a batch has hundreds."""
         keys = []
@@ -212,19 +212,19 @@ class DeviceStates(HostStates):
         return DeviceState(own, tuple(made[key] for key in keys))
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives of fields that are on the device; see `HostStates.write`."""
+        """Write derivatives given as arrays on the device, and return that of time; see `HostStates.write`."""
         fields = require_fields(what, given, to)
         to.clear()
         copy_to(to, what, fields)
         return time_of(what, given, to)
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """As `HostStates.read`, in the precision of the simulation."""
+        """Return copies of the derivatives of a state's fields by name, in the simulation's precision."""
         own = _without_lost(lost, state.copy())
         return {name: own.numbers(name) for name in own.names}
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
-        """A state, whose arrays are overwritten, with other fields: it is judged on the host as any state is."""
+        """Overwrite fields of a device state with given arrays, and check the result on the host."""
         given = require_fields("state", fields, state.arrays)
         copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
@@ -237,7 +237,7 @@ class DeviceStates(HostStates):
         return state
 
     def on_host(self, state: DeviceState) -> States:
-        """As NumPy arrays, which nobody can change."""
+        """Return a device state as read-only NumPy arrays, in a restart state for each scene."""
         self._require_own(state)
         found = self.states(state.arrays, state.scenes)
         judged = zip(found, state.scenes, strict=True)
@@ -245,7 +245,7 @@ class DeviceStates(HostStates):
         return found[0] if self._simulation.batch is None else found
 
     def _require_taken(self, state: DeviceState) -> None:
-        """Arrays on the device are not looked at: they are those of a step of this simulation."""
+        """Raise `InputError` for a state that this simulation has not made; its arrays are not read."""
         self._require_own(state)
         if not all(scene in self._simulation.judged_states for scene in set(state.scenes)):
             advice = "simulation.on_host(state) is taken by any of the same scene"
@@ -276,7 +276,7 @@ def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
 
 
 def _taken(what: str, value: Any) -> wp.array:
-    """An array of another program, in its own memory."""
+    """Return an array of another program as a Warp array that shares its memory; raises `InputError`."""
     if isinstance(value, wp.array):
         return value
     if not hasattr(value, "__dlpack__"):
@@ -288,7 +288,7 @@ def _taken(what: str, value: Any) -> wp.array:
 
 
 def _without_lost(lost: OfLost, state: State) -> State:
-    """A state, or derivatives of one, without numbers for scenes that were lost."""
+    """Overwrite lost scenes in a state, or in derivatives with respect to one, with NaN or 0."""
     for b, number in lost.items():
         for array in state.member(b).arrays() if state.batch is not None else state.arrays():
             array.fill_(number)
@@ -296,7 +296,9 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 
 class DeviceRows:
-    """Those of one simulation over a number of steps.
+    """Parameters with a row for each step that stay on the device, as Warp arrays in the simulation's precision; a
+    number has shape (1,). Their values are never checked: neither for being finite, nor for how far a solid moves in a
+    step.
 
     They are Warp arrays in the simulation's precision and on its device, of the shapes that a parameter may have, (1,)
     in the place of (). Nobody looks at them: neither whether they are finite, nor how far a solid goes in a step.
@@ -307,8 +309,8 @@ class DeviceRows:
         self._spread, self._fold = _kernels(simulation.precision)
 
     def split(self, given: Values | None, what: str = "parameter") -> tuple[Values, dict[str, wp.array]]:
-        """Parameters by name as those to be looked at and those that stay where they are; raises `InputError` for an
-        array of another shape, type or device."""
+        """Split parameters by name into values for the host to check and Warp arrays that stay on the device; raises
+        `InputError` for an array of another shape, type or device."""
         if not isinstance(given, Mapping):
             return {} if given is None else given, {}
         rows = {name: array for name, array in given.items() if isinstance(array, wp.array) and self.takes(name)}
@@ -322,17 +324,17 @@ class DeviceRows:
         return {name: value for name, value in given.items() if name not in rows}, rows
 
     def takes(self, name: str) -> bool:
-        """Whether a parameter may stay on the device: one over time that steps depend on as it is, unless their length
-        is chosen by it."""
+        """Test if a parameter may stay on the device: one over time that steps use unchanged, and that does not choose
+        their length."""
         parameter = None if self._simulation.scene.solver.chooses else self._simulation.known.get(name)
         return parameter is not None and parameter.axis is Axis.STEP and parameter.role is Role.RUN
 
     def stand_ins(self, rows: Mapping[str, wp.array]) -> Arrays:
-        """What stands for them on the host, by name: values that are no numbers, until `write` overwrites them."""
+        """Return arrays of NaN by name for parameters on the device, until `write` overwrites them."""
         return {name: np.full(self._space.shapes(name)[0], np.nan) for name in rows}
 
     def write(self, rows: Mapping[str, wp.array], parameters: Parameters) -> None:
-        """Write them to the parameters of a rollout, or tangents to those of tangents."""
+        """Copy rows on the device, parameters or tangents, to those of a rollout for all scenes and steps."""
         for name, array in rows.items():
             own = wp.empty_like(parameters[name])
             numbers = _numbers(own)
@@ -341,8 +343,8 @@ class DeviceRows:
             parameters.set({name: own})
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
-        """From the adjoints of the parameters to those of the rows, in their shapes, without numbers where scenes of a
-        batch were ``lost``."""
+        """Sum the adjoints of a rollout's parameters to those of the given rows, in their shapes; NaN or 0 for ``lost``
+        scenes."""
         adjoints = {}
         for name, array in rows.items():
             bars, shape = _numbers(found[name]), self._in_three(name, array).shape
@@ -353,13 +355,13 @@ class DeviceRows:
         return adjoints
 
     def _folded(self, bars: wp.array, shape: tuple[int, ...]) -> wp.array:
-        """What several entries of an axis share is added up."""
+        """Sum adjoints (members, steps, k) over axes that ``shape`` has as 1, as their entries share one row."""
         sums = wp.empty(shape, dtype=bars.dtype, device=bars.device)
         launch(self._fold, shape, bars.device, bars=bars, sums=sums)
         return sums
 
     def _in_three(self, name: str, array: wp.array) -> wp.array:
-        """With an axis each for scenes and for steps, of 1 where they share rows, and for components."""
+        """Reshape rows to (scenes, steps, components), with 1 for an axis along which all share a row."""
         each = prod(self._space.shapes(name)[0])
         of_each = array.ndim == self._simulation.known[name].rank + 2  # else all scenes of a batch share them
         members = len(array) if of_each else 1
@@ -367,13 +369,13 @@ class DeviceRows:
 
 
 def _numbers(array: wp.array) -> wp.array:
-    """The memory of a parameter over time, (members, steps) vectors or numbers, as numbers (members, steps, k)."""
+    """View a parameter over time, (members, steps) of vectors or numbers, as numbers (members, steps, k)."""
     return components(array, (*array.shape, wp.types.type_size(array.dtype)))
 
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any]:
-    """What writes rows to all scenes and steps, and the transpose."""
+    """Return two kernels: one that spreads rows over all scenes and steps, and its transpose, which sums adjoints."""
     real = precision.real
     module = kernel_module(f"device_rows_{precision.name}")
 

@@ -10,17 +10,17 @@ from cortado.sph.viscous_stress import Solve
 from cortado.words import counted
 
 TORN = 0.015
-"""A divergence that is warned of. Vortices, water at rest, and dams within the longest step of a coarse grid, came to
-0.014 at most. Tanks that sink as their pressure has to travel came to 0.02, longer steps with a coarse grid to 0.02 to
-0.06, and without one dams at their limit to 0.04."""
+"""Divergence, times the step, above which a warning is given. Vortices, water at rest, and dams within the longest step
+of a coarse grid reach 0.014. Tanks that sink as pressure travels reach 0.02, longer steps with a coarse grid 0.02 to
+0.06, and dams at their limit without one 0.04."""
 RARE = 0.05
-"""Of all steps that may have more: the first has no pressure of a step before it, and splashes strike."""
+"""Part of steps that may exceed `TORN` without a warning: the first has no earlier pressure, and splashes strike."""
 SAME = 1e-6
-"""Relative: a supply that lacks so little is enough."""
+"""Relative shortfall of an emitter's supply that still counts as enough."""
 
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
-    """What to say of the last forward run of a rollout; nothing where all is well."""
+    """Yield warnings on the last forward run of a rollout: pressure, divergence, a dry emitter, lost scenes."""
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         yield not_converged_sentence(converged, scene)
@@ -43,7 +43,7 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
-    """What to say of steps that ended above the tolerance."""
+    """Return a warning that says how many steps ended with pressure above the tolerance, and what to try."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
     spacing, emitter = scene.discretisation.spacing, scene.emitter
     if emitter is not None and not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
@@ -55,7 +55,7 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
 
 
 def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> str | None:
-    """What to say of the step in which the projection left most divergence; None where few steps left much."""
+    """Return a warning on the step in which the projection left most divergence; None where few steps left much."""
     found = diagnostics.get("divergence", np.zeros(0))
     torn = np.nan_to_num(found, nan=0.0, posinf=0.0)  # what is not finite is of a scene that is lost
     if scene.solver.kind != "projection" or np.count_nonzero(torn > TORN) <= RARE * torn.size:
@@ -70,8 +70,8 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
-    """Of a run whose emitter gives all that it has before the end; None of others. Where steps are chosen, the end is
-    known once they are taken."""
+    """Return a warning that an emitter runs out of fluid before the run ends, else None. With chosen steps, the end is
+    known only after the run."""
     emitter, spacing, clock = scene.emitter, scene.discretisation.spacing, rollout.clocks[0]
     if emitter is None:
         return None

@@ -31,16 +31,16 @@ from cortado.scene.scene_warnings import parameter_sentence
 from cortado.scene.stability import divergence_advice
 
 SAME = 1e-9
-"""Relative: a time that so little is missing of has been reached."""
+"""Relative tolerance within which a time counts as reached."""
 STATE_TIME = "time"
-"""What the time of a state is called among derivatives with respect to its fields."""
+"""Name of the time of a state in tables of derivatives by field."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
-"""Parameters that explicit steps of diffusion have to follow."""
+"""Names of parameters on which the number of explicit diffusion substeps depends."""
 
 
 class ParameterSpace:
-    """The parameters of one simulation over a number of steps. In a batch of scenes a value holds for all of them, or
-    has a first axis with an entry for each."""
+    """The map from parameters by name, checked, to the arrays of a rollout and back to gradients. In a batch, a value
+    holds for all scenes, or has a first axis for them."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
@@ -54,7 +54,7 @@ class ParameterSpace:
         """The last values that make sense: a step after another often has the same ones."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
-        """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
+        """Return values as float64 arrays; raises `InputError`. Where ``what`` is "direction", negative ones pass."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
         for view, name in self._known.views.items():
@@ -75,7 +75,7 @@ class ParameterSpace:
         return found
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
-        """Names of parameters that the scene has; raises `InputError` for anything else."""
+        """Return names of parameters as a list; raises `InputError` for one that the scene does not have."""
         if isinstance(names, str) or not isinstance(names, Iterable):
             raise InputError(f"{what} is {shown(names)}, but must be a list of names, such as ['mobility'].")
         found = list(names)
@@ -84,24 +84,24 @@ class ParameterSpace:
         return found
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        """The shapes that a parameter may have; raises `InputError` for one that the scene does not have."""
+        """Return the shapes that a parameter may have; raises `InputError` for one unknown to the scene."""
         check_known(name, self._simulation.scene, known=self._known)
         own = self._one.shapes(name)
         return [*own, *self._batched(own)]
 
     def members(self, values: Arrays) -> list[Arrays]:
-        """Checked values as those of each scene of a batch; of a single scene they are the only ones."""
+        """Return checked values as one table for each scene of a batch."""
         different = self._different(values)
         return different if len(different) > 1 else different * (self._batch or 1)
 
     def defaults(self) -> Arrays:
-        """Every parameter that the scene has, as runs of so many steps take it where it is not given: parameters that
-        the scene's schedule or a force changes with a row for each step, others as `Simulation.parameters` has them."""
+        """Return the default of every parameter of the scene: a row for each step where its schedule or a force changes
+        it, else the value of `Simulation.parameters`."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def colours(self, values: Arrays) -> np.ndarray:
-        """(phases, 3) the colours of the phases in one scene."""
+        """Return the colours (phases, 3) of the phases in one scene, given or the scene's."""
         return values.get("colours", self._one.values["colours"])
 
     @WARP
@@ -113,8 +113,9 @@ class ParameterSpace:
         states: Sequence[RestartState] = (),
         arrays: State | None = None,
     ) -> None:
-        """Give a rollout its first state and its parameters: ``values``, and for what is not among them the scene's, as
-        its schedule changes it.
+        """Set the first state and the parameters of a rollout: ``values``, and the scene's own, as scheduled, for those
+        left out. With the mobility among ``varied``, which are to be differentiated, diffusion is computed even where
+        it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
         diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
@@ -167,13 +168,13 @@ class ParameterSpace:
             begin_choosing(rollout, simulation.scene, self._one, each)
 
     def _warn(self, sentence: str | None) -> None:
-        """Once."""
+        """Give a warning sentence unless this space has given it before."""
         if sentence and sentence not in self._told:
             self._told.add(sentence)
             warn(sentence)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
-        """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
+        """Check that restart states, one for each scene, are of this simulation and fit ``values``; raises
         `InputError`."""
         for name in self._known.state if states else ():
             if name in values:
@@ -185,9 +186,8 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """A direction by name as tangents of the first state, 0 of one that was given, and of the parameters, at
-        ``values``. The next call for this rollout overwrites those of the parameters: what was captured with them is
-        launched again."""
+        """Return tangents of the first state (0 if that was given) and of the parameters for a direction by name, at
+        ``values``. The next call for this rollout overwrites the latter, so captured graphs stay valid."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
@@ -204,8 +204,8 @@ class ParameterSpace:
         parameters: Parameters,
         time_dots: np.ndarray | None = None,
     ) -> None:
-        """Write a direction by name to tangents of the first state, unless it was given, and of the parameters.
-        ``time_dots`` (members,): those of the times at which the first states are."""
+        """Write a direction by name to tangents of the first state, unless that was given, and of the parameters.
+        ``time_dots`` (members,) are tangents of the first states' times."""
         members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
         each = zip(members, self.members(along), rollout.clocks, times, strict=True)
         directions = [self._one.direction(*own) for own in each]
@@ -214,14 +214,14 @@ class ParameterSpace:
         parameters.set(stacked([run for _, run in directions]))
 
     def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
-        """(members,) from the adjoints of the parameters those of the times at which the first states are."""
+        """Return the adjoints (members,) of the first states' times, given the adjoints of the parameters."""
         run = self._read(parameters, {name for own in self._different(values) for name in self._one.changing(own)})
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
         return np.array([self._one.time_adjoint(own, entry(run, b), clock) for b, (own, clock) in members])
 
     def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
-        """Adjoints of the first state as those of its fields, by name, and of its ``time``, all in float64; in a batch
-        each has a first axis for the scenes."""
+        """Return the adjoint of the first state as float64 arrays by field name, with its ``time``; in a batch each has
+        a first axis for the scenes."""
         found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
         times = self.time_adjoints(rollout, values, parameters)
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
@@ -234,9 +234,8 @@ class ParameterSpace:
         parameters: Parameters,
         elsewhere: Collection[str] = (),
     ) -> Arrays:
-        """Adjoints of the first state, unless it was given, and of the parameters, for the names and in the shapes of
-        ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one.
-        Those of names ``elsewhere`` are left out."""
+        """Return the gradient for the names and in the shapes of ``values``, given adjoints of the first state and of
+        the parameters. In a batch each array has a first axis for the scenes; names ``elsewhere`` are left out."""
         dimension = self._simulation.dimension
         read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
@@ -251,7 +250,7 @@ class ParameterSpace:
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
 
     def _read(self, parameters: Parameters, names: Collection[str]) -> Arrays:
-        """Of what steps depend on those of some names, in float64, with an axis for the scenes."""
+        """Copy adjoints of some parameters to float64 arrays by name, with a first axis for the scenes."""
         found = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in names}
         vectors = {name: found[name] for name in self._known.vectors if name in found}
         return found | {name: array[..., : self._simulation.dimension] for name, array in vectors.items()}
@@ -269,8 +268,8 @@ class ParameterSpace:
         return array
 
     def _batched(self, own: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """The shapes in a batch of a parameter that may have these in one scene. One that may have a row for each step
-        then always has an axis of steps."""
+        """Return the shapes in a batch of a parameter that has shapes ``own`` in one scene. A parameter over time then
+        always has an axis of steps."""
         if self._batch is None:
             return []
         if len(own) == 1:
@@ -278,11 +277,11 @@ class ParameterSpace:
         return [(self._batch, 1, *own[0]), (self._batch, *own[1]), (1, *own[1])]
 
     def _row(self, name: str, value: np.ndarray) -> tuple[int, ...]:
-        """The shape of what a checked value holds for one scene of a batch."""
+        """Return the shape of one scene's part of a checked value."""
         return value.shape if value.shape in self._one.shapes(name) else value.shape[1:]
 
     def _different(self, values: Arrays) -> list[Arrays]:
-        """The values of each scene of a batch, or once where they are the same for all."""
+        """Return one table of values for each scene of a batch, or a single one where all scenes share every value."""
         shared, each = {}, {}
         for name, value in values.items():
             own = self._one.shapes(name)
@@ -296,8 +295,8 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Whether the values of one scene make sense for it. It warns, once, of each limit of stability that the time
-        step is beyond, and of first positions that are crowded."""
+        """Check the values of one scene; raises `InputError`. It warns, once each, of a time step beyond a limit of
+        stability, and of crowded first positions."""
         simulation = self._simulation
         if self._steps == 0:
             return
@@ -316,13 +315,13 @@ class ParameterSpace:
             warn(sentence)
 
     def _together(self, fields: list[Arrays]) -> Arrays:
-        """The fields of the states of all scenes, given those of each or once those of all."""
+        """Stack the fields of the states of all scenes along a first axis, from one table or one for each scene."""
         return fields[0] if self._batch is None else stacked(fields * (self._batch // len(fields)))
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """The number of steps of a run, which has either so many or reaches a time [s] with them; where they are chosen, as
-    many as there is room for. Raises `InputError`."""
+    """Return the number of steps of a run, given as such or by a time [s] to reach; where steps are chosen, the number
+    that there is room for. Raises `InputError`."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given where no time says how long the run is.")
     if steps is not None and time is not None:
@@ -348,6 +347,6 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
 
 
 def end_after(rollout: Rollout, time: float | None) -> None:
-    """Have a rollout that chooses its steps end with the first state so much later than its first [s]."""
+    """Make a rollout that chooses its steps end with the first state at least ``time`` [s] after its first."""
     if time is not None and isinstance(rollout.step_sizes, ChosenSteps):
         rollout.step_sizes.end_after(time * (1.0 - SAME))

@@ -29,37 +29,37 @@ from cortado.solvers.containment import Lost, shut_in
 from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent
 
 Observer = Callable[[int, State], None]
-"""Is given the number of a state and the state, which later steps overwrite."""
+"""A function that a run calls with the number of a state and the state, which later steps overwrite."""
 OBSERVED = "a number of steps", "a state"
-"""Its arguments, in words."""
+"""Descriptions of an observer's two arguments, for error messages."""
 CHUNK = 64
-"""Steps between two looks of the host, at most."""
+"""Greatest number of steps between two reads by the host."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
+"""Particles times steps of a chunk, by kind of device, above which a read by the host costs hardly anything."""
 
 
 class BackwardStep(Protocol):
-    """The way back through one step, made by an `AdjointEstimator` of `cortado.gradients` for one rollout."""
+    """Protocol of the backward pass through one step, made by an `AdjointEstimator` for one rollout."""
 
     capturable: bool
-    """Whether a step may be captured as a graph."""
+    """True if a backward step may be captured as a CUDA graph."""
     rollout: "Rollout"
-    """That it was made for."""
+    """Rollout whose steps are differentiated."""
     solver: Solver
-    """Whose fields hold the replayed step after `step`."""
+    """Solver whose fields hold the replayed step after `step`."""
 
     def begin(self) -> None:
-        """Forget the parameters' adjoints of an earlier way back."""
+        """Set the adjoints of the parameters to 0, before a new backward pass."""
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
-        """Replace ``bar``, the adjoint of the step's result, by that of its first state."""
+        """Replace ``bar``, the adjoint of a step's result, by the adjoint of the state before it."""
 
     def parameters(self) -> Parameters:
-        """Adjoints of the parameters, of all steps since `begin`."""
+        """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
 class AdjointStep:
-    """A `BackwardStep`: the step is taken once more, and the adjoint goes through it in reverse."""
+    """The exact `BackwardStep`: it repeats a step, then propagates the adjoint through it in reverse."""
 
     capturable = True
 
@@ -138,23 +138,23 @@ class Rollout(Staying):
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """(steps,) by name, in a batch (steps, batch), of the steps of the last forward run: see `StepLog`."""
+        """Diagnostics of the last forward run: (steps,) by name, in a batch (steps, batch); see `StepLog`."""
         found = self.log.diagnostics
         return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
 
     def is_last(self, step: int) -> bool:
-        """Whether the state after so many steps, which was observed, is the last one of the run."""
+        """Test if the run ends with the state after ``step`` steps, which was observed."""
         return step == self.steps or self.step_sizes.is_end(step)
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the solver."""
+        """The lock that a thread holds while it uses the solver."""
         return self.solver.turn
 
     # ---- evaluations ---------------------------------------------------------------------------------------------
 
     def begin_evaluation(self) -> None:
-        """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
+        """Prepare for a new first state and parameters: residuals that return to the present ones save copies."""
         if len(self.pending) > 1:
             self._checkpoints.release()  # of several owners: not to be used again
         for pending in list(self.pending):
@@ -215,8 +215,8 @@ class Rollout(Staying):
         return state
 
     def _advance(self, first: int, last: int) -> list[State]:
-        """Take the steps from one to another, from the state in the buffer, and return the states after them, which the
-        next chunk overwrites."""
+        """Take steps ``first`` to ``last`` from the buffered state, and return the states after them, which the next
+        chunk overwrites."""
         self.solver.step_number.fill_(first)
         self.step_sizes.seek(first)
         length = last - first
@@ -231,7 +231,7 @@ class Rollout(Staying):
         return self._chunk[:length]
 
     def _take(self, length: int) -> None:
-        """So many steps from the state in the buffer."""
+        """Launch ``length`` steps from the buffered state."""
         state = self._buffer
         for new_state in self._chunk[:length]:
             self.solver.step(state, new_state, self.parameters, self.log)
@@ -239,7 +239,7 @@ class Rollout(Staying):
             state = new_state
 
     def _forget_stale_graphs(self) -> None:
-        """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
+        """Drop captured graphs where this rollout or another has replaced arrays of the solver."""
         if self._generation == self.solver.generation:
             return
         self._generation = self.solver.generation
@@ -252,7 +252,9 @@ class Rollout(Staying):
 
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
-        """The adjoint of the first state, for ``bars``, adjoints of states by their number.
+        """Return the adjoint of the first state for ``bars``, adjoints of states by number; the next backward pass
+        overwrites it. ``observe`` is given the adjoint of each state, last to first. Raises `InputError` unless
+        `forward` has finished with these parameters and kept states.
 
         ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
         `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
@@ -292,8 +294,8 @@ class Rollout(Staying):
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
-        """From ``dot``, the tangent of the first state, which becomes that of the last, to those of all states, which
-        ``observe`` is given; `forward` has run with these parameters."""
+        """Propagate ``dot``, the tangent of the first state, to that of the last, giving each state's to ``observe``;
+        `forward` has run with these parameters."""
         self._require("along a tangent", self._run)
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
@@ -318,24 +320,24 @@ class Rollout(Staying):
         self.solver.write_state(counts, self.parameters, self._buffer)
 
     def last_state(self) -> State:
-        """The state after all steps of the last forward run, for a way back that is about to begin."""
+        """Return the last state of the last forward run, recomputed from a checkpoint where it was not kept."""
         return self._checkpoints.state(self.steps, self._replayed)
 
     def _require(self, what: str, evaluation: int) -> None:
-        """Whether a forward run was of the present evaluation; raises `InputError`."""
+        """Raise `InputError` unless a forward run was of the present evaluation."""
         if evaluation != self.evaluation:
             lacking = "as it has not gone forward with these parameters, or has kept no states"
             raise InputError(f"The rollout cannot go {what}, {lacking}: run forward first, with keep=True.")
 
     def _replayed(self, n: int, state: State) -> State:
-        """The state after state n, computed once more."""
+        """Return the state after state ``n``, computed again."""
         counts, new_state = self._seek(n), self.initial.following()
         self.solver.replay(state, self.parameters, counts)
         self.solver.write_state(counts, self.parameters, new_state)
         return new_state
 
     def _seek(self, step: int) -> Counts:
-        """Make the solver ready to take a step again, from 0."""
+        """Prepare the solver to take a step, counted from 0, again, and return its recorded counts."""
         self.solver.step_number.fill_(step)
         self.step_sizes.seek(step)
         return self.log.seek(step)
@@ -353,12 +355,12 @@ OF_AN_EVALUATION = (
     "_kept",
     "_run",
 )
-"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
+"""Attributes of a rollout that each evaluation replaces by new objects, rather than overwrites."""
 
 
 class Residual:
-    """The present evaluation of a rollout, to come back to: whoever holds it may go back through its steps, also after
-    other evaluations of the same rollout.
+    """A handle on one evaluation of a rollout (first state, parameters, checkpoints), which allows a backward pass also
+    after later evaluations. Nothing is copied until another evaluation begins; then it keeps what that would overwrite.
 
     Nothing is copied until another evaluation begins. From then on it keeps the first state and, as long as it is held,
     the checkpoints.
@@ -372,11 +374,11 @@ class Residual:
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the rollout."""
+        """The lock that a thread holds while it uses the rollout."""
         return self.rollout.turn
 
     def put_aside(self) -> None:
-        """Copy what another evaluation is about to overwrite."""
+        """Copy the first state, parameters and log that another evaluation is about to overwrite."""
         rollout, log = self.rollout, self.rollout.solver.new_log(self.rollout.steps)
         log.assign(rollout.log)
         first, time_steps, sizes = rollout.initial.copy(), rollout.time_steps.copy(), rollout.step_sizes.recorded()
@@ -406,12 +408,12 @@ class Residual:
 
 
 AROUND = 6.0
-"""In spacings: how far from where a particle was before a step something may be that it was lost by."""
+"""Distance, in spacings, around a lost particle's last position within which causes are sought."""
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Of one scene of a batch, given states up to the one after the step in which it lost a particle, at least two, and
-    what to try."""
+    """Return the error for a scene of a batch that lost a particle, given at least two states up to the failed step,
+    and advice."""
     containment, particles = solver.containment, solver.layout.particles
     spacing, d = containment.walled.spacing, containment.walled.dimension
     own = slice(member * particles, (member + 1) * particles)

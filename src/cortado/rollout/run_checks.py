@@ -27,12 +27,11 @@ from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
 
 CROWDED = 0.5
-"""Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
+"""Part of the fluid's volume at rest: particles with less room than this in all cannot be pushed apart."""
 
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
-    """Numbers are no larger than the precision bears, nor smaller where they must be positive; else it raises
-    `OutOfRangeError`."""
+    """Raise `OutOfRangeError` for numbers too large for the precision, or too small where they must be positive."""
     for name, value in values.items():
         size = np.abs(value)
         if size.max(initial=0.0) > precision.greatest:
@@ -44,8 +43,8 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Fluid starts inside of the container, and the opening of the emitter stays there; raises `InputError`. Only the
-    first ``free`` particles do not wait in the emitter, where they may be outside."""
+    """Raise `InputError` where fluid starts outside the container, or the emitter's opening is. Only the first ``free``
+    particles are checked, as others wait in the emitter."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -77,8 +76,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """What to say of a time step beyond limits of stability under these parameters, of which the least counts that was
-    not told; None if there is nothing. All of them are told then."""
+    """Return a warning on the tightest limit of stability that the time step exceeds and that ``told`` does not hold,
+    else None. All exceeded limits are added to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -92,7 +91,7 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """The numbers of the points (n, d) [m] that are outside of a room, along whose periods nothing is."""
+    """Return the indices of the points (n, d) [m] outside a room; along a periodic axis none is."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -101,12 +100,12 @@ def place_in_words(point: np.ndarray) -> str:
 
 
 MOVED = 0.05
-"""In spacings: positions that have moved by less along every axis since they were judged are not judged again. A
-search, an ensemble or a check by differences moves them so little from one run to the next that it costs nothing."""
+"""Distance in spacings: positions that all moved less along every axis since their last check are not checked again.
+Searches, ensembles and difference checks move them so little between runs that they skip the cost."""
 
 
 class FirstPositions:
-    """Judges the first positions of the scenes of a batch, run after run."""
+    """A checker of the first positions of a batch's scenes, which skips positions that hardly moved since."""
 
     def __init__(self, simulation: Simulated):
         self._simulation, self._warned = simulation, False
@@ -114,8 +113,8 @@ class FirstPositions:
         """(n, d) [m], those of each scene that were judged last; at first they are the scene's own."""
 
     def check(self, values: Arrays, member: int) -> str | None:
-        """What to warn of, once, where the positions among the values of a scene are crowded, None if there is nothing.
-        Raises `InputError` where two particles are at one place, or where they would burst."""
+        """Return a warning where a scene's first positions are crowded, else None. Raises `InputError` where two
+        particles coincide, or would burst apart."""
         simulation = self._simulation
         positions = values.get("initial_positions", simulation.positions)
         spacing = simulation.scene.discretisation.spacing
@@ -140,22 +139,22 @@ class FirstPositions:
 
 
 FURTHEST = 1.0
-"""In spacings: solids that go further in a step pass over fluid, which is in them then."""
+"""Greatest distance, in spacings, that a solid may move in one step: a faster one passes over fluid."""
 SCALES = (0.6, 1.5)
-"""Between which wall particles hold fluid as they should: twice as large, a disc lets it in by 0.8 spacings."""
+"""Least and greatest scale of a solid whose wall particles hold fluid: twice as large, a disc leaks 0.8 spacings."""
 
 
 def path_sentence(
     scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
 ) -> str | None:
-    """What to say of the first path that is wrong, with the parameters that were given, all that steps take, and what
-    changes by the time; None if there is none."""
+    """Return an error sentence on the first faulty path or scale of a solid or nozzle, else None, given the values, the
+    run's arrays and the courses."""
     leaps = _leaps(scene, values, courses) if scene.solver.chooses else ()
     return next(chain(_stretches(scene, values), leaps, _jumps(scene, first, run, courses)), None)
 
 
 def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Of paths that go further than a spacing in the shortest step that is chosen for them."""
+    """Yield sentences on paths that move more than a spacing within the shortest step that may be chosen."""
     spacing = scene.discretisation.spacing
     for what, moved in moved_by(scene, values, courses).items():
         travel = Travel.of(scene, values, [moved])
@@ -169,9 +168,8 @@ def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Ite
 
 
 def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Of solids that go further than a spacing in a step, from where a first state has them, of a batch in its first
-    scene, with the parameters of a run. Where steps are still to be chosen, those count that are told step by step, and
-    have no course."""
+    """Yield sentences on solids that move more than a spacing in one step, from the first state on (of a batch, in its
+    first scene). With chosen steps, only solids moved by arrays, without a course, are checked."""
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
@@ -189,8 +187,8 @@ def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changi
 
 
 def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
-    """Of solids whose scale, among the parameters of a run, is too far from 1 for their walls, makes them reach over
-    fluid that the scene puts beside them, or lets them fill a period no more."""
+    """Yield sentences on solids whose scale is too far from 1 for their walls, lets them overlap fluid beside them, or
+    leaves a gap in a period."""
     spacing, periods = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
@@ -210,19 +208,18 @@ def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
 
 
 SAME = 1e-6
-"""Relative: two numbers that differ by less are the same, as one of them may have been rounded to float32."""
+"""Relative difference below which two numbers count as equal, as one may have been rounded to float32."""
 MIXED = 0.02
-"""The same of the volume of particles among which phases have diffused, and of fractions that do not quite add up
-to 1."""
+"""Relative tolerance of the volume of particles whose phases have diffused, and of the sum of their fractions."""
 BEYOND = 0.5
-"""How far fractions may be below 0 or above 1: diffusion leaves them a little outside."""
+"""Amount by which fractions may be below 0 or above 1, as diffusion may leave them."""
 CLOSE, FAR, PART = 0.7, 1.4, 0.1
-"""In spacings: the distance from a particle to the nearest other one is greater than the first for half of them, and
-less than the second for this part of them."""
+"""Bounds in spacings on the distance to a particle's nearest neighbour, above ``CLOSE`` for half of all, and below
+``FAR`` for the part ``PART`` of them."""
 
 
 def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
-    """Of the particles of a run with these rest densities (phases,) [kg/m3]."""
+    """Return the origin (spacing, kernel, densities, ...) of particles with rest densities (phases,) [kg/m3]."""
     scene, cut = simulation.scene, simulation.scene.discretisation
     return Origin(
         spacing=cut.spacing,
@@ -236,8 +233,8 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
 
 
 def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
-    """The states to go on from, one for each scene; none for the scenes' own. Raises `InputError` for another number of
-    them, and for anything else."""
+    """Return restart states as a list, one for each scene; empty for None. Raises `InputError` for another number or
+    type."""
     if state is None:
         return []
     states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
@@ -250,22 +247,22 @@ def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int
 
 
 def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) -> None:
-    """Raises `InputError` where directions have parameters that are ``of_state``, which a state has instead."""
+    """Raise `InputError` where a direction names parameters of the first state, as its fields replace them."""
     if given := [name for name in of_state if name in along]:
         wanted = "but must be left out: give it among those of the state's fields"
         raise InputError(f"direction {given[0]} is given, {wanted}.")
 
 
 def shapes_of_fields(simulation: Simulated, batch: int | None = None) -> dict[str, tuple[int, ...]]:
-    """Of the fields of a state of one scene, by name; of a ``batch`` with a first axis for the scenes."""
+    """Return the shapes of a state's fields by name; with ``batch``, each has a first axis for the scenes."""
     sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
     members = () if batch is None else (batch,)
     return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
 
 
 def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> None:
-    """A state to go on from is one of the simulation, and of these particles; raises `InputError`. One that was judged
-    before can only be of other rest densities, and that of a scene of a batch that was lost has no numbers to judge."""
+    """Raise `InputError` unless a restart state fits the simulation and the origin of its particles. A state judged
+    before is compared by rest density alone; lost scenes of a batch are not checked."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
@@ -309,7 +306,7 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
 
 
 def check_clock(clock: Clock) -> None:
-    """A clock is one of a state; raises `InputError`."""
+    """Raise `InputError` unless ``clock`` is a valid `Clock`: whole steps, finite time and step of at least 0."""
     if not isinstance(clock, Clock):
         raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as that of trajectory.last_state.")
     if not is_whole(clock.steps) or clock.steps < 0:
@@ -321,7 +318,7 @@ def check_clock(clock: Clock) -> None:
 
 
 def _check_origin(found: Origin, wanted: Origin) -> None:
-    """Both are of the same particles."""
+    """Raise `InputError` where a state's particles have another origin than the simulation's."""
     for name, words in WORDS.items() if found != wanted else ():
         one, other = getattr(found, name), getattr(wanted, name)
         if one is None:
@@ -346,7 +343,7 @@ WORDS = {
     "rest_density": "a rest density of {} kg/m3",
     "solver": "what {} carries from step to step",
 }
-"""What each field of an `Origin` is called."""
+"""Words for each field of an `Origin`, for error messages."""
 ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}
 
 
@@ -357,8 +354,8 @@ def _listed(value: object) -> str:
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
-    """The masses (n,) of particles over their volume at rest are those of fluid of these rest densities. With one phase
-    that is so of each particle, as it was at the start; phases that diffuse keep the volume of all of them."""
+    """Raise `InputError` unless the masses (n,) over volumes at rest match the rest densities. One phase is checked
+    particle by particle, phases that diffuse by their total volume."""
     if (found <= 0.0).any():
         raise InputError("state reference_density must be greater than 0.")
     volumes = found * (fractions / rest_density).sum(axis=1)
@@ -375,8 +372,8 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
 
 
 def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
-    """The particles (n, d) of a state that does not say what it is of are about as far apart as those of the scene:
-    most of them no nearer, and some, which have others around them, no further."""
+    """Raise `InputError` unless particles (n, d) of a state without origin are about as far apart as the scene's: most
+    no nearer, and a part of them no further."""
     if len(positions) < 2 or not simulation.scene.forces.pressure:
         return
     spacing = simulation.scene.discretisation.spacing

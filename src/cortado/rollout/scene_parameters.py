@@ -29,27 +29,27 @@ from cortado.scene.restart import Clock, RestartState
 from cortado.solvers.build import ForceMaker
 
 DENSITY = "reference_density"
-"""The field of a state that the first mass fractions and the rest densities decide."""
+"""Name of the state field that the first mass fractions and the rest densities determine."""
 COMPOSITION = ("mass_fractions", "rest_density")
 
 
 class Simulated(Source, Protocol):
-    """A simulation as its parameters see it."""
+    """Protocol of a simulation as its parameters need it."""
 
     initial: State
-    """The first state, on the device."""
+    """First state, on the device."""
     known: Known
-    """Its parameters."""
+    """Parameters of the scene."""
     forces: tuple[ForceMaker, ...]
-    """What makes the forces that are not Cortado's own."""
+    """Makers of the user's own forces."""
     judged_states: WeakSet[RestartState]
-    """Those that need not be judged again, as nobody can change them."""
+    """Restart states that were checked before; they are immutable, so no second check is needed."""
     batch: int | None
-    """How many scenes there are in one launch; None for a single one."""
+    """Number of scenes computed together; None for a single one."""
 
     @property
     def dimension(self) -> int:
-        """2 or 3."""
+        """Number of space dimensions, 2 or 3."""
 
     @property
     def precision(self) -> Precision:
@@ -65,18 +65,18 @@ class Simulated(Source, Protocol):
 
     @property
     def free_particles(self) -> int:
-        """How many particles, the first ones, do not wait in an emitter."""
+        """Number of particles, the first ones, that do not wait in an emitter."""
 
     @property
     def carried_by(self) -> str | None:
-        """What sentences call its solver, if this has fields of its own in states."""
+        """Name of the solver in sentences, if it adds fields of its own to states; else None."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
-        """Explicit steps of diffusion within a time step that are stable with these parameters."""
+        """Return the number of explicit diffusion substeps per time step that is stable with these parameters."""
 
 
 class SceneParameters:
-    """The parameters of one scene over a number of steps."""
+    """The map between one scene's parameters by name and the arrays of a run; with tangents and adjoints."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
@@ -85,38 +85,38 @@ class SceneParameters:
         """As the scene has them."""
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        """The shapes that a parameter may have; () is a number."""
+        """Return the shapes that a parameter may have; () is a number."""
         simulation = self._simulation
         return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
 
     def upright(self, values: Arrays) -> Arrays:
-        """The values, with gravity instead of a tilt."""
+        """Return the values with a tilt replaced by the gravity that it gives."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def courses(self, values: Arrays) -> dict[str, Changing]:
-        """Those of the schedule, and of forces, that act: a gravity or a tilt that is given replaces either."""
+        """Return the courses, by parameter, that apply; a given gravity or tilt replaces either."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
         return found | {name: Steady(values[rate]) for rate, name in self._rates(values).items()}
 
     def _rates(self, values: Arrays) -> dict[str, str]:
-        """Of the values those that say how fast others grow, with the names of these."""
+        """Return, for values that are growth rates of other parameters, the names of the latter."""
         known = self._known
         return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
-        """(steps,) [s] when the rows of a scheduled parameter are; of steps that are chosen, the clock has recorded
-        it."""
+        """Return the times (steps,) [s] at which a scheduled parameter is evaluated; with chosen steps, those that the
+        clock has recorded."""
         time_step = float(values.get("time_step", self.values["time_step"]))
         return (clock or Clock()).times(self._moments(name), time_step)
 
     def _moments(self, name: str) -> NDArray:
-        """(steps,) the same in steps."""
+        """Return the moments (steps,), in steps, at which a scheduled parameter is evaluated."""
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
-        """The derivatives of `scheduled` with respect to the time step, or to the time of the clock, with a row for
+        """Return the derivatives of `scheduled` with respect to the time step, or to the clock's time, with a row for
         each step."""
         found = {}
         for name, course in self.courses(values).items():
@@ -130,20 +130,20 @@ class SceneParameters:
         return found
 
     def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
-        """What the scene's schedule says of the steps after a clock, with a row for each, in the place of what is not
-        among the ``values``: gravity, also where it is a tilt that is scheduled, and the nozzle's path."""
+        """Return the scheduled parameters that are not among ``values``, with a row for each step after a clock:
+        gravity, also from a scheduled tilt, and paths."""
         rows = {name: course.at(self._times(name, values, clock)) for name, course in self.courses(values).items()}
         return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
 
     def scheduled_at(self, values: Arrays, time: float, size: float) -> Arrays:
-        """The same for one step, which begins at a time and is so long [s], without an axis for it."""
+        """Return the scheduled parameters for a single step that begins at ``time`` and lasts ``size`` [s]."""
         courses = self.courses(values)
         rows = {name: course.at(np.array([time + self._known[name].moment * size])) for name, course in courses.items()}
         return {name: value[0] for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
-        """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over
-        time with a row for each step, those of phases as (phases,), others as they are."""
+        """Return the arrays that steps use, from upright ``values`` or the scene's own: parameters over time with a row
+        for each step, those of phases as (phases,), others as they are."""
         known = self._known
         found = {name: values.get(name, self.values[name]) for name in known.run}
         for name, value in found.items():
@@ -155,8 +155,8 @@ class SceneParameters:
         return found
 
     def first(self, values: Arrays) -> Arrays:
-        """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
-        fractions without a volume: a little below 0, as diffusion may leave them."""
+        """Return the fields of the first state that these values change. Raises `InputError` for mass fractions without
+        a volume, or more than a little below 0."""
         fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
@@ -174,8 +174,8 @@ class SceneParameters:
     def direction(
         self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
     ) -> tuple[Arrays, Arrays]:
-        """A direction by name as tangents of the fields of the first state and of what steps depend on, where the first
-        state is at a clock whose time has a tangent."""
+        """Return a direction by name as tangents of the first state's fields and of the arrays that steps use;
+        ``time_dot`` is the tangent of the clock's time."""
         for view, replaced in self._known.views.items():
             for name, other in ((view, replaced), (replaced, view)):
                 if name in along and other in values:
@@ -205,18 +205,18 @@ class SceneParameters:
         return first, self.run({**along, **moved})
 
     def changing(self, values: Arrays) -> set[str]:
-        """The names of what steps depend on that changes by itself while they are taken."""
+        """Return the names of step arrays that the schedule or a force changes over time."""
         return {"gravity" if name == "tilt" else name for name in self.courses(values)}
 
     def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
-        """From the adjoints of what steps depend on, of those that are `changing`, to that of the time at which they
-        begin."""
+        """Return the adjoint of the time at which the steps begin, given those of the step arrays that are
+        `changing`."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
         return sum((float((run[name] * rate).sum()) for name, rate in rates.items()), 0.0)
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
-        """From the adjoints of what steps depend on and of those fields of the first state that depend on parameters,
-        which is at a clock, to those of ``values``, in their shapes; what ``run`` leaves out is left out."""
+        """Return the gradient for ``values``, in their shapes, from the adjoints of the step arrays ``run`` and of the
+        ``first`` state's fields, at a clock. Names missing in ``run`` are left out."""
         found = {name: run[name].copy() for name in self._known.run if name in values and name in run}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:

@@ -22,20 +22,20 @@ from cortado.scene.solvers import COURANT
 from cortado.scene.stability import SOLID_STEP, chosen_limits, gravity_limits, stability_limits
 
 ROOM = 4
-"""There is room for so many times the steps that fluid takes which falls through the whole container all the time."""
+"""Factor of reserve over the steps of fluid that falls through the whole container throughout."""
 MOST = 1e17
-"""Steps of a run of so many seconds."""
+"""Greatest number of steps of a run given by its time."""
 LEAST = 1e-4
-"""A path makes no step shorter than this part of the greatest: what goes further then has jumped."""
+"""Shortest step that a path may cause, as a part of the greatest step; a faster path counts as a jump."""
 PARTS = 8
-"""Into which a step is cut: gravity that changes within it is looked at after each."""
+"""Number of parts of a step at whose ends a changing gravity is evaluated."""
 Moved = Sequence[tuple[float, Changing | None]]
-"""The courses that move something, each with the length that makes a speed of its rate [m] or, of a place, 1."""
+"""Courses that move one object, each with the factor from its rate to a speed: 1, or an arm [m] for a turn."""
 
 
 def greatest_step(scene: SceneTables, values: Arrays) -> float:
-    """That no step of a run with these parameters is longer than, whatever its gravity [s]; raises `InputError` where
-    nothing bounds them."""
+    """Return the longest step [s] of a run with these parameters at any gravity; raises `InputError` where nothing
+    bounds it."""
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
         raise InputError(
@@ -46,8 +46,8 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
 
 
 def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
-    """(steps,) that of each step [s]: a gravity that is given bounds each by its own row. Raises `InputError` where
-    one, or one of a scheduled gravity, is below the ``least`` [s] that a precision bears."""
+    """Return the upper bounds (steps,) [s] of each step; a given gravity bounds each by its own row. Raises
+    `InputError` for a bound below the ``least`` [s] of the precision."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
@@ -62,7 +62,7 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
 
 
 def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> dict[str, Moved]:
-    """What courses of parameters move in a scene, by what it is in words, with parameters that replace the scene's."""
+    """Return the courses that move the nozzle and each solid, by a phrase for each, under these values."""
     found: dict[str, Moved] = {"the nozzle": [(1.0, courses.get("nozzle_path"))]}
     for solid in told(scene.solid):
         shift, turn = (courses.get(name(solid.name)) for name in (displacement_name, turn_name))
@@ -72,22 +72,22 @@ def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> d
 
 @dataclass(frozen=True, eq=False)
 class Travel:
-    """Of the fastest point on any of some paths, whose speed is constant between times."""
+    """The distance covered by the fastest point on some paths, as a piecewise linear function of time."""
 
     times: NDArray[np.float64]
-    """(k,) from 0 on [s]"""
+    """Times (k,) from 0 on [s] at which the speed changes."""
     speeds: NDArray[np.float64]
-    """(k,) after each of the times, 0 after the last [m/s]"""
+    """Speeds (k,) after each of the times [m/s]; 0 after the last."""
     lengths: NDArray[np.float64]
-    """(k,) how far it has come [m]"""
+    """Distances covered (k,) at each of the times [m]."""
     furthest: float
-    """How far it may go in a step [m]."""
+    """Greatest distance in one step [m]."""
     least: float
-    """That no step has to be shorter than [s]."""
+    """Length below which paths shorten no step [s]."""
 
     @classmethod
     def of(cls, scene: Scene, values: Arrays, moved: Iterable[Moved]) -> "Travel":
-        """Of what moves in a scene, with parameters that replace the scene's."""
+        """Make the travel of what moves in a scene, given parameter values."""
         known = [[(arm, c) for arm, c in one if isinstance(c, Knots | Course)] for one in moved]
         times = np.unique(np.concatenate([[0.0], *(c.times for one in known for _, c in one)]))
         speeds = np.zeros(len(times))
@@ -99,7 +99,7 @@ class Travel:
         return cls(times, speeds, lengths, furthest, LEAST * greatest_step(scene, values))
 
     def longest(self, time: float) -> float:
-        """A step that begins at a time [s] may be so long [s]; infinite where the paths end before."""
+        """Return the longest step [s] that may begin at a time [s]; infinite where the paths end before."""
         reached = float(self.at(time)) + self.furthest
         k = int(np.searchsorted(self.lengths, reached, side="right")) - 1
         if self.speeds[k] == 0.0:
@@ -108,12 +108,12 @@ class Travel:
         return max(float(end - time), self.least)
 
     def at(self, times: ArrayLike) -> NDArray[np.float64]:
-        """How far it has come at times [s], of their shape [m]."""
+        """Return the distance covered [m] at times [s], in their shape."""
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
-        """How many steps it needs at most in so many seconds beside those that are as long as the ``longest`` [s]: to
-        go its way, and until they are long again wherever it becomes slower."""
+        """Return an upper bound on extra steps in ``duration`` [s], beside steps of length ``longest`` [s]: for the
+        distance, and for growing back wherever paths slow down."""
         begins = np.concatenate([self.times, self.times - duration])
         way = float((self.at(begins + duration) - self.at(begins)).max())
         with np.errstate(divide="ignore"):
@@ -124,18 +124,18 @@ class Travel:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """Of a gravity that changes, as such or by a tilt."""
+    """The bound that a gravity changing over time, as such or by a tilt, sets on steps."""
 
     scene: Scene
     course: Course
     upright: Callable[[NDArray], NDArray]
-    """Gravity (k, d) [m/s2] of values of the course."""
+    """Function from values of the course to gravity (k, d) [m/s2]."""
     greatest: float
-    """No step is longer [s]."""
+    """Length that no step exceeds [s]."""
 
     @classmethod
     def of(cls, scene: Scene, courses: Mapping[str, Changing], greatest: float) -> "dict[str, Pull]":
-        """Those among the courses of parameters in a scene, by what they are in words."""
+        """Return a `Pull` for each gravity or tilt among the courses of a scene, by a phrase for it."""
         upright: dict[str, Callable[[NDArray], NDArray]] = {
             "gravity": np.asarray,
             "tilt": Tilt(scene.forces.gravity).gravity,
@@ -147,7 +147,7 @@ class Pull:
         }
 
     def longest(self, time: float) -> float:
-        """A step that begins at a time [s] may be so long [s]: it is over before gravity is too strong for it."""
+        """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong for it."""
         ways = np.linspace(0.0, self.greatest, PARTS + 1)
         known = np.array(self.course.times) - time
         ways = np.concatenate([ways, known[(known > 0.0) & (known < self.greatest)]])
@@ -156,15 +156,15 @@ class Pull:
 
 
 def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
-    """What changes by the time and bounds each step by itself, in words, with parameters that replace the scene's."""
+    """Return, by a phrase, the bounds on steps that vary in time: speed along paths, and scheduled gravity."""
     courses = parameters.courses(values)
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
     return {"the speed along paths": travel, **Pull.of(scene, courses, greatest_step(scene, values))}
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Before a run: ``members`` are the upright values of the scenes of a batch, whose clocks and first states the
-    rollout has."""
+    """Make a rollout choose its steps: ``members`` are the upright values of the scenes of a batch; clocks and first
+    states are set."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius
@@ -177,28 +177,27 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
 
 
 class Courses:
-    """What is scheduled in the scenes of a batch, each at its own time."""
+    """The `Scheduled` of a batch of scenes, each at its own time: bounds on steps, and rows of scheduled parameters."""
 
     def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
         self._rollout, self._parameters, self._members = rollout, parameters, members
         self._bounds = [scheduled_bounds(scene, own, parameters) for own in members]
 
     def longest(self, times: NDArray) -> NDArray:
-        """See `Scheduled`."""
+        """Return the longest steps (members,) [s] that scheduled changes allow at times (members,) [s]."""
         each = zip(self._bounds, times.tolist(), strict=True)
         return np.array([min(bound.longest(time) for bound in bounds.values()) for bounds, time in each])
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """See `Scheduled`."""
+        """Write the scheduled parameters of a step that begins at ``times`` and lasts ``sizes`` (members,) [s]."""
         each = zip(self._members, times.tolist(), sizes.tolist(), strict=True)
         rows = [self._parameters.scheduled_at(*one) for one in each]
         self._rollout.parameters.set_row(step, stacked(rows))
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
-    """How many steps fluid would take for a time [s] that falls through the whole container all the time, and what
-    moves along a path beside it, with parameters that replace the scene's; raises `InputError` where nobody can count
-    them."""
+    """Return an estimate of the steps of a run over a time [s]: fluid that falls through the whole container
+    throughout, and paths beside it. Raises `InputError` above `MOST` steps."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limits = stability_limits(scene, values)
@@ -210,24 +209,24 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
 
 
 def counted_steps(time: float, steps: float) -> int:
-    """So many steps, rounded up."""
+    """Return a number of steps rounded up, at least 1; raises `InputError` above `MOST`."""
     if steps > MOST:
         raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
     return max(ceil(steps), 1)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
-    """How many frames a run has, with one for every so many steps."""
+    """Return the greatest expected number of frames of a run with one every ``record_every`` steps."""
     return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 
 def ends_at_a_time(rollout: Rollout) -> bool:
-    """Whether nobody knows how many steps a rollout has, as it ends at a time."""
+    """Test if a rollout ends at a time rather than after a known number of steps."""
     return bool(np.isfinite(rollout.step_sizes.end))
 
 
 def done_of(rollout: Rollout, step: int, time: float) -> int:
-    """How far a rollout is after a step, at a time [s]: so many steps, or percents of its time if it ends at one."""
+    """Return a rollout's progress after a step, at a time [s]: the step, or percents of a given end time."""
     if not ends_at_a_time(rollout):
         return step
     begun, end = rollout.clocks[0].time, rollout.step_sizes.end

@@ -27,30 +27,30 @@ from cortado.solvers.projection.steps import ProjectionSteps
 from cortado.solvers.solver import Solver
 
 PRESSED = 0.2
-"""Of the density: a step that compresses a particle by more than this, beyond what it was before, is taken again. In
-dam breaks, with ink and with a jug that pours, the repairs found 0.15 at most."""
+"""Part of the density: a step that adds more compression than this to a particle is retaken. In dam breaks, with ink
+and with a jug that pours, repairs had added 0.15 at most."""
 SHORTER = 0.25
-"""How long it is then, in parts of what it was."""
+"""Factor by which a retaken step is shortened."""
 TIMES = 2
-"""How often a step is shortened at most."""
+"""Greatest number of times that a step is shortened."""
 LEAST_SHARE = 0.01
-"""No step is shortened below so much of what its state alone allows, whatever the step before it was."""
+"""Least length of a shortened step, as a part of the length that its state alone allows."""
 HELPED = 0.5
-"""A shorter step helps if it adds at most so much of the compression that the longer one did."""
+"""A shortened step counts as a help if it adds at most this part of the compression of the longer one."""
 
 
 @dataclass(frozen=True)
 class Try:
-    """How a step went."""
+    """The length and outcome of one attempt at a step."""
 
     size: float
-    """[s]"""
+    """Length of the step [s]."""
     added: float
-    """Compression, infinite where a particle was lost."""
+    """Compression that the step added to a particle, at most; infinite where a particle was lost."""
 
 
 class Retaken:
-    """The steps of one run that were taken again."""
+    """The record of steps of one run that were taken again with a shorter length."""
 
     def __init__(self) -> None:
         self._tries: dict[tuple[int, int], tuple[float, list[Try]]] = {}
@@ -59,10 +59,9 @@ class Retaken:
     def found(
         self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
     ) -> dict[tuple[int, int], float]:
-        """Of the steps from one number on, which were taken, those to be taken again, each with its scene of a batch,
-        and how long [s]: the first of each scene, as the later ones follow from it. All arrays are (steps, members):
-        the compression that they ``added``, their ``sizes`` and the ``longest`` that their states allow [s]; ``lost``
-        has the steps in which scenes lost a particle."""
+        """Return new lengths [s] by (step, scene) for steps to retake, the first of each scene. Arrays are (steps,
+        members): compression ``added``, ``sizes`` and ``longest`` that states allow [s]; ``lost`` has the step in which
+        a scene lost a particle."""
         again = {}
         for member in range(added.shape[1]):
             end = lost.get(member, first + len(added))
@@ -76,7 +75,7 @@ class Retaken:
         return again
 
     def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
-        """How long a step is next that went badly [s]; None if it stays as it is."""
+        """Return the next length [s] of a step that went badly; None if it stays."""
         least, tries = self._tries.setdefault(key, (least, []))
         tries.append(now)
         helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= HELPED * tries[-2].added
@@ -89,7 +88,7 @@ class Retaken:
 
 
 class Compressions:
-    """What the steps of one run add to the compression of a particle, at most."""
+    """The greatest compression that each step of a run adds to any particle, recorded on the device."""
 
     def __init__(self, solver: ProjectionSteps, steps: int):
         layout, device = solver.layout, solver.device
@@ -99,7 +98,7 @@ class Compressions:
         self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
 
     def measure(self, state: State) -> None:
-        """Of the step that led to a state, whose number the solver has counted: launches alone."""
+        """Record the compression added by the step that led to ``state``; kernel launches only."""
         solver = self._solver
         repaired = solver.repaired[0]
         solver.launch(
@@ -122,14 +121,14 @@ class Compressions:
         )
 
     def read(self, first: int, last: int) -> NDArray[np.float64]:
-        """(last - first, members) of the steps between two numbers, which were taken [-]."""
+        """Return the added compressions (last - first, members) [-] of the steps between two numbers."""
         return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
 
 
 @cache
 def compression_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Kernels: what a step adds to each particle's compression, and the greatest of it in each scene. They have no
-    derivatives: a chosen step is held constant."""
+    """Return two kernels: the compression that a step adds to each particle, and its maximum in each scene. They have
+    no derivatives: a chosen step is held constant."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"compressions_{precision.name}")
 
@@ -145,9 +144,8 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
         # out
         added: wp.array(dtype=pair),
     ):
-        """``added`` is a pair for a sum, which nobody reads, and a maximum, of sorted particles: (n - 1)+ as the last
-        repair finds it less the same before the step. What a nozzle leads, which is not where the step has left it and
-        may be in walls, adds nothing."""
+        """Write to ``added`` a pair (0, growth of compression) per sorted particle: (n - 1)+ as the last repair finds
+        it less its value before the step. Particles moved by a nozzle, perhaps inside walls, add nothing."""
         i = wp.tid()
         more = wp.max(excess[i], real(0.0)) - wp.max(n[i] - real(1.0), real(0.0))
         p = order[i]
@@ -172,93 +170,94 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 GROWTH = 1.1
-"""A step is at most so many times as long as the one before."""
+"""Greatest ratio of the lengths of two successive steps."""
 LEAST = 1e-6
-"""The speed of the fluid shortens a step to so much of its other bounds at least. What is faster was thrown about by
-walls that leave it no room, ever faster from step to step."""
+"""Least part of its other bounds to which the fluid's speed shortens a step. Faster fluid was thrown about by walls
+that leave it no room, ever faster from step to step."""
 
 
 class Scheduled(Protocol):
-    """What is scheduled in the scenes of a batch, by the time."""
+    """Protocol of scheduled parameters in the scenes of a batch, as functions of time."""
 
     def longest(self, times: NDArray) -> NDArray:
-        """(members,) how long steps may be that begin at times (members,) [s]."""
+        """Return the longest steps (members,) [s] that may begin at times (members,) [s]."""
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """Write it for a step, given its number, and when it begins and how long it is, (members,) [s]."""
+        """Write the scheduled parameters for a step, given its number, and its times and lengths (members,) [s]."""
 
 
 @dataclass(frozen=True)
 class RecordedSizes:
-    """What was chosen in one evaluation, which alone writes to it."""
+    """The step lengths and times of one evaluation, read from the device."""
 
     sizes: NDArray
-    """(steps + 1, members) of each step, and of the one that would follow [s]."""
+    """Lengths (steps + 1, members) [s] of each step, and of the one that would follow."""
     times: NDArray
-    """(steps + 1, members) of each state [s]."""
+    """Times (steps + 1, members) [s] of each state."""
 
 
 class StepSizes:
-    """How long the steps of a rollout are: here all as long as a parameter of the scene says."""
+    """The lengths of the steps of a rollout; in this base class a parameter of the scene, equal for all."""
 
     longest_chunk = 2**31
-    """Steps that may be taken before the host looks."""
+    """Greatest number of steps before the host must read."""
     end = inf
-    """When the run is to end at the latest [s]; infinite where it has all of its steps."""
+    """Time [s] at which the run ends at the latest; infinite where it takes all of its steps."""
 
     def begin_at(self, state: State) -> None:
-        """The length of the first step, from a state."""
+        """Choose the length of the first step, from the first state."""
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Have the steps before a state as an earlier process chose them, (step,) [s], and choose the one after it.
-        Returns whether the run ends with the state."""
+        """Resume after ``step`` steps of lengths ``sizes`` (step,) [s] that an earlier process took, and choose the
+        next. Returns True if the run ends with the state."""
         return False
 
     def choose(self, state: State) -> None:
-        """The length of the step after a state that a step has led to, whose number the solver has counted: launches
-        alone."""
+        """Choose the length of the step after ``state``, which the solver has counted; kernel launches only."""
 
     def seek(self, step: int) -> None:
-        """Have the solver take a step, from 0, as long as it was chosen."""
+        """Set the solver to the recorded length of a step, counted from 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read the steps behind the first of these states, up to the one after the last. Returns the last state that
-        belongs to the run, and whether the run ends with it."""
+        """Read the lengths of the steps after states ``first`` to ``last``. Returns the last state that belongs to the
+        run, and True if the run ends with it."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:
-        """Whether the steps between these states, which were taken, are to be taken again, as some are shorter now."""
+        """Test if steps between these states, already taken, must be retaken with a shorter length."""
         return False
 
     def is_end(self, step: int) -> bool:
-        """Whether the run ends with the state after so many steps, which was read."""
+        """Test if the run ends with the state after ``step`` steps, whose length was read."""
         return False
 
     def of_step(self, step: int) -> NDArray | None:
-        """(members,) the length of a step, once the state before it was read [s]; None where it is a parameter."""
+        """Return the lengths (members,) [s] of a step that the host has read; None where a parameter has it."""
         return None
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
-        """(steps,) by name, in a batch (steps, batch), of the first steps of the last run."""
+        """Return diagnostics of the first steps: arrays (steps,) by name, in a batch (steps, batch)."""
         return {}
 
     def recorded(self) -> RecordedSizes | None:
-        """What the next evaluation overwrites."""
+        """Return the recorded lengths and times that the next evaluation overwrites; None for fixed steps."""
         return None
 
     def assign(self, recorded: RecordedSizes | None) -> None:
-        """Hold what another evaluation has recorded."""
+        """Restore the lengths and times that another evaluation recorded."""
 
 
 class ChosenSteps(StepSizes):
-    """Each step is as long as the state before it allows, scene by scene: see `choose` of `step_size_kernels`.
+    """Step lengths that each scene's state chooses on the device: see `choose` of `step_size_kernels`. They depend on
+    the greatest speed, a maximum with bits independent of order, and on the clock's last step, so a resumed run has the
+    steps of an unbroken one.
 
     The greatest speed is a maximum, so that the same bits come whatever the order; nothing else is read of a state, and
     the step before is in its clock, so that a run that goes on has the steps of one that did not stop.
     """
 
     def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
-        """``length``: how far a particle may move in a step [m]."""
+        """Prepare the arrays for at most ``steps`` steps; ``length`` is how far a particle may move in one [m]."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
         self._solver, self._parameters, self._length = solver, parameters, length
@@ -277,8 +276,8 @@ class ChosenSteps(StepSizes):
         self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
-        """Before a run: ``bounds`` (steps, members) of its steps [s]; where something is ``scheduled`` the host has to
-        know each step. Returns the clocks of the first states, which know the times of those that will be read."""
+        """Prepare a run with upper bounds (steps, members) [s]; with ``scheduled`` parameters the host reads each step.
+        Returns clocks of the first states, which learn the times of later ones."""
         self._bounds.assign(bounds)
         self._first.assign([clock.time_step for clock in clocks])
         self._times[0].assign([clock.time for clock in clocks])
@@ -294,7 +293,7 @@ class ChosenSteps(StepSizes):
         self._look(0, 0)
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Times are added up as the device does, one step after the other in float64."""
+        """Resume after steps of known lengths; times are summed as on the device, one by one in float64."""
         assert sizes is not None
         times = np.cumsum([self._read.times[0, 0], *sizes[: step - 1].astype(np.float64)])
         self._sizes[:step].assign(sizes[:step, None])
@@ -306,7 +305,7 @@ class ChosenSteps(StepSizes):
         return self.is_end(step)
 
     def end_after(self, duration: float) -> None:
-        """The run, of a single scene, ends with the first state that is so much later than its first [s]."""
+        """Make the run of a single scene end with the first state at least ``duration`` [s] after its first."""
         self.end = float(self._read.times[0, 0]) + duration
 
     def choose(self, state: State) -> None:
@@ -361,8 +360,8 @@ class ChosenSteps(StepSizes):
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
-        """Read the lengths of these steps, and when they begin; where something is scheduled, have the last no longer
-        than that allows, and write it."""
+        """Read the lengths and times of these steps; with scheduled parameters, shorten the last one to their bound and
+        write their rows."""
         for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
             found[first : last + 1] = array[first : last + 1].numpy()
         if self._scheduled is None:
@@ -396,14 +395,14 @@ class ChosenSteps(StepSizes):
 
 @cache
 def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Kernels that choose a time step, ``speeds`` and ``choose``. They have no derivatives: a chosen step is held
-    constant."""
+    """Return the two kernels that choose a time step, ``speeds`` and ``choose``. They have no derivatives: a chosen
+    step is held constant."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
     def speeds(v: wp.array(dtype=vector), squares: wp.array(dtype=pair)):
-        """The square of each particle's speed, as pairs, for a sum, which nobody reads, and a maximum."""
+        """Write for each particle a pair (0, squared speed), from which a reduction takes the maximum."""
         i = wp.tid()
         squares[i] = pair(real(0.0), wp.length_sq(v[i]))
 
@@ -423,8 +422,10 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
         longest: wp.array2d(dtype=real),
         time_step: wp.array(dtype=real),
     ):
-        """dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at which the
-        step begins.
+        """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at
+        which it begins. ``length``: how far a particle may move in a step; ``first``: dt before the first step, 0 for
+        none; ``longest`` is dt without the growth. Where no particle moves, nothing is divided by its speed. A speed
+        that is not finite bounds nothing: its particle is lost, and the host will see it.
 
         ``length``: how far a particle may move in a step; ``first``: dt of the step before the first, 0 where there was
         none; ``longest`` is dt without it. Where no particle moves, nothing is divided by its speed. A speed that is

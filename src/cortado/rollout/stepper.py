@@ -35,26 +35,26 @@ from cortado.solvers.solver import Solver
 from cortado.words import counted, sized
 
 KEPT = 4
-"""Numbers of steps whose arrays and graphs a simulation keeps for the next call."""
+"""Number of different step counts for which a simulation keeps arrays and graphs."""
 
 
 class Steppable(Simulated, Protocol):
-    """A simulation as its steps see it."""
+    """Protocol of a simulation as its steps need it."""
 
     solver: Solver
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
-    """What `Stepper.step` leaves for `Stepper.vjp` and `Stepper.jvp`, whole: other steps may come in between."""
+    """The result of `Stepper.step` that `Stepper.vjp` and `Stepper.jvp` need, valid whatever steps follow."""
 
     evaluation: Residual
     values: Arrays
-    """The parameters that were given, with stand-ins for rows on the device."""
+    """Parameters that were given, with stand-ins for rows on the device."""
     rows: Mapping[str, wp.array]
-    """Those of them that are on the device."""
+    """Parameters over time that are on the device."""
     place: HostStates
-    """Where its states are, and the derivatives with respect to them."""
+    """Interface to the states and to derivatives with respect to them, on the host or on the device."""
     instead = "but the state before its steps and the parameters can, from which they are taken again"
 
     def __repr__(self) -> str:
@@ -64,36 +64,37 @@ class StepResidual(Staying):
 
 
 class Stepper:
-    """So many steps of a simulation, as a function of the state before them and of parameters.
+    """A fixed number of steps of a simulation, as a function of the state before them and of parameters. Its arrays,
+    graphs and kernels are made once and serve every call.
 
     Its arrays, graphs and kernels are made once and serve every call.
     """
 
     def __init__(self, simulation: Steppable, steps: int):
-        """``steps`` may be 0."""
+        """Prepare a rollout of ``steps`` steps, which may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
         """What takes the steps, with the parameters of the last ones."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as what it is made from."""
+        """Pickle or copy the stepper as its simulation and number of steps."""
         return type(self), (self._simulation, self.rollout.steps)
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the simulation."""
+        """The lock that a thread holds while it uses the simulation."""
         return self.rollout.turn
 
     @in_turn
     def first(self, parameters: Values | None = None) -> States:
-        """The state before the first step of a run with these parameters."""
+        """Return the state before the first step of a run with these parameters."""
         self._space.begin(self.rollout, self._checked(parameters))
         return HostStates(self._simulation).state(self.rollout, self.rollout.initial, 0)
 
     @in_turn
     def on_device(self, state: Given | DeviceState, fields: Values, parameters: Values | None = None) -> DeviceState:
-        """A state of a run with these parameters in arrays of its own on the device, with other ``fields``."""
+        """Return a state of a run with these parameters, in device arrays of its own, with other ``fields``."""
         values, place = self._checked(parameters), DeviceStates(self._simulation)
         self._begin(state, values, {})
         found = place.state(self.rollout, self.rollout.initial, 0)
@@ -101,14 +102,15 @@ class Stepper:
 
     @in_turn
     def on_host(self, state: DeviceState) -> States:
-        """A state on the device as NumPy arrays."""
+        """Return a state on the device as NumPy arrays."""
         if not isinstance(state, DeviceState):
             raise InputError(f"state is {shown(state)}, but must be a DeviceState, of simulation.on_device.")
         return DeviceStates(self._simulation).on_host(state)
 
     @in_turn
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
-        """The state after the steps, on the device if the one before them is.
+        """Return the state after the steps, on the device if the given one is. A parameter over time may be a Warp
+        array in the simulation's precision: it stays on the device, unchecked.
 
         A parameter over time may be a Warp array on the device, in the simulation's precision: it stays there, and is
         not looked at.
@@ -119,9 +121,9 @@ class Stepper:
 
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
-        """As `advance`, with the parameters that the last call of it had but for these ``rows``, over time and of all
-        scenes of a batch (batch, steps, ...), which are not judged: what a controller of many scenes calls again and
-        again. All that `advance` was given over time has to be among them."""
+        """Return the state after the steps with the parameters of the last `advance`, except ``rows`` over time (batch,
+        steps, ...), which are not checked: for controllers of many scenes. All that `advance` was given over time has
+        to be among them."""
         place = DeviceStates(self._simulation)
         place.follow(self.rollout, state)
         self.rollout.parameters.set(rows)
@@ -131,7 +133,9 @@ class Stepper:
     def step(
         self, state: Given | DeviceState, parameters: Values | None = None, along: Iterable[str] = ()
     ) -> tuple[States | DeviceState, StepResidual]:
-        """The state after the steps, and what `vjp` and `jvp` take to differentiate them.
+        """Return the state after the steps, and a residual for `vjp` and `jvp`; several may be held at once. ``along``
+        are further parameters of directions for `jvp`; only the mobility must be named, as nothing diffuses where it is
+        0. Parameters may be on the device as those of `advance`.
 
         Any number of residuals may be held at a time, each with states of its own. ``along`` are further parameters
         that `jvp` will be given directions of; only the mobility has to be said before, as where it is 0 nothing
@@ -144,8 +148,12 @@ class Stepper:
 
     @in_turn
     def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Reverse mode: from the adjoint of the state after the steps to those of the state before them and of the
-        parameters that were given.
+        """Return adjoints of the state before the steps and of the given parameters, from that of the state after them
+        (reverse mode). The adjoint of a state is a table of arrays, those of its fields by name and in their shapes,
+        and of its ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on
+        the device; all else that is returned is in float64. A batch has a first axis for the scenes; of one that was
+        lost all is NaN, or 0 where its adjoint is 0 throughout. A parameter on the device has its adjoint there, in its
+        own shape. Raises `InputError` for fields that the state does not have, or that have other shapes.
 
         The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
         ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
@@ -172,8 +180,8 @@ class Stepper:
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
-        """Forward mode: from tangents of the state before the steps and of any parameters that it does not hold to that
-        of the state after them; as `vjp` takes and returns adjoints."""
+        """Return the tangent of the state after the steps, from those of the state before and of parameters (forward
+        mode), in the forms of `vjp`."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
@@ -221,7 +229,7 @@ class Stepper:
         rows: Mapping[str, wp.array],
         varied: Iterable[str] = (),
     ) -> HostStates:
-        """Give the rollout a first state and parameters; returns where the state is."""
+        """Set the first state and parameters of the rollout, and return the interface to where the state is."""
         place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
         self._rows.write(rows, self.rollout.parameters)
@@ -231,12 +239,12 @@ class Stepper:
         return self._space.checked({} if parameters is None else parameters)
 
     def _given(self, parameters: Values | None) -> tuple[Arrays, dict[str, wp.array]]:
-        """Checked, with stand-ins for those that are on the device, and these."""
+        """Return the checked parameters, with NaN in place of those on the device, and the latter."""
         looked_at, rows = self._rows.split(parameters)
         return self._space.checked(looked_at) | self._rows.stand_ins(rows), rows
 
     def _forward(self, keep: bool) -> State:
-        """Take the steps; ``keep`` checkpoints for a way back. Warnings and errors as of `Simulation.run`."""
+        """Take the steps; ``keep`` stores checkpoints for a backward pass. Warns and raises as `Simulation.run`."""
         last = self.rollout.forward(keep=keep)
         for sentence in trouble(self.rollout, self._simulation.scene):
             warn(sentence)
@@ -244,16 +252,17 @@ class Stepper:
 
 
 class Stepping:
-    """What a simulation can do with states."""
+    """The methods of a simulation that take, give and differentiate states, such as `step`, `vjp` and `jvp`."""
 
     @property
     def turn(self) -> Turn:
-        """What a thread holds that uses the simulation."""
+        """The lock that a thread holds while it uses the simulation."""
         raise NotImplementedError
 
     def state(self, parameters: Values | None = None) -> States:
-        """The state before the first step, whole: what `step` and ``Simulation.run(state=...)`` go on from; of a batch
-        a tuple with one for each scene.
+        """Return the state before the first step, from which `step` and ``Simulation.run(state=...)`` go on; of a batch
+        a tuple with one for each scene. ``parameters`` are any of those of `Problem` that a first state depends on,
+        such as ``initial_velocities``. Raises `InputError` for those that do not fit.
 
         ``parameters`` are any of those of `Problem` that a first state depends on, such as ``initial_velocities``.
         Raises `InputError` for those that do not fit.
@@ -263,8 +272,11 @@ class Stepping:
     def on_device(
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
-        """A state, the first one if left out, in arrays on the device, which other programs take by DLPack: steps from
-        it give states on the device, and nothing of them passes through the host.
+        """Return a state, the first one if left out, in arrays on the device, which other programs take by DLPack;
+        steps from it stay on the device. ``fields`` are arrays that speak DLPack and replace fields of the state, in
+        the precision of the simulation and on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a
+        batch (batch, n, ...). Such a state is judged as one from a file is, which reads it on the host, once.
+        ``parameters`` are those of the run that the state is of. Raises `InputError` for what does not fit.
 
         ``fields`` are arrays that speak DLPack and replace fields of the state, in the precision of the simulation and
         on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). Such a state is
@@ -274,8 +286,8 @@ class Stepping:
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
     def on_host(self, state: DeviceState) -> States:
-        """A state on the device as NumPy arrays: what files and other processes take, and ``Simulation.run``. Raises
-        `InputError` for a state of another simulation."""
+        """Return a state on the device as NumPy arrays, which files, other processes and ``Simulation.run`` take.
+        Raises `InputError` for a state of another simulation."""
         return self.stepper(0).on_host(state)
 
     @overload
@@ -285,8 +297,8 @@ class Stepping:
     def step(self, state: DeviceState, parameters: Values | None = None, steps: int = 1) -> DeviceState: ...
 
     def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
-        """The state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters, state=state)``; of
-        a batch a tuple with one for each scene, with NaN in that of a scene that is lost.
+        """Return the state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters,
+        state=state)``; of a batch a tuple with one for each scene, with NaN in that of a scene that is lost.
 
         ``parameters`` are any of those of `Problem` but first values, which ``state`` has; one over time has a row for
         each of these steps. Nothing is recorded on the way. From a `DeviceState` it gives another one. From the
@@ -298,8 +310,8 @@ class Stepping:
     def vjp(
         self, state: Given | DeviceState, parameters: Values | None, state_bar: Values, steps: int = 1
     ) -> tuple[dict[str, Any], Arrays]:
-        """The derivatives of `step` in reverse: from the adjoint of the state after the steps to those of ``state`` and
-        of ``parameters``; see `Stepper.vjp`, which takes the steps once for several adjoints."""
+        """Return the adjoints of ``state`` and of ``parameters`` from that of the state after ``steps`` steps (reverse
+        mode); see `Stepper.vjp`, which takes the steps once for several adjoints."""
         stepper = self.stepper(check_steps(steps))
         return stepper.vjp(stepper.step(state, parameters)[1], state_bar)
 
@@ -311,15 +323,15 @@ class Stepping:
         parameter_dots: Values | None = None,
         steps: int = 1,
     ) -> dict[str, Any]:
-        """The derivative of `step` along tangents of ``state`` and of any parameters, as the tangent of the state after
-        the steps; see `Stepper.jvp`."""
+        """Return the tangent of the state after ``steps`` steps, given tangents of ``state`` and of any parameters
+        (forward mode); see `Stepper.jvp`."""
         stepper = self.stepper(check_steps(steps))
         residual = stepper.step(state, parameters, along=parameter_dots or ())[1]
         return stepper.jvp(residual, state_dot, parameter_dots)
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
-        """The `Stepper` of so many steps; those of the last few numbers of steps are kept."""
+        """Return the `Stepper` for this number of steps; those of the last few numbers are kept."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
         found = steppers.pop(steps, None) or Stepper(cast(Steppable, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one
