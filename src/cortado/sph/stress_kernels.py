@@ -16,7 +16,7 @@ turns as a whole, whatever the order of its particles, so that linear and angula
 shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). With the moments m_2 and m_4
 of s_ij along k, C = 4 / (3 m_2) takes the second term out, in every direction and for every kernel.
 
-From M, A and R of one particle (`stress_functions`) follow
+From M, A and R of one particle (`stress_of_particle`) follow
 
     G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
     mu = S law(sqrt(2 D : D), mu_m).
