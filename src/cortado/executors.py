@@ -51,9 +51,7 @@ class Executor(ABC):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the function's result for every item, in the order of the items. The function keeps what is large,
-        such as a problem, and items are small. Items are taken as they are needed. Raises what the function raised for
-        the first item, in their order, for which it raised anything.
+        """Return the function's result for every item, in the order of the items.
 
         The function keeps what is large, such as a problem, and items are small. Items are taken as they are needed.
         Raises what the function raised for the first item, in their order, for which it raised anything.
@@ -118,8 +116,7 @@ class Distributed(Executor):
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
         """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client; ``patience`` [s]: how long to
-        wait where there is no worker left. Raises `InputError` where distributed is not installed, or where there is no
-        scheduler.
+        wait where there is no worker left.
 
         Raises `InputError` where distributed is not installed, or where there is no scheduler.
         """
@@ -153,8 +150,6 @@ class Distributed(Executor):
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
         """Return the function's results for all items; see `Executor.map`. ``function``, items and results are pickled.
-        Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
-        scheduler or all workers are lost for good, or an item ends its process.
 
         Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
         scheduler or all workers are lost for good, or an item ends its process.
@@ -386,10 +381,7 @@ class LocalWorkers(Distributed):
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
     """Start worker processes on this machine with a scheduler in this process, which restarts lost ones, and end them
-    with the block. ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda".
-    The cores are shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin
-    under ``if __name__ == "__main__":``, as every process imports it. Raises `InputError` for more processes than there
-    are GPUs, or than four for each core, and 64.
+    with the block.
 
     ``number``: of processes; by default one for each core, or for each GPU with a ``device`` of "cuda". The cores are
     shared out among them. On GPUs each process sees one, as "cuda:0". A script that uses them must begin under

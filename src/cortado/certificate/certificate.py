@@ -285,10 +285,7 @@ def _beside(
     problem: Problem, values: Arrays, along: Arrays, random: np.random.Generator
 ) -> tuple[Consistency | None, int]:
     """Check all parameters with first positions and velocities moved a little at random, and return the check and its
-    number of steps: those before the moved run loses a particle (None where none are). Fluid at rest is on the corner
-    of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the errors of many corners may
-    cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved has the same terms, and is
-    on no corner.
+    number of steps: those before the moved run loses a particle (None where none are).
 
     Fluid at rest is on the corner of each |v| and min(v, 0) at once. Derivatives are those of one side of each; as the
     errors of many corners may cancel in the slopes of the loss to both sides, these are no bound. Fluid that is moved

@@ -167,9 +167,7 @@ class LossHistory:
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """Return the relative distance of the adjoints of `Rounded` losses from finite differences of their values. It
-        is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or where
-        round-off is as large as the differences.
+        """Return the relative distance of the adjoints of `Rounded` losses from finite differences of their values.
 
         It is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or
         where round-off is as large as the differences.
@@ -234,7 +232,6 @@ class LossHistory:
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """Return the change of a loss between two states from its adjoints: their mean times the difference of the states.
-    It is exact to second order, and free of the round-off of the loss's values.
 
     It is exact to second order, and free of the round-off of the loss's values.
     """
@@ -309,8 +306,7 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative distances (tried - 1, sample_steps) of central differences of successive h, with their round-off. At
-        every sample step it is the greatest up to there.
+        """Relative distances (tried - 1, sample_steps) of central differences of successive h, with their round-off.
 
         At every sample step it is the greatest up to there.
         """

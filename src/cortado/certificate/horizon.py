@@ -79,8 +79,7 @@ def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """Return the size of a meaningful perturbation of every number of these parameters, in their shapes and units. It
-    is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
+    """Return the size of a meaningful perturbation of every number of these parameters, in their shapes and units.
 
     It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
     """
@@ -101,8 +100,7 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
     """Return random directions that are smooth in space and constant in time, which move the fluid as a whole; for a
-    path that begins at 0 they grow in time. An independent random number for each particle would only move particles
-    against their neighbours.
+    path that begins at 0 they grow in time.
 
     An independent random number for each particle would only move particles against their neighbours.
     """
@@ -125,8 +123,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 def growth(norms: np.ndarray, time_step: float) -> float:
     """Return the growth of an adjoint from the last state to the first, in e-folds, by a line fitted to the logarithm
-    of its norm. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^
-    grows linearly, it hardly grows.
+    of its norm.
 
     The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the whole run. In free flight, where v^ grows linearly,
     it hardly grows.
@@ -252,8 +249,7 @@ class Alignment:
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """Return the alignment for all these parameters together; None where they have too many components for a smoothed
-    gradient, where it has no run, and where the loss does not depend on them.
+    """Return the alignment for all these parameters together.
 
     None where they have too many components for a smoothed gradient, where it has no run, and where the loss
     does not depend on them.

@@ -167,8 +167,8 @@ class GuardedServer:
 
 @contextmanager
 def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Make websockets' servers within by ``serve``, which is given the usual way. Viser has no options for it, and a
-    guard that came later would leave the first moments open."""
+    """Make websockets open servers in the block by ``serve``, whose first argument is its usual function. Viser has no
+    options for it, and a later guard would leave the first moments open."""
     usual = sockets.serve
     sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
     try:

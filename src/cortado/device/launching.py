@@ -81,8 +81,7 @@ Named = Mapping[str, Any]
 
 def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, bundles: Bundles) -> list[Any]:
     """Return a kernel's arguments in its order: from ``given``, all of which it must have, and from the first of the
-    ``groups`` that has each. A bundle is filled with the arrays that it names. Raises `TypeError` for missing or
-    unknown arguments, as nothing else would notice.
+    ``groups`` that has each. A bundle is filled with the arrays that it names.
 
     Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
     that is missing or that the kernel does not have.
@@ -194,10 +193,7 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 
 class KernelLauncher:
-    """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`). On a CPU,
-    where Warp has one thread, kernels whose first argument is the neighbourhood ``s`` are cut into ranges of particles,
-    which cores take one by one. Such a kernel works on particle ``s.first + wp.tid()``, and not on threads of its own
-    number. Sums are gathers, so their bits depend neither on the cut nor on the cores.
+    """A launcher of kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
     On a CPU Warp launches in one thread. A kernel whose first argument is the neighbourhood ``s`` is cut into ranges of
     particles there, several for each core where there are many, and a core that has done one takes the next: such a
@@ -285,8 +281,7 @@ class KernelLauncher:
 
 
 class CapturedGraph:
-    """Work repeated with fixed arrays: a captured graph from the second call on, as the first loads modules and
-    allocates. On a CPU a graph saves the packing of arguments: half of the time with a hundred particles.
+    """Work repeated with fixed arrays, as a captured graph from the second call on.
 
     The first time loads modules and allocates what a capture must not. On a CPU a graph saves the packing of arguments:
     half of the time with a hundred particles.

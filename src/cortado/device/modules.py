@@ -53,9 +53,7 @@ class Kernels:
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return the part of a Warp module's name that tells its kernels: "forward", "taped" or "derivative". Kernels with
-    Warp's own adjoint, which `gradients.Tape` needs, take three times as long to compile, so they are in "taped"
-    modules.
+    """Return the part of a Warp module's name that tells its kernels: "forward", "taped" or "derivative".
 
     Warp's own adjoint of forward kernels, which `gradients.Tape` needs, takes three times as long to compile as the
     kernels: those that a tape can differentiate are others, in modules of their own.

@@ -22,8 +22,7 @@ SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A tree of triangles, halved again and again across the longest side of their middles' box. Nodes are numbered as
-    `cortado.discretise.tree_kernels` says.
+    """A tree of triangles, halved again and again across the longest side of their middles' box.
 
     `cortado.discretise.tree_kernels` says how nodes are numbered.
     """
@@ -360,8 +359,7 @@ class Mesh(Solid):
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
         """Return `Solid.own_feet`, points at equal intervals of the area along the triangles, in an order of neighbours
-        in space. In a triangle that has several, these are a sequence of low discrepancy (Roberts 2018, R2), folded
-        into it.
+        in space.
 
         Along the triangles, in an order in which those near each other in space follow one another, a point stands at
         equal intervals of the area; in a triangle that has several, these are a sequence of low discrepancy (Roberts

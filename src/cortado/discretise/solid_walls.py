@@ -63,9 +63,7 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """Choose points about a spacing [m] apart from points (n, d) [m] ``fine`` [m] apart on a surface. First as many are
-    taken as can be so that no two are too near each other. Then each is moved to the middle of its nearest candidates
-    (Lloyd 1982), and to a candidate. At last any that are too near another are left out, and gaps are filled.
+    """Choose points about a spacing [m] apart from points (n, d) [m] ``fine`` [m] apart on a surface.
 
     First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
     to it (Lloyd 1982), and to a candidate; then any that are too near another are left out, and gaps are filled.

@@ -188,7 +188,6 @@ class Spread(OverParticles):
 
 class Missed(OverParticles):
     """A reward term: the weighted sum of squared distances of particles to targets that change from step to step.
-    Targets go on beyond a period as positions do, so a lap too many counts.
 
     Targets go on beyond the end of a period, as positions do: a lap too many is a distance.
     """

@@ -44,8 +44,7 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """Return size and times of a file that may be read, with links followed. Raises `OSError` with a reason in words if
-    it is no regular file or has more than ``most`` bytes.
+    """Return size and times of a file that may be read, with links followed.
 
     Raises `OSError`, whose ``strerror`` says why in words, if it is no regular file, or has more bytes than ``most``.
     """

@@ -42,7 +42,7 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
     """Return sRGB bytes (rows, columns, 3) of a linear image, clipped to 0..1. ``each`` maps a function over parts, as
-    ``map`` of an executor does. Raises: InputError: another shape, or values that are not finite.
+    ``map`` of an executor does.
 
     Raises:
         InputError: another shape, or values that are not finite.

@@ -15,8 +15,7 @@ from cortado.errors import ComputationError
 
 
 def printable(text: str) -> str:
-    """Return a text on one line, with characters that would steer a terminal as escapes, such as ``\x1b``. A byte of a
-    file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
+    """Return a text on one line, with characters that would steer a terminal as escapes, such as ``\\x1b``.
 
     A byte of a file name that is not UTF-8, which Python keeps as a lone surrogate, becomes that byte's escape.
     """

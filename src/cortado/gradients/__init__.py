@@ -49,8 +49,7 @@ def estimate(
     estimator: GradientEstimator | None = None,
     observe: Observer | None = None,
 ) -> Estimate:
-    """Return the loss of a problem and its gradient by an estimator, `Exact` by default. Raises `InputError` for
-    anything but an estimator, or one that does not return the gradient of every parameter.
+    """Return the loss of a problem and its gradient by an estimator, `Exact` by default.
 
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """

@@ -169,9 +169,7 @@ class LeftOutWarning(CortadoWarning):
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
     """Return masks (members,) of ensemble members to average, given their runs one member after the other. A member
-    with a diverged run is left out: the others are as symmetric about the parameters as before. ``what``: the members
-    in words, in the plural. Warns of left out members; with more than a quarter of them, it raises the error of the
-    first diverged run.
+    with a diverged run is left out: the others are as symmetric about the parameters as before.
 
     ``what``: the members in words, in the plural. Warns of those that are left out; where they are more than a quarter
     of all, it raises the error of the first run that diverged.

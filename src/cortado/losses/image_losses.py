@@ -37,8 +37,7 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class SquaredDifference:
-    """An image loss: the mean over pixels and channels of the squared difference. Shapes must overlap to feel each
-    other.
+    """An image loss: the mean over pixels and channels of the squared difference.
 
     Shapes that do not overlap do not feel each other; `Pyramid` is for these.
     """
@@ -58,8 +57,7 @@ class SquaredDifference:
 @dataclass(frozen=True)
 class Pyramid:
     """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
-    Adelson 1983). The first is the image itself, every other one the level before, blurred by a binomial and reduced by
-    2 (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.
+    Adelson 1983).
 
     The first level is the image itself, every other one the level before, blurred by a binomial and reduced by 2
     (`reduction`). Coarse levels see where a shape is before it overlaps with its target, fine levels its outline.

@@ -230,7 +230,7 @@ class NeighbourSearch:
         self._sort(positions)
 
     def _write_walls(self, walls: WallArrays) -> None:
-        """Write the wall particles at rest to the search's arrays, in this order."""
+        """Copy the wall particles at rest to the search's arrays on the device, in the given order."""
         known = {name: getattr(walls, name) for name in ("positions", "weights", "grips", "feet")}
         for name, values in {**known, "solids": walls.solid}.items():
             array = self.walls[f"wall_{name}"]

@@ -115,8 +115,7 @@ def _linear(colours: Any) -> Any:
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
     """Write ``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a transform
-    ``/run/solid_NAME`` with a mesh; return its path. Frame k is at time code k, and the file has the number of time
-    codes in a second: `WholeFrames` says which states these are. Lengths are metres, colours linear.
+    ``/run/solid_NAME`` with a mesh; return its path.
 
     Frame k is at time code k, and the file says how many time codes a second has: `WholeFrames` says which states
     these are. Lengths are metres, colours linear.

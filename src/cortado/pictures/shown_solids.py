@@ -87,7 +87,7 @@ class ShownSolid:
 
     @property
     def body(self) -> Solid:
-        """Return the shape in its place."""
+        """Return the shape placed at the solid's position and turn."""
         return Placed(self.shape, self.position, self.turn)
 
     @property

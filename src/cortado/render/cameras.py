@@ -81,7 +81,7 @@ class Camera:
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
         """Return the camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,)
-        [rad]. The renderer gives derivatives with respect to the pose in these coordinates, at zero.
+        [rad].
 
         These are the coordinates, at zero, in which the renderer gives the derivative with respect to the pose.
         """

@@ -139,8 +139,6 @@ def ray_functions(precision: Precision) -> RayFunctions:
     @wp.func
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
         """Return the first column, the one behind the last, first row, and the one behind the last; never too few.
-        Where the map to the screen is regular, over the whole box, its extremes are at corners. A box that reaches
-        behind a camera with a point of view may be anywhere on the screen.
 
         Where the map to the screen is regular, over the whole box, its extremes are at corners. A box that
         reaches behind a camera with a point of view may be anywhere on the screen.

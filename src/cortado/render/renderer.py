@@ -68,7 +68,7 @@ class Renderer:
         periods: Sequence[float] | np.ndarray | None = None,
         colours: np.ndarray | None = None,
     ):
-        """Fluid is seen from ``lower`` to ``upper`` (d,) [m], and by the support radius [m] beyond.
+        """Prepare a view of the fluid from ``lower`` to ``upper`` (d,) [m], and by the support radius [m] beyond.
 
         Along an axis with a period (``periods`` (d,) [m], 0 without one) fluid is seen wherever an image of it is
         between ``lower`` and ``upper``.

@@ -43,9 +43,7 @@ class Pictured(Protocol):
 
 
 def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for the particles of a simulation, after its scene's table [render], or from above. The
-    extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
-    `Simulation.renderer`.
+    """Make a renderer for the particles of a simulation, after its scene's table [render], or from above.
 
     The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
     `Simulation.renderer`.

@@ -114,8 +114,7 @@ class ParameterSpace:
         arrays: State | None = None,
     ) -> None:
         """Set the first state and the parameters of a rollout: ``values``, and the scene's own, as scheduled, for those
-        left out. With the mobility among ``varied``, which are to be differentiated, diffusion is computed even where
-        it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.
+        left out.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
         diffusion even where it is 0. ``states`` replace the scene's first one, with their fields or ``arrays``.

@@ -253,8 +253,7 @@ class Rollout(Staying):
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
         """Return the adjoint of the first state for ``bars``, adjoints of states by number; the next backward pass
-        overwrites it. ``observe`` is given the adjoint of each state, last to first. Raises `InputError` unless
-        `forward` has finished with these parameters and kept states.
+        overwrites it.
 
         ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
         `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
@@ -360,7 +359,7 @@ OF_AN_EVALUATION = (
 
 class Residual:
     """A handle on one evaluation of a rollout (first state, parameters, checkpoints), which allows a backward pass also
-    after later evaluations. Nothing is copied until another evaluation begins; then it keeps what that would overwrite.
+    after later evaluations.
 
     Nothing is copied until another evaluation begins. From then on it keeps the first state and, as long as it is held,
     the checkpoints.

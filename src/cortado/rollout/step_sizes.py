@@ -423,9 +423,7 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
         time_step: wp.array(dtype=real),
     ):
         """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time at
-        which it begins. ``length``: how far a particle may move in a step; ``first``: dt before the first step, 0 for
-        none; ``longest`` is dt without the growth. Where no particle moves, nothing is divided by its speed. A speed
-        that is not finite bounds nothing: its particle is lost, and the host will see it.
+        which it begins.
 
         ``length``: how far a particle may move in a step; ``first``: dt of the step before the first, 0 where there was
         none; ``longest`` is dt without it. Where no particle moves, nothing is divided by its speed. A speed that is

@@ -64,8 +64,7 @@ class StepResidual(Staying):
 
 
 class Stepper:
-    """A fixed number of steps of a simulation, as a function of the state before them and of parameters. Its arrays,
-    graphs and kernels are made once and serve every call.
+    """A fixed number of steps of a simulation, as a function of the state before them and of parameters.
 
     Its arrays, graphs and kernels are made once and serve every call.
     """
@@ -109,8 +108,7 @@ class Stepper:
 
     @in_turn
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
-        """Return the state after the steps, on the device if the given one is. A parameter over time may be a Warp
-        array in the simulation's precision: it stays on the device, unchecked.
+        """Return the state after the steps, on the device if the given one is.
 
         A parameter over time may be a Warp array on the device, in the simulation's precision: it stays there, and is
         not looked at.
@@ -133,9 +131,7 @@ class Stepper:
     def step(
         self, state: Given | DeviceState, parameters: Values | None = None, along: Iterable[str] = ()
     ) -> tuple[States | DeviceState, StepResidual]:
-        """Return the state after the steps, and a residual for `vjp` and `jvp`; several may be held at once. ``along``
-        are further parameters of directions for `jvp`; only the mobility must be named, as nothing diffuses where it is
-        0. Parameters may be on the device as those of `advance`.
+        """Return the state after the steps, and a residual for `vjp` and `jvp`; several may be held at once.
 
         Any number of residuals may be held at a time, each with states of its own. ``along`` are further parameters
         that `jvp` will be given directions of; only the mobility has to be said before, as where it is 0 nothing
@@ -149,11 +145,7 @@ class Stepper:
     @in_turn
     def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return adjoints of the state before the steps and of the given parameters, from that of the state after them
-        (reverse mode). The adjoint of a state is a table of arrays, those of its fields by name and in their shapes,
-        and of its ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on
-        the device; all else that is returned is in float64. A batch has a first axis for the scenes; of one that was
-        lost all is NaN, or 0 where its adjoint is 0 throughout. A parameter on the device has its adjoint there, in its
-        own shape. Raises `InputError` for fields that the state does not have, or that have other shapes.
+        (reverse mode).
 
         The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
         ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
@@ -261,8 +253,7 @@ class Stepping:
 
     def state(self, parameters: Values | None = None) -> States:
         """Return the state before the first step, from which `step` and ``Simulation.run(state=...)`` go on; of a batch
-        a tuple with one for each scene. ``parameters`` are any of those of `Problem` that a first state depends on,
-        such as ``initial_velocities``. Raises `InputError` for those that do not fit.
+        a tuple with one for each scene.
 
         ``parameters`` are any of those of `Problem` that a first state depends on, such as ``initial_velocities``.
         Raises `InputError` for those that do not fit.
@@ -273,10 +264,7 @@ class Stepping:
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
         """Return a state, the first one if left out, in arrays on the device, which other programs take by DLPack;
-        steps from it stay on the device. ``fields`` are arrays that speak DLPack and replace fields of the state, in
-        the precision of the simulation and on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a
-        batch (batch, n, ...). Such a state is judged as one from a file is, which reads it on the host, once.
-        ``parameters`` are those of the run that the state is of. Raises `InputError` for what does not fit.
+        steps from it stay on the device.
 
         ``fields`` are arrays that speak DLPack and replace fields of the state, in the precision of the simulation and
         on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). Such a state is

@@ -410,7 +410,7 @@ def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None
 
 
 def _written(value: Any) -> str:
-    """Write a value as in a file; one that is left out has no value."""
+    """Return a value as a run's file shows it, in a few words; "nothing" for None."""
     if value is None:
         return "nothing"
     return json.dumps(value)[: 2 * LONGEST] if isinstance(value, dict) else shown(value)

@@ -318,7 +318,6 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
 
 def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
     """Check that the opening is inside, and that fluid comes in through it; upstream of it the column may be outside.
-    Along a periodic axis it may not: such fluid comes in again on the other side.
 
     Along a periodic axis it may not: what is outside there comes in again on the other side.
     """

@@ -136,8 +136,7 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Make the wall particles of one solid that moves, as if nothing else were there, but for its own images where it
-    fills a period. They are found in its own frame, so that they do not depend on its first place, nor, unless it fills
-    a period, on its rotation.
+    fills a period.
 
     They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
     how it is turned.

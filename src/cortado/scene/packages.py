@@ -109,8 +109,7 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """Guard an object that a part of a package made, such as a solver: the methods and properties of its class, and
-    their results."""
+    """Wrap an object made by a package, such as a solver, with guarded methods, which name the package in errors."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's

@@ -63,10 +63,7 @@ class Scene(SceneTables):
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """Return this scene with an emitter that has a reserve for a time [s], or for ``steps`` steps. It is the scene
-        itself where that has no emitter, or one with a duration, and where the column suffices. So it is where fluid
-        flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more particles than
-        memory holds.
+        """Return this scene with an emitter that has a reserve for a time [s], or for ``steps`` steps.
 
         It is the scene as it is where that has no emitter, or one with a duration, and where the column suffices. So it
         is where fluid flows along a periodic axis, which leaves no place for a reserve. Raises `InputError` for more

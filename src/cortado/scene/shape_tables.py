@@ -410,8 +410,7 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
-    """Check that a container is at least one spacing wide, and a period longer than two support radii. The search takes
-    the nearest periodic image only; in a shorter period a pair would have two.
+    """Check that a container is at least one spacing wide, and a period longer than two support radii.
 
     The neighbour search takes the nearest periodic image only; in a shorter period a pair would have two.
     """

@@ -189,9 +189,7 @@ class ConjugateGradients:
         r: wp.array,
         y: wp.array,
     ) -> None:
-        """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``. ``multiply``
-        writes B p, for ``p``, its first argument, to the ``product`` of its second, and each particle's w p B p to the
-        ``share``.
+        """Write to ``y`` the solution of B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
 
         ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
         w p B p of each particle to the ``share``.

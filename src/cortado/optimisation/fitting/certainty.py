@@ -119,7 +119,7 @@ def independent_frames(times: np.ndarray, correlation_time: float) -> float:
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
     """Estimate the covariance of a fit's score J^T r, from whitened residuals r (F, m) and Jacobians J (F, m, p) of F
-    frames. They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`.
+    frames.
 
     They are weighted as in the normal matrix, whose ``inverse`` is given; ``frames``: see `independent_frames`."""
     F, products = len(r), Products.of(J, r)

@@ -108,7 +108,7 @@ class Frames:
 
     @property
     def around(self) -> set[int]:
-        """Return the numbers of steps before the states that `rates` reads."""
+        """Return the step numbers of the states that `rates` needs: each frame's state and the next."""
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
@@ -310,10 +310,10 @@ class Tracks:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """``first`` (tracers, d) places at the start of the run [m]; ``times`` (frames,) [s] after it; ``positions``
-        (frames, tracers, d) [m], NaN where a tracer was not seen; ``noise``, standard deviation of a coordinate [m], if
-        it is known; ``clock`` [s], what is added to the times, which ``calibrate=["start"]`` searches. Raises
-        `InputError` for a tracer that has no fluid around it."""
+        """Set the tracers' ``first`` places (tracers, d) [m] at the start of the run, and ``positions`` (frames,
+        tracers, d) [m] at ``times`` (frames,) [s] after it, NaN where a tracer was not seen. ``noise``, if known, is
+        the standard deviation of a coordinate [m]; ``clock`` [s] is added to the times, and ``calibrate=["start"]``
+        searches it. Raises `InputError` for a tracer that has no fluid around it."""
         self.start = only_a_clock(calibrate, clock)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)

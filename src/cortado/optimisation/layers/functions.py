@@ -234,8 +234,8 @@ class Value(OfSimulation):
 
 
 def _times(found: np.ndarray, bar: Any) -> np.ndarray:
-    """Return a derivative times that with respect to the loss, of a batch with a first axis; 0 where the latter is 0,
-    even without numbers."""
+    """Return ``found`` times ``bar``, a loss's derivative for each scene of a batch; 0 where ``bar`` is 0, even if
+    NaN."""
     factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
     return np.where(factor == 0.0, 0.0, found) * factor
 

@@ -98,8 +98,7 @@ def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
     """Push tangents ``others`` of the arrays ``given`` to a layer forward, or pull adjoints of its results back, by the
-    tickets of its residual. Of a layer mapped over entries, the derivative is mapped over these, over a part of them,
-    as where it is differentiated along several directions, or not at all.
+    tickets of its residual.
 
     Mapped over so many entries, of a layer that was mapped over these, over a part of them, as where it is
     differentiated along several directions, or not at all."""

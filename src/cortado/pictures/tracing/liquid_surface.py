@@ -258,7 +258,7 @@ def _cube(particles: Particles) -> float:
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:
-    """Return the ends of all particles, or of those around the middle one, where some are very far away."""
+    """Return lower and upper corner of all particles, or of those around their median if some are very far away."""
     lower, upper = particles.ends(launch)
     if np.prod((upper - lower) / spacing + 1.0) <= MOST_CELLS:
         return lower, upper

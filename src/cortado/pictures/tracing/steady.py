@@ -56,7 +56,7 @@ class Still:
 
 @wp.func
 def share(way: wp.float32, limits: wp.vec2):
-    """Return 1 for ways up to the first limit, 0 from the second on, and a smooth share between."""
+    """Return the weight of a displacement: 1 up to the first limit, 0 from the second on, smooth between."""
     x = wp.clamp((limits[1] - way) / (limits[1] - limits[0]), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 

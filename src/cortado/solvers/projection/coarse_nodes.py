@@ -160,7 +160,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     def products(
         i: int, particles: int, x: vector, e: wp.array(dtype=real), u: wp.array(dtype=real), grid: grid_type
     ) -> real:
-        """Return the sum of e u over the nodes whose hats reach particle i."""
+        """Return the sum of products e u of two fields over the nodes whose hats reach particle i."""
         own, first = first_corner(i, particles, x, grid)
         total = real(0.0)
         for corner in range(CORNERS):

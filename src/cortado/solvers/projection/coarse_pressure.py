@@ -268,7 +268,8 @@ def length_kernels(precision: Precision) -> LengthKernels:
         carried_i: real,
         thrust_i: vector,
     ) -> pair_of:
-        """Return a particle's share of both sums of alpha; a scene that ``stays`` uncorrected has an alpha of 0."""
+        """Return a particle's addends to both sums whose ratio is alpha, which is 0 in a scene that ``stays``
+        uncorrected."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
         own = least(m_i, spacing, time_step)

@@ -182,8 +182,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Residual
 
     @wp.func
     def counts(y: real, tension: real, left: real) -> real:
-        """Return the part of a divergence that counts in the residual. Iterations that let through a part of a tension
-        leave a divergence that the coarse grid must not take away; the corner between has the mean. NaN counts."""
+        """Return the share, 1, 1/2 or 0, of a divergence in the coarse residual: 0 where iterations let through part of
+        a tension, whose divergence must stay; 1/2 at the corner between; 1 for NaN."""
         if y > real(0.0) or tension >= real(1.0) or not (left <= real(0.0)):
             return real(1.0)
         return wp.where(left == real(0.0), real(0.5), real(0.0))

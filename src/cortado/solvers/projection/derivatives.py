@@ -263,7 +263,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._coarse.finish(context, known)
 
     def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
-        """Apply the adjoint of the coarse correction before iteration k to those of k, y and u."""
+        """Apply the adjoint of the coarse correction before iteration ``k``, to the adjoints of its pressure and
+        velocity."""
         solver, at = self._solver, self._solver.iterates[k]
         steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar, "S": self._push}
         drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}

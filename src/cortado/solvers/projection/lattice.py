@@ -36,9 +36,7 @@ class ProjectionConstants:
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
-        """Compute the constants on a lattice with a spacing [m], for a support radius [m]. One undamped Jacobi
-        iteration goes lambda times too far in the stiffest pressure wave exp(i q . x), lambda = max_q |sum_j g_j sin(q
-        . x_j)|^2 / a_0.
+        """Compute the constants on a lattice with a spacing [m], for a support radius [m].
 
         lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is how many times too far one undamped Jacobi iteration goes in
         the stiffest pressure wave exp(i q . x) of the lattice.

@@ -378,7 +378,7 @@ class ProjectionSteps(ParticleSolver):
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
-        """Return the drift of walls, where free bodies move as the y of an iterate pushes them."""
+        """Return the drift of walls, with the motion of free bodies under the pressure y of an iterate."""
         drift = self.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 

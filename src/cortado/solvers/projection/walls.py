@@ -204,7 +204,7 @@ class ProjectionPush:
     """The sums along which pressures of the projection push walls: a `cortado.sph.walls.WallAction`."""
 
     def __init__(self, discretisation: Discretisation, layout: Layout, constants: ProjectionConstants, volume: float):
-        """Prepare sums for particles with a volume V at rest, ``volume`` [m^d]."""
+        """Prepare the sums over walls, for a particle's ``volume`` at rest [m^d]."""
         self._layout = layout
         self._normal, self._whole = (WallSums(term(discretisation), layout) for term in (normal_term, wall_slope_term))
         self._least = DIRECTION * constants.least_diagonal / volume**2
