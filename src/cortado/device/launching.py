@@ -202,7 +202,7 @@ class KernelLauncher:
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
-        """``record_tape`` False keeps launches off a tape that a user may have open."""
+        """Prepare launches; ``record_tape`` False keeps them off a tape that a user may have open."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
         self._cores = min(usable_cores(), MOST_CORES) if device.is_cpu and not record_tape else 1
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))

@@ -358,8 +358,7 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """Return `Solid.own_feet`, points at equal intervals of the area along the triangles, in an order of neighbours
-        in space.
+        """Return points spread over the triangles at equal intervals of area, for `Solid.own_feet`.
 
         Along the triangles, in an order in which those near each other in space follow one another, a point stands at
         equal intervals of the area; in a triangle that has several, these are a sequence of low discrepancy (Roberts

@@ -299,8 +299,8 @@ class Packing:
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """Return by how much (m,) the densities of ``some`` of particles (n, d) [m] are above the lattice's, relative.
-        It is 0 for those that stay (n,), around which no air is counted, where they are below it."""
+        """Return the relative excess (m,) of the densities of ``some`` of particles (n, d) [m] over the lattice's. For
+        those that ``stays`` (n,) marks, around which no air is counted, a lack of density counts as 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 

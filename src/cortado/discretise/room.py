@@ -203,8 +203,8 @@ WITHOUT_PERIODS = Domain((), ())
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """Return vectors (m, k) from image to image, along as many periodic axes as are independent when they are seen as
-    ``axes`` (d, k): first along those that are seen best."""
+    """Return the translations (m, k) between periodic images along a maximal independent set of axes, as projected by
+    ``axes`` (d, k), longest projections first."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)

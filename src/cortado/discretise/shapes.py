@@ -38,7 +38,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Join the rows of several, one behind the other."""
+        """Concatenate the rows of several objects of this class."""
         names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 

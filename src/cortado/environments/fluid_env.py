@@ -139,10 +139,10 @@ class FluidEnv(Staying, gymnasium.Env[Observation, NDArray]):
         sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
     ):
-        """``task``: its name, such as "Carry", in the ``size`` "small", if left out, or "large"; or a `Task` of
-        your own.
-        ``particles``: how many are observed; ``sensors`` by name, such as those of `cortado.sensors`, are observed as
-        well; ``device`` and ``precision`` as those of `Simulation`; ``render_mode`` None or "rgb_array"."""
+        """Make the environment of a ``task``: its name, such as "Carry", in the ``size`` "small", if left out, or
+        "large"; or a `Task` of your own. ``particles``: how many are observed; ``sensors`` by name, such as those of
+        `cortado.sensors`, are observed as well; ``device`` and ``precision`` as those of `Simulation`; ``render_mode``
+        None or "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
         self.scenes = Scenes(task_of(task, size), 1, device, precision, particles, sensors)
         self.observation_space, actions = spaces(self.scenes)
@@ -215,7 +215,7 @@ class FluidVectorEnv(Staying, VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
     ):
-        """``num_envs``: scenes in the batch; ``autoreset_mode`` as that of `gymnasium.vector.SyncVectorEnv`;
+        """Make a batch of ``num_envs`` scenes; ``autoreset_mode`` as that of `gymnasium.vector.SyncVectorEnv`;
         ``max_episode_steps``: after how many steps an episode is truncated, by default the horizon of the task. Other
         arguments are those of `FluidEnv`."""
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)

@@ -139,7 +139,7 @@ def unfinished(path: Path) -> Path:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a whole file under a temporary name and then renames it, so that no reader meets half of it.
+    """Write a whole file under a temporary name and then rename it, so that no reader meets half of it.
 
     Raises:
         ComputationError: the disk is full.

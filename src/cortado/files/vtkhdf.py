@@ -117,7 +117,7 @@ class TrajectoryWriter:
         others: Mapping[str, ArrayLike] | None = None,
         **scalars: ArrayLike,
     ) -> None:
-        """Writes one frame.
+        """Write one frame.
 
         Args:
             positions: (n, d) [m]
@@ -169,7 +169,7 @@ class TrajectoryWriter:
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
     def append_steps(self, **diagnostics: ArrayLike) -> None:
-        """Writes what the solver noted of one step (scalars) or of several ((k,) each), by name.
+        """Write what the solver noted of one step (scalars) or of several ((k,) each), by name.
 
         Raises:
             InputError: names other than announced, or more steps than announced.
@@ -231,7 +231,7 @@ class TrajectoryWriter:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Reads the frames and steps that were completed, while the writer is at work or after its death.
+    """Read the frames and steps that were completed, while the writer is at work or after its death.
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],

@@ -86,8 +86,8 @@ class Page:
     def images(
         self, frames: Sequence[int], ahead: Ahead = iter, begin: int = 0, window: int = WINDOW
     ) -> Iterator[Points]:
-        """Yield the pictures of a film's frames in their order, from one of them on, each given ``window`` frames
-        before and after it; ``ahead`` may draw panels' pictures before they are needed."""
+        """Yield the pictures of a film's frames in order, from ``begin`` on, each drawn with ``window`` frames before
+        and after it; ``ahead`` may draw panels' pictures early."""
         shown = range(begin, len(frames))
         drawn = ahead(panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels)
         return (self.composed(list(islice(drawn, len(self.panels)))) for _ in shown)

@@ -405,7 +405,7 @@ class Render(Table):
         return self
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return this table, at a path, for 2 or 3 dimensions."""
+        """Return this table with the view for 2 or 3 dimensions; raise a field's error where it does not fit."""
         if dimension == 2 and "view" not in self.model_fields_set:
             return self.model_copy(update={"view": "plane"})
         if (self.view == "plane") != (dimension == 2):

@@ -56,7 +56,7 @@ class Knots:
         return float(np.linalg.norm(self._slopes.reshape(len(self.times), -1), axis=1).max())
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the derivatives with respect to time, (n,) or (n, components), at a knot those after it."""
+        """Return the time derivatives, (n,) or (n, components), at times (n,) [s]; at a knot, those just after it."""
         return self._slopes[np.searchsorted(self.times, times, side="right") - 1]
 
     @property

@@ -70,7 +70,7 @@ class Contact:
 
 
 class Seen:
-    """How deep each point of a body is within another one, with normals and shares of the force; or their tangents."""
+    """The depths of a body's points within another body, with normals and shares of the force; or their tangents."""
 
     def __init__(self, contact: Contact, layout: Layout, suffix: str = ""):
         real, vector = layout.precision.real, layout.precision.vector
@@ -90,7 +90,7 @@ class Seen:
         return {f"whole{self._suffix}": self._whole(self.numbers[f"square{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """The sums over the points of a body of each share of the contact force, (members,) vectors each."""
+        """Return the sums over the points of a body of each share of the contact force, (members,) vectors each."""
         shares = zip(self.shares.items(), self._sums, strict=True)
         names = [f"{name}_sum{self._suffix}" for name in SHARES]
         return dict(zip(names, (total(share) for (_, share), total in shares), strict=True))
@@ -176,7 +176,7 @@ class ContactsTangent:
         self._seen = [Seen(contact, contacts.layout, "_dot") for contact in contacts.contacts]
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """The tangent of `Contacts.look`."""
+        """Write the tangents of the depths and normals that `Contacts.look` finds."""
         contacts, kernels = self._contacts, self._contacts.kernels
         for own in self._changes:
             for array in own.given.values():

@@ -201,7 +201,7 @@ class PartAdjoint:
         has the adjoint of the part's fields after the step, and becomes that of those before it."""
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoint of `Part.begin`, after all others; a part whose fields it leaves alone needs none."""
+        """Apply the adjoint of `Part.begin`, after all others; a part without fields changed there needs none."""
 
 
 class Part:
@@ -251,8 +251,8 @@ class PartMaker(Protocol):
 
 
 class Carried:
-    """What a solver carries of particles from step to step, such as a pressure, sorted as in a step; or the tangents or
-    the adjoints of that."""
+    """A set of fields that a solver carries from step to step, such as a pressure, for sorted particles; or their
+    tangents or adjoints."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
         """Allocate the fields' arrays; raise `TypeError` for a field that has not an entry for each particle."""

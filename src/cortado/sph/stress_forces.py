@@ -41,7 +41,7 @@ class ContactFunctions:
 
 @cache
 def contact_functions(discretisation: Discretisation) -> ContactFunctions:
-    """The Warp functions by which walls and particles hold each other in the viscous stress, for a discretisation."""
+    """Return the Warp functions by which walls and particles hold each other in the viscous stress."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)

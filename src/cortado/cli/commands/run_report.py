@@ -270,7 +270,7 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
 
 
 def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
-    """The section of a report about the sensors of a run, with a plot of what they read."""
+    """Return the section of a report about the sensors of a run, with a plot of what they read."""
     path = readings(read, folder.figures / "sensors.png")
     told = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
     return Section("Sensors", [told], figures=[("What the sensors read.", path)])

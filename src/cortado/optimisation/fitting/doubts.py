@@ -288,8 +288,8 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Sequence[Weighting])
 def _by_change(
     problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
 ) -> list[np.ndarray]:
-    """Return how much predictions change with a change in each experiment, which a function computes with the numbers
-    of runs and tangent runs that it took; 0 where that cannot be told."""
+    """Return the change of predictions by a change in each experiment, computed by a function that also returns its
+    numbers of runs and tangent runs; 0 where it cannot be told."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
         try:

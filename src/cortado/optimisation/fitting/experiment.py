@@ -37,8 +37,8 @@ class Experiment:
         steps: int | None = None,
         state: RestartState | None = None,
     ):
-        """``observations`` such as ``{"camera": measured.Video(...)}``; ``steps`` up to the last frame if left out;
-        ``state`` where the run begins, as that of a `Problem`."""
+        """Take ``observations`` such as ``{"camera": measured.Video(...)}``; ``steps`` up to the last frame if left
+        out; ``state`` where the run begins, as that of a `Problem`."""
         require_table("observations", observations, "{'camera': measured.Video(...)}")
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")

@@ -176,7 +176,7 @@ def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) ->
 
 
 def on_host(array: Array) -> np.ndarray:
-    """The numbers of an array, on the host or on a device, as a NumPy array."""
+    """Return the numbers of an array, on the host or on a device, as a NumPy array."""
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 

@@ -168,7 +168,7 @@ class BodiesTangent:
     def drifted(
         self, context: StepContext, dot: Tangents, drift_dot: wp.array, y: wp.array, y_dot: wp.array
     ) -> wp.array:
-        """The tangent of `Bodies.drifted`."""
+        """Return the tangent of the drift of walls by `Bodies.drifted`."""
         for k, own in enumerate(self._held):
             moved = self._bodies.held[k].moved
             self._move(context, dot, k, (y, y_dot), moved, own.moved)
@@ -178,7 +178,7 @@ class BodiesTangent:
         return drift_dot
 
     def settle(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
-        """The tangent of `Bodies.settle`."""
+        """Write the tangents of the free bodies' new velocities, as `Bodies.settle` writes the velocities."""
         for k, held in enumerate(self._bodies.held):
             self._move(context, dot, k, (y, y_dot), held.body.moved, self._changes[k].moved)
 
@@ -230,7 +230,7 @@ class BodiesAdjoint:
         context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
 
     def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
-        """The adjoint of `Bodies.settle`."""
+        """Apply the adjoint of `Bodies.settle`, which wrote the bodies' new velocities."""
         for k, held in enumerate(self._bodies.held):
             self._move(context, bar, k, y, held.body.moved, self._changes[k].moved, y_bar)
 

@@ -137,7 +137,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
 
 class Level(NamedTuple):
-    """One of the multigrid's grids, with its part of the arrays of all levels."""
+    """A grid of the multigrid, with its part of the arrays of all levels."""
 
     shape: wp.vec3i
     factor: wp.vec3i

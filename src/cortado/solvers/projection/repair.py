@@ -162,7 +162,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     def move(
         pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
     ) -> tuple[real, vector]:
-        """Move a particle by lambda'; ``held`` is the part of the way d that it goes."""
+        """Move a particle by the repair's lambda', by a limited distance; ``held`` is the part of the full way."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:

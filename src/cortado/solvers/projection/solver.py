@@ -118,7 +118,7 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         w_i: real,
         p_i: real,
     ) -> tuple[real, real]:
-        """Apply the adjoint system's operator over w to p; ``u`` is -D^T y / m."""
+        """Apply the operator of the adjoint system, divided by the weights w, to p; ``u`` is -D^T y / m."""
         total = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + image_i * widened
         found = rest_i * p_i - root_i * (total + wp.dot(gamma_i, u_i))
         return found / w_i, p_i * found
