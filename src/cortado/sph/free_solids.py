@@ -17,14 +17,7 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Entry, Layout, State, StateField
-from cortado.scene.motions import (
-    AXES,
-    angular_velocity_name,
-    density_name,
-    position_name,
-    rotation_name,
-    velocity_name,
-)
+from cortado.scene.motions import AXES, angular_velocity_name, density_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
 from cortado.sph.free_kernels import free_kernels
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
