@@ -24,33 +24,40 @@ SIZES = [0.0, 1e-9, 1e-3, 0.9 * NEAR, 0.999 * NEAR, 1.001 * NEAR, 0.3, 3.0]
 """Of turns [rad]: on both sides of where a series ends."""
 
 
+ROTATION = SPACE.rotation
+
+
+@wp.func
+def work(turn: VECTOR, arm: VECTOR, force: VECTOR) -> REAL:
+    return wp.dot(ROTATION(turn) * arm, force)
+
+
 @wp.kernel(enable_backward=False)
 def all_of(
     turn: wp.array(dtype=VECTOR),
-    change: wp.array(dtype=VECTOR),
-    bar: wp.array(dtype=VECTOR),
+    arm: wp.array(dtype=VECTOR),
+    force: wp.array(dtype=VECTOR),
     # out
     columns: wp.array2d(dtype=VECTOR),
-    further: wp.array(dtype=VECTOR),
-    back: wp.array(dtype=VECTOR),
+    slope: wp.array(dtype=VECTOR),
 ):
     i = wp.tid()
     for k in range(3):
         axis = VECTOR()
         axis[k] = REAL(1.0)
-        columns[i, k] = wp.static(SPACE.rotation)(turn[i]) * axis
-    further[i] = wp.static(SPACE.further)(turn[i], change[i])
-    back[i] = wp.static(SPACE.back)(turn[i], bar[i])
+        columns[i, k] = ROTATION(turn[i]) * axis
+    by_turn, _by_arm, _by_force = wp.grad(work)(turn[i], arm[i], force[i])
+    slope[i] = by_turn
 
 
-def found(turn, change, bar):
-    """(n, 3, 3) rotations, and (n, 3) further changes and adjoints."""
+def found(turn, arm, force):
+    """(n, 3, 3) rotations, and (n, 3) the derivatives of R(w) arm . force."""
     n = len(turn)
-    out = [wp.zeros(shape, dtype=VECTOR, device="cpu") for shape in ((n, 3), n, n)]
-    given = [wp.array(values, dtype=VECTOR, device="cpu") for values in (turn, change, bar)]
+    out = [wp.zeros(shape, dtype=VECTOR, device="cpu") for shape in ((n, 3), n)]
+    given = [wp.array(values, dtype=VECTOR, device="cpu") for values in (turn, arm, force)]
     wp.launch(all_of, n, [*given, *out], device="cpu")
-    columns, further, back = (array.numpy() for array in out)
-    return columns.transpose(0, 2, 1), further, back
+    columns, slope = (array.numpy() for array in out)
+    return columns.transpose(0, 2, 1), slope
 
 
 def jacobian(w):
@@ -65,13 +72,13 @@ def jacobian(w):
 @pytest.mark.parametrize("size", SIZES)
 def test_a_rotation_and_its_changes(size):
     random = np.random.default_rng(4)
-    turn, change, bar = random.normal(size=(3, 20, 3))
+    turn, arm, force = random.normal(size=(3, 20, 3))
     turn *= size / np.linalg.norm(turn, axis=1, keepdims=True)
-    matrices, further, back = found(turn, change, bar)
-    wanted = np.array([jacobian(w) for w in turn])
+    matrices, slope = found(turn, arm, force)
+    torque = np.cross(np.einsum("nab,nb->na", matrices, arm), force)
+    wanted = np.einsum("nab,na->nb", [jacobian(w) for w in turn], torque)
     np.testing.assert_allclose(matrices, Rotation.from_rotvec(turn).as_matrix(), atol=1e-15)
-    np.testing.assert_allclose(further, np.einsum("nab,nb->na", wanted, change), atol=3e-15)
-    np.testing.assert_allclose(back, np.einsum("nab,na->nb", wanted, bar), atol=3e-15)
+    np.testing.assert_allclose(slope, wanted, atol=2e-14)
 
 
 def test_the_series_is_that_of_a_rotation():

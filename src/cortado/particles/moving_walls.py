@@ -69,6 +69,24 @@ def matrix_of(precision: Precision) -> Any:
 
 
 @cache
+def turn_functions(precision: Precision) -> tuple[Any, Any]:
+    """Make two Warp functions of a rotation R: the adjoint of a further turn of it, given that of its entries; and an
+    adjoint of the entries that stands for one of a further turn."""
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+
+    @wp.func
+    def turning(R: matrix, bar: matrix) -> vector:
+        T = bar * wp.transpose(R)
+        return vector(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
+
+    @wp.func
+    def leaning(R: matrix, turn_bar: vector) -> matrix:
+        return (real(0.5) * wp.skew(turn_bar)) * R
+
+    return turning, leaning
+
+
+@cache
 def sizes_type(precision: Precision) -> Any:
     """Make the Warp struct of the scales of solids and their tangents."""
     real = precision.real
@@ -76,8 +94,7 @@ def sizes_type(precision: Precision) -> Any:
     class Sizes:
         scales: wp.array2d(dtype=real)
         """(members, solids) sigma [-]."""
-        growths: wp.array2d(dtype=real)
-        """Their tangents, over themselves."""
+        scales_dot: wp.array2d(dtype=real)
         power: real
         """The power of sigma by which weights grow: d - 1."""
 
@@ -191,7 +208,8 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         b = j - member * count
         k = of.own_solids[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
-        growth, surface = sizes.growths[member, k], surface_of(b, sizes.scales[member, k], of)
+        scale = sizes.scales[member, k]
+        growth, surface = sizes.scales_dot[member, k] / scale, surface_of(b, scale, of)
         arm, arm_before = turns[member, k] * surface, turns_before[member, k] * surface
         surface_dot = after_dot[member, k] + wp.cross(turned, arm) + growth * arm
         x_dot = surface_dot - wp.cross(turned, turns[member, k] * of.own_feet[b])
@@ -218,7 +236,9 @@ class MovingWalls:
         sizes = (layout.members, solids, precision, device)
         self.sizes, each = sizes_type(precision)(), {"dtype": precision.real, "device": device}
         """How large they are, which others may write."""
-        self.sizes.scales, self.sizes.growths = (make((layout.members, solids), **each) for make in (wp.ones, wp.zeros))
+        self.sizes.scales, self.sizes.scales_dot = (
+            make((layout.members, solids), **each) for make in (wp.ones, wp.zeros)
+        )
         self.sizes.power = precision.real(dimension - 1)
         self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
         """How many solids, and their poses before and after a step, which somebody else writes."""
@@ -234,9 +254,11 @@ class MovingWalls:
             "after_dot": self.after_dot.positions,
             "turned_dot": self.after_dot.turns,
             "scales": self.sizes.scales,
-            "growths": self.sizes.growths,
+            "scales_dot": self.sizes.scales_dot,
         }
         """Poses and sizes as kernels call them, and their tangents."""
+        self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
+        """Of each solid, views (members,) of these."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
         """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
         slides = np.zeros((solids, 3))

@@ -19,7 +19,8 @@ r = f(x_i, ..., time_step, ...) they are
     adjoint:  x_bar[i] += (df/dx)^T r_bar[i],   time_step_bar[i] += df/dtime_step . r_bar[i]
 
 so that particles keep their shares of the adjoints of a scene's parameters, which are summed later. Both are exact; the
-tangent is put together of the gradients of the components of r.
+tangent is put together of the gradients of the components of r. A rotation R changes by the vector w by which it turns
+further, R_dot u = w x (R u): w stands for its tangent, and the adjoint of w for its adjoint.
 
 Two traps of Warp: after ``a, b = array[j], c`` the name ``a`` is no copy, and writing to its component writes to the
 array, where after ``a = array[j]`` it is one. And ``wp.grad`` stands in the function that a kernel calls: in one that
@@ -27,7 +28,7 @@ this function calls it does not compile.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from re import sub
 from typing import Any
@@ -39,6 +40,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.particles.made_derivatives import bars_of, dot_of, work_of
+from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import Term, array_of
 
@@ -59,8 +61,7 @@ _total_{n} = _kind_{n}()
         _unit = _kind_{n}()
         _unit[{entry}] = _one
         {gradient}
-        _total_{n} += ({change}) * _unit
-    {place}_total_{n}"""
+        _total_{n} += ({change}) * _unit"""
 """The text of the tangent of a vector or a matrix. The number of components is a variable, as Warp would write each
 gradient out."""
 
@@ -254,8 +255,7 @@ def pointwise_kernels(
     make: Callable[[Any], Callable[..., Any]],
     results: Sequence[str],
     replaced: Mapping[str, str] | None = None,
-    numbers: Collection[str] = (),
-    written: Collection[str] = (),
+    **names: Any,
 ) -> Kernels:
     """Make forward, tangent and adjoint kernels, each in its own of the Warp ``modules``, of the function that ``make``
     makes for a module.
@@ -263,24 +263,42 @@ def pointwise_kernels(
     The function has a type at each parameter, and ``results`` are the arrays that it writes; what it returns for
     "acceleration:acceleration_in" is added to the latter. ``replaced`` maps a result to the input in whose place its
     adjoint stands at first, and the adjoint kernel leaves that of the input there. Adjoints of other inputs are added
-    to, but for those that are ``written``. Parameters among ``numbers`` are numbers of a launch, without
-    derivatives."""
-    forward, along, back = (Term.of(make(module)) for module in modules)
-    of = _Pointwise(precision, forward, results, replaced or {}, numbers, written)
-    known = (
-        {"_function": wp.func(forward.function, module=modules[0])},
-        {"_work": work_of(along, precision, modules[1]), **of.units},
-        {"_work": work_of(back, precision, modules[2])},
-    )
+    to. For all other ``names`` see `Kinds`."""
+    functions = [make(module) for module in modules]
+    terms = [Term.of(function) for function in functions]
+    of = _Pointwise(precision, terms[0], results, replaced or {}, Kinds(**names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
-    made = zip(texts, known, modules, strict=True)
-    return Kernels(*(made_kernel(f"{MADE}{name}", *rest, *one) for (name, *rest), *one in made))
+    made = []
+    for k, ((name, types, lines), term, module) in enumerate(zip(texts, terms, modules, strict=True)):
+        scope = {"_function": wp.func(term.function, module=module), **of.scope}
+        if k > 0:
+            scope["_work"] = work_of(term, precision, module)
+        made.append(made_kernel(f"{MADE}{name}", types, lines, scope, module))
+    return Kernels(*made)
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """Names of parameters and results by what they are to pointwise kernels, all of which may be left out."""
+
+    numbers: Collection[str] = ()
+    """Parameters that are numbers of a launch, without derivatives."""
+    written: Collection[str] = ()
+    """Inputs whose adjoints are written, and not added to."""
+    known: Collection[str] = ()
+    """Inputs without derivatives."""
+    where: str = ""
+    """An array of numbers that are 0 where results are so, with their tangents."""
+    told: Collection[str] = ()
+    """Inputs with a column for each step of a scene, the number of which is ``step``; a thread is a scene."""
+    summed: Collection[str] = ()
+    """Results of which the sum over a scene has an adjoint, ``name_sum_bar`` (scenes,)."""
+    turned: Mapping[str, str] = field(default_factory=dict)
+    """Rotations, and what further turns of them are called."""
 
 
 class _Pointwise:
     """The name, the arguments and the lines of each of the three kernels of a pointwise function."""
-
-    _first = "i = wp.tid()"
 
     def __init__(
         self,
@@ -288,81 +306,132 @@ class _Pointwise:
         term: Term,
         results: Sequence[str],
         replaced: Mapping[str, str],
-        numbers: Collection[str],
-        written: Collection[str],
+        kinds: Kinds,
+        taped: bool,
     ):
-        self._term, self._real = term, precision.real
+        self._term, self._precision, self._kinds, self._replaced, self._taped = term, precision, kinds, replaced, taped
         self._before = dict(one.split(":") for one in results if ":" in one)
         names = (one.partition(":")[0] for one in results)
-        self._results, self._replaced = dict(zip(names, term.results, strict=True)), replaced
-        self._overwritten = {*replaced.values(), *written}
-        self._inputs, self._entries, self._given = {}, {}, {}
+        self._results = dict(zip(names, term.results, strict=True))
+        self._overwritten = {*replaced.values(), *kinds.written}
+        self._entries, self._indices, self._numbers, self._inputs = {}, {}, {}, {}
+        self._arrays = {kinds.where: precision.real} if kinds.where else {}
         for name, kind in term.parameters.items():
-            if name in numbers:
-                self._entries[name], self._given[name] = name, kind
+            if name in kinds.numbers:
+                self._entries[name], self._numbers[name] = name, kind
                 continue
-            array = array_of(name) or name
-            self._entries[array] = f"{array}[{'i' if array_of(name) else 'i // particles'}]"
-            self._inputs[array], self._given[array] = kind, wp.array(dtype=kind)
-        self.units = {"_one": wp.constant(precision.real(1.0)), "_no": wp.constant(precision.real(0.0))}
-        """What tangents call types of results, 1 and 0."""
-        self.units |= {f"_kind_{n}": kind for n, kind in enumerate(term.results)}
+            array, self._indices[array] = array_of(name) or name, "i" if array_of(name) else "i // particles"
+            if array in kinds.told:
+                self._indices[array] = f"{self._indices[array]}, step[i]"
+                self._numbers |= {"step": wp.array(dtype=wp.int32), array: wp.array2d(dtype=kind)}
+            else:
+                self._arrays[array] = kind
+            self._entries[array] = f"{array}[{self._indices[array]}]"
+            if array not in kinds.known:
+                self._inputs[array] = kind
+        turning, leaning = turn_functions(precision)
+        self.scope = {"_turning": turning, "_leaning": leaning, "_one": wp.constant(precision.real(1.0))}
+        """What the kernels know: functions of rotations, 1 and 0, and types of results and of their changes."""
+        self.scope["_no"] = wp.constant(precision.real(0.0))
+        self.scope |= {f"_kind_{n}": self._change(name, kind) for n, (name, kind) in enumerate(self._results.items())}
+        self.scope |= {f"_whole_{n}": kind for n, kind in enumerate(term.results)}
 
     def forward(self) -> tuple[str, Types, Iterable[str]]:
-        found = [f"_result_{n}" for n in range(len(self._results))]
-        call = f"{', '.join(found)} = _function({', '.join(self._entries.values())})"
-        writes = (f"{self._place(result)}{value}" for result, value in zip(self._results, found, strict=True))
-        return self._term.name, self._types(self._written("")), [self._first, call, *writes]
+        writes = (f"{self._place(result)}_found_{n}" for n, result in enumerate(self._results))
+        return self._term.name, *self._kernel(self._written(""), {}, [self._found(), *writes])
 
     def tangent(self) -> tuple[str, Types, Iterable[str]]:
-        changes = (
-            self._product(kind).format(f"_by_{name}", f"dot.{self._entries[name]}")
-            for name, kind in self._inputs.items()
-        )
-        change, lines = " + ".join(changes), [self._first]
-        zeros = ["_no" if kind is self._real else f"_kind_{n}()" for n, kind in enumerate(self._term.results)]
+        real, turned, changes = self._precision.real, self._kinds.turned, []
+        for name, kind in self._inputs.items():
+            by = f"_turning({self._entries[name]}, _by_{name})" if name in turned else f"_by_{name}"
+            change = self._change(name, kind)
+            dot = self._changed(name, "dot", self._indices[name])
+            changes.append(f"{by} * {dot}" if change is real else f"wp.{dot_of(change)}({by}, {dot})")
+        lines, where = [self._found()] if turned.keys() & self._results.keys() else [], self._kinds.where
+        zeros = ["_no" if kind is real else f"_whole_{n}()" for n, kind in enumerate(self._term.results)]
+        if where:
+            none = (f"    {self._place(result, '_dot')}{zeros[n]}" for n, result in enumerate(self._results))
+            lines += [f"if {where}[i] == _no:", *none, "    return"]
         for n, (result, kind) in enumerate(self._results.items()):
-            if kind is self._real:
-                lines += [
-                    self._gradient([*zeros[:n], "_one", *zeros[n + 1 :]]),
-                    f"{self._place(result, '_dot')}{change}",
-                ]
+            one = "_one" if kind is real else f"_leaning(_found_{n}, _unit)" if result in turned else "_unit"
+            gradient, change = self._gradient([*zeros[:n], one, *zeros[n + 1 :]]), " + ".join(changes)
+            if kind is real:
+                lines += [gradient, f"_total_{n} = {change}"]
             else:
-                gradient = self._gradient([*zeros[:n], "_unit", *zeros[n + 1 :]])
-                shape = kind._shape_
+                shape = self._change(result, kind)._shape_
                 entry = "_k" if len(shape) == 1 else f"_k // {shape[1]}, _k % {shape[1]}"
-                own = {"n": n, "components": prod(shape), "entry": entry, "place": self._place(result, "_dot")}
+                own = {"n": n, "components": prod(shape), "entry": entry}
                 lines.append(TANGENT.format(gradient=gradient, change=change, **own))
-        more = {"dot": bundle(**self._inputs), **self._written("_dot")}
-        return f"{self._term.name}_tangent", self._types(more), lines
+        lines += [f"{self._place(result, '_dot')}_total_{n}" for n, result in enumerate(self._results)]
+        written = self._written("_dot")
+        return f"{self._term.name}_tangent", *self._kernel(written, self._changes("dot"), lines)
 
     def adjoint(self) -> tuple[str, Types, Iterable[str]]:
-        held = self._replaced
-        bars = [f"bar.{held[result]}[i]" if result in held else f"{result}_bar[i]" for result in self._results]
-        added = {name: "" if name in self._overwritten else f"bar.{name}[i] + " for name in self._inputs}
-        writes = (f"bar.{name}[i] = {before}_by_{name}" for name, before in added.items())
-        left = {f"{name}_bar": wp.array(dtype=kind) for name, kind in self._results.items() if name not in held}
-        types = self._types({**left, "bar": bundle(**self._inputs)})
-        return f"{self._term.name}_adjoint", types, [self._first, self._gradient(bars), *writes]
+        turned, held, summed, bars, left = self._kinds.turned, self._replaced, self._kinds.summed, [], {}
+        for n, (result, kind) in enumerate(self._results.items()):
+            bar = self._changed(held[result], "bar") if result in held else f"{turned.get(result, result)}_bar[i]"
+            if result in summed:
+                bar = f"{result}_sum_bar[i // particles]"
+            if result not in held:
+                left[bar.partition("[")[0]] = self._change(result, kind)
+            bars.append(f"_leaning(_found_{n}, {bar})" if result in turned else bar)
+        lines = [self._found()] if turned.keys() & self._results.keys() else []
+        lines.append(self._gradient(bars))
+        for name in self._inputs:
+            bar, by = self._changed(name, "bar"), f"_by_{name}"
+            by = f"_turning({self._entries[name]}, {by})" if name in turned else by
+            lines.append(f"{bar} = {'' if name in self._overwritten else f'{bar} + '}{by}")
+        return f"{self._term.name}_adjoint", *self._kernel(left, self._changes("bar"), lines)
 
-    def _types(self, more: Types) -> Types:
-        return {"particles": int, **self._given, **more}
+    def _kernel(self, others: Types, more: Types, lines: Iterable[str]) -> tuple[Types, Iterable[str]]:
+        """Types and lines of a kernel with so many other arrays and ``more`` arguments."""
+        own, body = {name: kind for name, kind in self._arrays.items() if name not in others}, ["i = wp.tid()"]
+        if len(own) + len(others) > MOST_ARRAYS and not self._taped:
+            groups = {"at": own, "to": others}
+            arrays: Types = {label: bundle(**kinds) for label, kinds in groups.items() if kinds}
+            body += [f"{each} = {label}.{each}" for label, kinds in groups.items() for each in kinds]
+        else:
+            arrays = {name: wp.array(dtype=kind) for name, kind in (*own.items(), *others.items())}
+        return {"particles": int, **self._numbers, **arrays, **more}, [*body, *lines]
 
-    def _product(self, kind: Any) -> str:
-        if kind is self._real:
-            return "{} * {}"
-        return f"wp.{dot_of(kind)}({{}}, {{}})"
+    def _change(self, name: str, kind: Any) -> Any:
+        """The type of a tangent or adjoint."""
+        return self._precision.vector if name in self._kinds.turned else kind
+
+    def _changed(self, name: str, way: str, index: str = "i") -> str:
+        """The text of an input's tangent or adjoint, ``way`` "dot" or "bar"."""
+        if name in self._kinds.told:
+            return f"{name}_{way}[i, step[i]]"
+        return f"{way}.{self._kinds.turned.get(name, name)}[{index}]"
+
+    def _changes(self, way: str) -> Types:
+        """Types of the tangents or adjoints of inputs."""
+        kinds, told = {}, {}
+        for name, kind in self._inputs.items():
+            if name in self._kinds.told:
+                told[f"{name}_{way}"] = wp.array2d(dtype=kind)
+            else:
+                kinds[self._kinds.turned.get(name, name)] = self._change(name, kind)
+        return {**told, way: bundle(**kinds)}
+
+    def _found(self) -> str:
+        found = ", ".join(f"_found_{n}" for n in range(len(self._results)))
+        return f"{found} = _function({', '.join(self._entries.values())})"
 
     def _place(self, result: str, suffix: str = "") -> str:
         before = self._before.get(result)
-        return f"{result}{suffix}[i] = " + (f"{before}{suffix}[i] + " if before else "")
+        called = f"{self._kinds.turned.get(result, result) if suffix else result}{suffix}"
+        return f"{called}[i] = " + (f"{before}{suffix}[i] + " if before else "")
 
     def _written(self, suffix: str) -> dict[str, Any]:
-        names = (name for result in self._results for name in (self._before.get(result), result) if name)
-        return {f"{name}{suffix}": wp.array(dtype=self._kind(name)) for name in names}
-
-    def _kind(self, name: str) -> Any:
-        return self._results.get(name) or next(self._results[one] for one, at in self._before.items() if at == name)
+        """Types of the arrays that results, or their tangents, are written to, and added to."""
+        written = {}
+        for result, kind in self._results.items():
+            if result in self._before:
+                written[f"{self._before[result]}{suffix}"] = kind
+            called = self._kinds.turned.get(result, result) if suffix else result
+            written[f"{called}{suffix}"] = self._change(result, kind) if suffix else kind
+        return written
 
     def _gradient(self, bars: Sequence[str]) -> str:
         names = ", ".join((*(f"_by_{name}" for name in self._entries), *bars_of(self._term)))

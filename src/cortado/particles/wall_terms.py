@@ -44,7 +44,9 @@ from cortado.particles.state import Layout
 ALL_WALLS = -(2**31)
 """Stands in place of a solid's number for the walls of all solids and of the container."""
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
-"""f, t, f_0, t_0 and g."""
+"""f, t, f_0, t_0 and g / sigma."""
+BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
+"""The adjoints, of poses and of the scale, that these are."""
 WHOLE = ("force", "torque", "growth")
 """Shares of a solid that others than particles give."""
 LOOP = """\
@@ -230,9 +232,15 @@ class SolidShares:
         ``over`` the walls of one solid, to that one alone."""
         if self._walls is None:
             return
-        before, after, power = self._walls.before, self._walls.after, self._walls.sizes.power
-        poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns, "power": power}
-        known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
+        sizes = {"scales": self._walls.sizes.scales, "power": self._walls.sizes.power}
+        known = {
+            **self._walls.named,
+            **sizes,
+            "slides": self._walls.slides,
+            "constants": self._pair(*constants),
+            "k": 0,
+            "rounds": None,
+        }
         for solid in range(self._walls.solids):
             if over in (ALL_WALLS, solid):
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
@@ -242,12 +250,12 @@ class SolidShares:
         return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
-        """Return the sums (members,) of one solid's shares, by `NAMES`, and set the shares to 0."""
+        """Return the sums (members,) of one solid's shares, adjoints of poses and scale, and set the shares to 0."""
         found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
         for name, given in self._whole[solid].items():
             add(given, found[name])
         self._forget(solid)
-        return found
+        return dict(zip(BARS, found.values(), strict=True))
 
     def add_whole(self, solid: int, *given: wp.array) -> None:
         """Add f, t, and g where there is one, (members,), to the adjoints of one solid, apart from particles."""
@@ -296,9 +304,10 @@ def solid_kernel(
         solid: int,
         constants: pair,
         time_step: wp.array(dtype=real),
-        positions: wp.array2d(dtype=vector),
+        after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
         turns_before: wp.array2d(dtype=matrix),
+        scales: wp.array2d(dtype=real),
         slides: wp.array(dtype=vector),
         power: real,
         at: seen,
@@ -316,14 +325,14 @@ def solid_kernel(
         slide = R * slides[solid]
         back = turns_before[member, solid] * wp.transpose(R)
         force, torque, pulled, twisted, twisted_before, rate, grown, spread = shares(
-            i, at, constants, solid, positions[member, solid], back, slide, power, s
+            i, at, constants, solid, after[member, solid], back, slide, power, s
         )
         per = real(1.0) / time_step[member]
         bar.force[i] = bar.force[i] + force + per * pulled
         bar.torque[i] = bar.torque[i] + torque + per * twisted + wp.cross(slide, pulled)
         bar.force_before[i] = bar.force_before[i] - per * pulled
         bar.torque_before[i] = bar.torque_before[i] - per * twisted_before
-        bar.growth[i] = bar.growth[i] + grown + per * spread
+        bar.growth[i] = bar.growth[i] + (grown + per * spread) / scales[member, solid]
         bar.time_step[i] = bar.time_step[i] - per * rate
 
     share.__qualname__ = share.__name__ = f"{term.name}_share"

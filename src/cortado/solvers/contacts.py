@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.reduction import sum_of
-from cortado.particles.state import Layout, padded
-from cortado.particles.wall_terms import WHOLE
+from cortado.particles.moving_walls import matrix_of
+from cortado.particles.state import Layout, Parameters, padded, zeros
 from cortado.scene.motions import density_name
-from cortado.solvers.contact_kernels import contact_kernels, strength_kernels
+from cortado.solvers.contact_kernels import SHARES, contact_kernels
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 Arrays = dict[str, wp.array]
-SHARES = ("push", "twist", "other")
 
 
 @dataclass(frozen=True)
@@ -43,57 +42,57 @@ class Contact:
     def __init__(self, touching: Touching, spacing: float, layout: Layout):
         self.touching, precision, device = touching, layout.precision, layout.device
         self.meshes = [obstacle_mesh(one, spacing, device) for one in touching.obstacles]
-        self.places: list[dict[str, Any]] = [
-            {
-                "mesh": mesh.id,
-                "middle": precision.vector(*padded(middle_of(one)[None])[0]),
-                "side": -1.0 if one.is_hollow else 1.0,
-            }
-            for one, mesh in zip(touching.obstacles, self.meshes, strict=True)
-        ]
-        points = padded(touching.points)
-        self.count, self._layout = len(points), layout
-        self.own = wp.array(points, dtype=precision.vector, device=device)
+        self.places: list[dict[str, Any]] = []
+        for one, mesh in zip(touching.obstacles, self.meshes, strict=True):
+            middle, none = precision.vector(*padded(middle_of(one)[None])[0]), precision.vector()
+            origin, inner = (middle, none) if touching.against < 0 else (none, middle)
+            side = -1.0 if one.is_hollow else 1.0
+            self.places.append({"mesh": mesh.id, "origin": origin, "inner": inner, "side": side})
+        points, real, vector = padded(touching.points), precision.real, precision.vector
+        self.count, self.layout = len(points), layout
+        self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
+        self.found = self.arrays({"face": vector, "plane": real, "shift": vector, "depth": real})
+        """The faces that points are behind, as the kernel ``look`` writes them."""
 
-    def arrays(self, names: Sequence[str], dtype: Any) -> Arrays:
-        """Make arrays (members points,) of zeros, by name, all of one type."""
-        return self.arrays_of(dict.fromkeys(names, dtype))
-
-    def arrays_of(self, kinds: Mapping[str, Any]) -> Arrays:
+    def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
         """Make arrays (members points,) of zeros, by name, each of its own type."""
-        return {name: wp.zeros(self.all, dtype=kind, device=self._layout.device) for name, kind in kinds.items()}
+        return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
 
-    def total(self, dtype: Any) -> Any:
-        """Make a function that adds up the values of a body's points, scene by scene."""
-        return sum_of(dtype, self.count, self._layout.device, self._layout.members)
+    def poses(self, each: Sequence[Named]) -> Named:
+        """Return the pose and scale of the other solid, and tangents, by the names that kernels have for them; ``each``
+        are those of all solids that move."""
+        if self.touching.against >= 0:
+            return {f"other_{name}": array for name, array in each[self.touching.against].items()}
+        layout, vector = self.layout, self.layout.precision.vector
+        kinds = {"after": vector, "turns": matrix_of(layout.precision), "scales": layout.precision.real}
+        kinds |= {"after_dot": vector, "turned_dot": vector, "scales_dot": layout.precision.real}
+        still = zeros({f"other_{name}": (layout.members, kind) for name, kind in kinds.items()}, layout.device)
+        still["other_scales"].fill_(1.0)
+        still["other_turns"].fill_(kinds["turns"](*np.eye(3).ravel()))
+        return still
 
 
-class Seen:
-    """The depths of a body's points within another body, with normals and shares of the force; or their tangents."""
+class Totals:
+    """Arrays of values of a body's points, such as ``push_dot``, and their sums of each scene, ``push_sum_dot``."""
 
-    def __init__(self, contact: Contact, layout: Layout, suffix: str = ""):
-        real, vector = layout.precision.real, layout.precision.vector
-        self._suffix = suffix
-        self.numbers = contact.arrays([f"depth{suffix}", f"square{suffix}"], real)
-        self.normals = contact.arrays([f"normal{suffix}"], vector)
-        self.shares = contact.arrays([f"{name}{suffix}" for name in SHARES], vector)
-        self._whole, self._sums = contact.total(real), [contact.total(vector) for _ in SHARES]
-
-    def clear(self) -> None:
-        """Forget what points of the body found in the last step."""
-        for array in (*self.numbers.values(), *self.normals.values()):
-            array.zero_()
-
-    def whole(self) -> Arrays:
-        """Sum up S = sum d^4 over the points of a contact, (members,), by the name that kernels have for it."""
-        return {f"whole{self._suffix}": self._whole(self.numbers[f"square{self._suffix}"])}
+    def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
+        layout = contact.layout
+        self.each = contact.arrays({f"{name}{suffix}": kind for name, kind in kinds.items()})
+        self._totals = {
+            f"{name}{end}{suffix}": sum_of(kind, contact.count, layout.device, layout.members)
+            for name, kind in kinds.items()
+        }
 
     def sums(self) -> Arrays:
-        """Return the sums over the points of a body of each share of the contact force, (members,) vectors each."""
-        shares = zip(self.shares.items(), self._sums, strict=True)
-        names = [f"{name}_sum{self._suffix}" for name in SHARES]
-        return dict(zip(names, (total(share) for (_, share), total in shares), strict=True))
+        """Add up the values of each scene, to arrays (members,) by name."""
+        pairs = zip(self._totals.items(), self.each.values(), strict=True)
+        return {name: total(array) for (name, total), array in pairs}
+
+
+def share_kinds(layout: Layout) -> dict[str, Any]:
+    """Return the types of `SHARES` by name."""
+    return {name: layout.precision.real if name == "square" else layout.precision.vector for name in SHARES}
 
 
 class Contacts:
@@ -110,11 +109,10 @@ class Contacts:
     ):
         """Prepare contacts of a solver's bodies; ``periods`` (d,) [m] are 0 along axes without one."""
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
-        self.strength = strength_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
-        self.seen = [Seen(contact, layout) for contact in self.contacts]
+        self._poses = [contact.poses(part.made_of.walls.each) for contact in self.contacts]
         self._period = layout.precision.vector(*padded(periods[None])[0])
-        self._whole: list[Arrays] = [{} for _ in self.contacts]
+        self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
@@ -125,38 +123,46 @@ class Contacts:
 
     def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
         """Return the arrays and constants of a contact by the names that kernels have for them."""
-        contact, seen, (own, other) = self.contacts[number], self.seen[number], self.bodies(number)
-        volumes = self.layout.precision.pair(own.table.mass.volume, other.table.mass.volume)
+        contact, (own, other) = self.contacts[number], self.bodies(number)
         constants: dict[str, Any] = {
-            "points": contact.count,
-            "number": own.table.number,
-            "against": contact.touching.against,
+            "particles": contact.count,
             "period": self._period,
             "is_free": contact.touching.other >= 0,
-            "volumes": volumes,
+            "volumes": self.layout.precision.pair(own.table.mass.volume, other.table.mass.volume),
             "own": contact.own,
-            "density": step.parameters[density_name(own.table.name)],
-            "other_density": step.parameters[density_name(other.table.name)],
         }
-        found = seen.numbers, seen.normals, seen.shares, self._whole[number], self._sums[number]
-        return constants, *found, self.part.poses
+        densities = self.densities(step.parameters, number)
+        return constants, densities, contact.found, self._sums[number], self._poses[number], own.constants
+
+    def densities(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
+        """Return the densities of both solids, or their tangents or adjoints, by the kernels' names."""
+        names = (f"density{suffix}", f"other_density{suffix}")
+        return {
+            name: parameters[density_name(body.table.name)]
+            for name, body in zip(names, self.bodies(number), strict=True)
+        }
+
+    def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
+        """Return the momenta that both solids get, or their changes; ``pushed_bar`` of the other is
+        ``pushed_other_bar``."""
+        touching = self.contacts[number].touching
+        other = each[touching.body if touching.other < 0 else touching.other].given
+        named = {name.replace("ed", "ed_other", 1): array for name, array in other.items()}
+        return {**each[touching.body].given, **named}
 
     def look(self, step: StepContext) -> None:
         """Find the contacts of a step, and write the momenta that bodies get from them."""
         for body in self.part.bodies:
             for array in body.given.values():
                 array.zero_()
-        for number, (contact, seen) in enumerate(zip(self.contacts, self.seen, strict=True)):
-            seen.clear()
-            known = self.known(step, number)
+        for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
+            for array in contact.found.values():
+                array.zero_()
             for place in contact.places:
-                step.launch(self.kernels.look.forward, place, *known, threads=contact.all)
-            self._whole[number] = seen.whole()
-            step.launch(self.kernels.push.forward, *self.known(step, number), threads=contact.all)
-            self._sums[number] = seen.sums()
-            own, other = self.bodies(number)
-            given = {**own.given, **{f"{name}_other": array for name, array in other.given.items()}}
-            step.launch(self.strength.forward, given, *self.known(step, number), threads=self.layout.members)
+                step.launch(self.kernels.look, place, *self.known(step, number), threads=contact.all)
+            step.launch(self.kernels.push.forward, shares.each, *self.known(step, number), threads=contact.all)
+            self._sums[number], given = shares.sums(), self.given(number, self.part.bodies)
+            step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
         """Return forward mode of `look`: from ``changes`` of the bodies' poses to those of what contacts push with."""
@@ -173,67 +179,43 @@ class ContactsTangent:
 
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
-        self._seen = [Seen(contact, contacts.layout, "_dot") for contact in contacts.contacts]
+        self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """Write the tangents of the depths and normals that `Contacts.look` finds."""
-        contacts, kernels = self._contacts, self._contacts.kernels
+        """The tangent of `Contacts.look`."""
+        contacts = self._contacts
         for own in self._changes:
             for array in own.given.values():
                 array.zero_()
-        for number, (contact, seen) in enumerate(zip(contacts.contacts, self._seen, strict=True)):
-            known = (seen.numbers, seen.normals, seen.shares, *contacts.known(step, number))
-            step.launch(kernels.look.tangent, *known, threads=contact.all)
-            step.launch(kernels.push.tangent, seen.whole(), *known, threads=contact.all)
-            bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
-            rates = {"time_step_dot": dot.parameters["time_step"]}
-            for name, body in zip(("density_dot", "other_density_dot"), bodies, strict=True):
-                rates[name] = dot.parameters[density_name(body.table.name)]
-            given = {**own.given, **_of_other(other.given)}
-            members = contacts.layout.members
-            step.launch(contacts.strength.tangent, given, rates, seen.sums(), *known, threads=members)
+        for number, shares in enumerate(self._shares):
+            known = contacts.known(step, number)
+            step.launch(contacts.kernels.push.tangent, shares.each, *known, threads=contacts.contacts[number].all)
+            rates = contacts.densities(dot.parameters, number, "_dot"), {"time_step_dot": dot.parameters["time_step"]}
+            moved = contacts.given(number, self._changes), shares.sums()
+            step.launch(contacts.kernels.give.tangent, *moved, *rates, *known, threads=contacts.layout.members)
 
 
 class ContactsAdjoint:
     """The adjoint of the contacts between bodies, for reverse mode."""
 
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
-        self._contacts, self._changes = contacts, changes
-        layout = contacts.layout
-        real, vector = layout.precision.real, layout.precision.vector
-        kinds = dict.fromkeys(("own_force", "own_torque", "other_force", "other_torque"), vector)
-        kinds["other_growth"] = real
-        self._work = [contact.arrays(["work", "weighed"], real) for contact in contacts.contacts]
-        self._moved = [contact.arrays_of(kinds) for contact in contacts.contacts]
-        self._weighed = [contact.total(real) for contact in contacts.contacts]
-        self._sums = [{name: contact.total(kind) for name, kind in kinds.items()} for contact in contacts.contacts]
-        self._shares = {f"{name}_bar": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SHARES}
+        self._contacts, self._changes, layout = contacts, changes, contacts.layout
+        vectors = dict.fromkeys(("after", "turned", "other_after", "other_turned"), layout.precision.vector)
+        kinds = {**vectors, "other_scales": layout.precision.real}
+        self._moved = [Totals(contact, kinds, "_bar", end="") for contact in contacts.contacts]
+        sums = {f"{name}_sum_bar": (layout.members, kind) for name, kind in share_kinds(layout).items()}
+        self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
         """Apply the adjoint of `Contacts.look`: from adjoints of the bodies' momenta to adjoints of their poses."""
-        contacts, kernels = self._contacts, self._contacts.kernels
-        for number, contact in enumerate(contacts.contacts):
-            bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
-            rates = {"time_step_bar": bar.parameters["time_step"]}
-            for name, body in zip(("density_bar", "other_density_bar"), bodies, strict=True):
-                rates[name] = bar.parameters[density_name(body.table.name)]
-            given = {**own.given, **_of_other(other.given)}
-            work, moved, known = self._work[number], self._moved[number], contacts.known(step, number)
-            step.launch(contacts.strength.adjoint, given, rates, self._shares, *known, threads=contacts.layout.members)
-            step.launch(kernels.push.adjoint, self._shares, work, *known, threads=contact.all)
-            weighed = {"weighed_sum": self._weighed[number](work["weighed"])}
-            step.launch(kernels.look.adjoint, self._shares, work, moved, weighed, *known, threads=contact.all)
-            sums = {name: total(moved[name]) for name, total in self._sums[number].items()}
-            bar.solids.add_whole(bodies[0].table.number, sums["own_force"], sums["own_torque"])
+        contacts = self._contacts
+        for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
+            rates = contacts.densities(bar.parameters, number, "_bar"), {"time_step_bar": bar.parameters["time_step"]}
+            known = (self._sums, *contacts.known(step, number))
+            given = contacts.given(number, self._changes)
+            step.launch(contacts.kernels.give.adjoint, given, *rates, *known, threads=contacts.layout.members)
+            step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
+            force, torque, *others = moved.sums().values()
+            bar.solids.add_whole(contacts.bodies(number)[0].table.number, force, torque)
             if contact.touching.against >= 0:
-                bar.solids.add_whole(contact.touching.against, *(sums[f"other_{name}"] for name in WHOLE))
-
-
-def _both(contact: Contact, changes: Sequence[Changes]) -> tuple[Changes, Changes]:
-    own = changes[contact.touching.body]
-    return own, own if contact.touching.other < 0 else changes[contact.touching.other]
-
-
-def _of_other(given: Arrays) -> Arrays:
-    """Rename a body's adjoints for kernels that take it as the other one: ``pushed_bar``, ``pushed_other_bar``."""
-    return {f"{name.split('_')[0]}_other_{name.split('_')[1]}": array for name, array in given.items()}
+                bar.solids.add_whole(contact.touching.against, *others)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.launching import Named
+from cortado.device.reduction import add
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls, matrix_of
@@ -83,7 +84,7 @@ class Touch(Protocol):
 class FreeBody:
     """One free body in a step, with its arrays on the device."""
 
-    def __init__(self, table: FreeTable, dimension: int, layout: Layout):
+    def __init__(self, table: FreeTable, poses: Named, dimension: int, layout: Layout):
         self.table, vector = table, layout.precision.vector
         angle = Entry.NUMBER if dimension == 2 else Entry.VECTOR
         angles = {"rotation": angle, "angular_velocity": angle}
@@ -100,7 +101,8 @@ class FreeBody:
         """What a step began from."""
         matrix = matrix_of(layout.precision)
         inertia, inverse = table.mass.inertia, np.linalg.pinv(table.mass.inertia)
-        self.constants: dict[str, Any] = {"number": table.number, "inertia": matrix(*inertia.ravel())}
+        self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
+        """Its poses too, which a step writes."""
         self.constants |= {"inverse": matrix(*inverse.ravel()), "greatest": float(np.linalg.eigvalsh(inverse).max())}
         self.constants |= {"volume": table.mass.volume, "solid": table.number}
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
@@ -125,19 +127,17 @@ class FreeSolidsPart(Part):
 
     def __init__(self, made_of: FreeSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
-        self.bodies = [FreeBody(table, made_of.dimension, layout) for table in made_of.tables]
+        poses = made_of.walls.each
+        self.bodies = [FreeBody(table, poses[table.number], made_of.dimension, layout) for table in made_of.tables]
         self.fields = tuple(field for body in self.bodies for field in body.fields)
         self.kernels = free_kernels(layout.precision, made_of.dimension)
-        self.poses = made_of.walls.named
         self.touch = made_of.contacts(self)
 
     def begin(self, step: StepContext, state: State) -> None:
         for body in self.bodies:
             for field in body.fields:
                 wp.copy(body.begun[field.name], state[field.name])
-            step.launch(
-                self.kernels.predict.forward, body.before, self.poses, *body.known(step), threads=self.layout.members
-            )
+            step.launch(self.kernels.predict.forward, body.before, *body.known(step), threads=self.layout.members)
 
     def sort(self, step: StepContext, state: State) -> None:
         self.touch.look(step)
@@ -145,8 +145,7 @@ class FreeSolidsPart(Part):
     def end(self, step: StepContext, state: State, moved: State) -> None:
         for body in self.bodies:
             new = body.state(state, "_new")
-            known = (*body.known(step), body.moved, self.poses)
-            step.launch(self.kernels.end.forward, new, *known, threads=self.layout.members)
+            step.launch(self.kernels.end.forward, new, body.moved, *body.known(step), threads=self.layout.members)
 
     def new_tangent(self) -> "FreeSolidsTangent":
         return FreeSolidsTangent(self)
@@ -195,9 +194,9 @@ class FreeSolidsTangent(PartTangent):
             body = own.body
             sizes = {"time_step_dot": dot.parameters["time_step"]}
             sizes["density_dot"] = dot.parameters[density_name(body.table.name)]
-            dots = {**body.state(state_dot, "_dot"), **(own.before if begins else own.moved)}
-            known = (*body.known(step), body.before if begins else body.moved, part.poses)
-            step.launch(kernel, dots, sizes, *known, threads=part.layout.members)
+            dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
+            moves = (own.before,) if begins else (own.moved, body.moved)
+            step.launch(kernel, dots, *moves, *body.known(step), threads=part.layout.members)
 
 
 class FreeSolidsAdjoint(PartAdjoint):
@@ -211,8 +210,8 @@ class FreeSolidsAdjoint(PartAdjoint):
     def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
         part = self._part
         for own in self.bodies:
-            body, bars = own.body, {**self._bars(own, bar, state_bar), **own.moved, "turned_end": own.turned_end}
-            known = (*body.known(step), body.moved, part.poses)
+            bars, body = {**self._bars(own, bar, state_bar), "turned_before_bar": own.turned_end}, own.body
+            known = (own.moved, body.moved, *body.known(step))
             step.launch(part.kernels.end.adjoint, bars, *known, threads=part.layout.members)
         return moved_bar
 
@@ -222,12 +221,12 @@ class FreeSolidsAdjoint(PartAdjoint):
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
         for own in self.bodies:
-            body = own.body
-            bars = {**self._bars(own, bar.parameters, state_bar), **own.before, "turned_end": own.turned_end}
-            known = (*body.known(step), bar.solids.collect(body.table.number))
-            step.launch(part.kernels.predict.adjoint, bars, *known, threads=part.layout.members)
+            body, bars = own.body, {**self._bars(own, bar.parameters, state_bar), **own.before}
+            given = bar.solids.collect(body.table.number)
+            add(own.turned_end, given["turned_before_bar"])
+            step.launch(part.kernels.predict.adjoint, bars, given, *body.known(step), threads=part.layout.members)
             own.clear()
 
     def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
         sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[density_name(own.body.table.name)]}
-        return {**own.body.state(state_bar, "_bar"), **sizes}
+        return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}

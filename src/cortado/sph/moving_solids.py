@@ -13,13 +13,13 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.launching import bundle
+from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, Parameters, State, StateField
-from cortado.particles.wall_terms import share_kinds
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters import Axis
 from cortado.sph.integration import integration_module
@@ -30,128 +30,38 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 """Names of a solid's state fields, by the names that kernels have for them."""
 
 
-@dataclass(frozen=True)
-class PoseKernels:
-    """Kernels of the poses of one moving solid, with a thread for each scene."""
-
-    begin: Any
-    """The solid's poses before and after a step."""
-    tangent: Any
-    """The tangents of these poses."""
-    end: Any
-    """The solid's state at the end of a step, or its tangent from the tangent before."""
-    adjoint: Any
-    """From the adjoints of the poses and of the state at the end to those of the parameters and of the state before."""
-
-
 @cache
-def _kernels(precision: Precision, dimension: int) -> PoseKernels:
-    """Make the kernels of moving solids' poses, in 2 or 3 dimensions."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    of = rotations(precision, dimension)
-    angle, rotation, further, back = of.angle, of.rotation, of.further, of.back
-    module = integration_module(precision, False)
-    state = bundle(position=vector, turn=angle, rotation=angle, scale=real)
-    shares = bundle(**share_kinds(precision))
+def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
+    """Make the kernels of one moving solid in 2 or 3 dimensions, with a thread for each scene: of its poses before and
+    after a step, and of its state at the end, whose adjoint stands where that of the state before is written."""
+    real, vector, matrix, of = precision.real, precision.vector, matrix_of(precision), rotations(precision, dimension)
+    angle, rotation = of.angle, of.rotation
 
-    @wp.kernel(module=module, enable_backward=False)
-    def begin(
-        number: int,
-        step: wp.array(dtype=wp.int32),
-        of: state,
-        place: wp.array(dtype=vector),
-        displacements: wp.array2d(dtype=vector),
-        turns_told: wp.array2d(dtype=angle),
-        # out
-        before: wp.array2d(dtype=vector),
-        turns_before: wp.array2d(dtype=matrix),
-        after: wp.array2d(dtype=vector),
-        turns: wp.array2d(dtype=matrix),
-        scales: wp.array2d(dtype=real),
-    ):
-        b = wp.tid()
-        k = step[b]
-        begun = rotation(of.rotation[b])
-        scales[b, number] = of.scale[b]
-        before[b, number] = of.position[b]
-        after[b, number] = place[b] + displacements[b, k]
-        turns_before[b, number] = rotation(of.turn[b]) * begun
-        turns[b, number] = rotation(turns_told[b, k]) * begun
+    def pose(
+        position_i: vector,
+        turn_i: angle,
+        rotation_i: angle,
+        scale_i: real,
+        place_i: vector,
+        displacements_i: vector,
+        turns_told_i: angle,
+    ) -> tuple[vector, matrix, vector, matrix, real]:
+        begun = rotation(rotation_i)
+        return position_i, rotation(turn_i) * begun, place_i + displacements_i, rotation(turns_told_i) * begun, scale_i
 
-    @wp.kernel(module=module, enable_backward=False)
-    def tangent(
-        number: int,
-        step: wp.array(dtype=wp.int32),
-        of: state,
-        dot: state,
-        turns_told: wp.array2d(dtype=angle),
-        place_dot: wp.array(dtype=vector),
-        displacements_dot: wp.array2d(dtype=vector),
-        turns_told_dot: wp.array2d(dtype=angle),
-        # out
-        before_dot: wp.array2d(dtype=vector),
-        turned_before_dot: wp.array2d(dtype=vector),
-        after_dot: wp.array2d(dtype=vector),
-        turned_dot: wp.array2d(dtype=vector),
-        growths: wp.array2d(dtype=real),
-    ):
-        b = wp.tid()
-        k = step[b]
-        growths[b, number] = dot.scale[b] / of.scale[b]
-        begun_dot = further(of.rotation[b], dot.rotation[b])
-        before, after = of.turn[b], turns_told[b, k]
-        before_dot[b, number] = dot.position[b]
-        after_dot[b, number] = place_dot[b] + displacements_dot[b, k]
-        turned_before_dot[b, number] = further(before, dot.turn[b]) + rotation(before) * begun_dot
-        turned_dot[b, number] = further(after, turns_told_dot[b, k]) + rotation(after) * begun_dot
-
-    @wp.kernel(module=module, enable_backward=False)
     def end(
-        step: wp.array(dtype=wp.int32),
-        begun: wp.array(dtype=angle),
-        scale_begun: wp.array(dtype=real),
-        place: wp.array(dtype=vector),
-        displacements: wp.array2d(dtype=vector),
-        turns_told: wp.array2d(dtype=angle),
-        # out
-        position: wp.array(dtype=vector),
-        turn: wp.array(dtype=angle),
-        rotation: wp.array(dtype=angle),
-        scale: wp.array(dtype=real),
-    ):
-        b = wp.tid()
-        position[b] = place[b] + displacements[b, step[b]]
-        turn[b] = turns_told[b, step[b]]
-        rotation[b] = begun[b]
-        scale[b] = scale_begun[b]
+        rotation_i: angle, scale_i: real, place_i: vector, displacements_i: vector, turns_told_i: angle
+    ) -> tuple[vector, angle, angle, real]:
+        return place_i + displacements_i, turns_told_i, rotation_i, scale_i
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adjoint(
-        step: wp.array(dtype=wp.int32),
-        of: state,
-        turns_told: wp.array2d(dtype=angle),
-        share: shares,
-        # in and out: at first of the state at the end, at last of that before
-        bar: state,
-        place_bar: wp.array(dtype=vector),
-        displacements_bar: wp.array2d(dtype=vector),
-        turns_told_bar: wp.array2d(dtype=angle),
-    ):
-        b = wp.tid()
-        k = step[b]
-        before, after = of.turn[b], turns_told[b, k]
-        moved_bar = bar.position[b] + share.force[b]
-        place_bar[b] = place_bar[b] + moved_bar
-        displacements_bar[b, k] = displacements_bar[b, k] + moved_bar
-        turns_told_bar[b, k] = turns_told_bar[b, k] + bar.turn[b] + back(after, share.torque[b])
-        begun_bar = wp.transpose(rotation(after)) * share.torque[b]
-        begun_bar += wp.transpose(rotation(before)) * share.torque_before[b]
-        bar.position[b] = share.force_before[b]
-        bar.turn[b] = back(before, share.torque_before[b])
-        bar.rotation[b] = bar.rotation[b] + back(of.rotation[b], begun_bar)
-        bar.scale[b] = bar.scale[b] + share.growth[b] / of.scale[b]
-
-    return PoseKernels(begin, tangent, end, adjoint)
+    modules, told = [integration_module(precision, False)] * 3, ["displacements", "turns_told"]
+    turned = {"turns": "turned", "turns_before": "turned_before"}
+    poses, written = ["before", "turns_before", "after", "turns", "scales"], ["position", "turn"]
+    ends, kept = [f"{name}_new" for name in FIELDS], {f"{name}_new": name for name in ("rotation", "scale")}
+    return (
+        pointwise_kernels(precision, modules, lambda _: pose, poses, written=written, told=told, turned=turned),
+        pointwise_kernels(precision, modules, lambda _: end, ends, kept, told=told),
+    )
 
 
 @dataclass(frozen=True)
@@ -193,7 +103,7 @@ class MovingSolidsPart(Part):
             )
         )
         """Where they are, how far they are turned from how they began, how that was, and how large they are."""
-        self.kernels = _kernels(layout.precision, made_of.dimension)
+        self.poses, self.ends = pose_kernels(layout.precision, made_of.dimension)
         self.begun = layout.state(self.fields)
         """What a step began from."""
 
@@ -203,18 +113,13 @@ class MovingSolidsPart(Part):
             wp.copy(self.begun[field.name], state[field.name])
         for name, number in self.made_of.numbers.items():
             known = self.state(self.begun, name), self.told(step.parameters, name)
-            step.launch(self.kernels.begin, *known, walls.named, number=number, threads=self.layout.members)
+            step.launch(self.poses.forward, *known, walls.each[number], threads=self.layout.members)
         walls.write(step.parameters["time_step"], search.walls)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        self.write_end(step, step.parameters, self.begun, state)
-
-    def write_end(self, step: StepContext, parameters: Parameters, begun: State, state: State) -> None:
-        """Write the fields of moving solids at the end of a step, or their tangents."""
         for name in self.made_of.numbers:
-            kept = {"begun": begun[rotation_name(name)], "scale_begun": begun[scale_name(name)]}
-            new = {**self.state(state, name), **self.told(parameters, name), **kept}
-            step.launch(self.kernels.end, new, threads=self.layout.members)
+            known = self.state(self.begun, name), self.told(step.parameters, name), self.state(state, name, "_new")
+            step.launch(self.ends.forward, *known, threads=self.layout.members)
 
     def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
         """Return a solid's fields of a state by the names that kernels have for them."""
@@ -237,21 +142,22 @@ class MovingSolidsTangent(PartTangent):
 
     def __init__(self, part: MovingSolidsPart):
         self._part = part
-        self._begun = part.layout.state(part.fields)
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        part, walls = self._part, self._part.made_of.walls
-        for field in part.fields:
-            wp.copy(self._begun[field.name], state_dot[field.name])
-        for name, number in part.made_of.numbers.items():
-            dots = {**part.state(self._begun, name, "_dot"), **part.told(dot.parameters, name, "_dot")}
-            known = part.state(part.begun, name), part.told(step.parameters, name)
-            step.launch(part.kernels.tangent, dots, *known, walls.named, number=number, threads=part.layout.members)
+        walls = self._part.made_of.walls
+        self._launch(self._part.poses.tangent, step, dot, state_dot)
         sizes = step.parameters["time_step"], dot.parameters["time_step"]
-        walls.write_tangent(*sizes, part.made_of.search.walls)
+        walls.write_tangent(*sizes, self._part.made_of.search.walls)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._part.write_end(step, dot.parameters, self._begun, state_dot)
+        self._launch(self._part.ends.tangent, step, dot, state_dot)
+
+    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        part = self._part
+        for name, number in part.made_of.numbers.items():
+            dots = part.told(dot.parameters, name, "_dot"), part.state(state_dot, name, "_new_dot")
+            known = part.state(part.begun, name), part.told(step.parameters, name), part.made_of.walls.each[number]
+            step.launch(kernel, part.state(state_dot, name, "_dot"), *dots, *known, threads=part.layout.members)
 
 
 class MovingSolidsAdjoint(PartAdjoint):
@@ -263,6 +169,8 @@ class MovingSolidsAdjoint(PartAdjoint):
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
         for name, number in part.made_of.numbers.items():
-            bars = {**part.state(state_bar, name, "_bar"), **part.told(bar.parameters, name, "_bar")}
+            bars = part.told(bar.parameters, name, "_bar"), part.state(state_bar, name, "_new_bar")
             known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)
-            step.launch(part.kernels.adjoint, bars, *known, threads=part.layout.members)
+            for kernels in (part.ends, part.poses):
+                all_bars = part.state(state_bar, name, "_bar"), *bars
+                step.launch(kernels.adjoint, *all_bars, *known, threads=part.layout.members)

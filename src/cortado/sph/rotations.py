@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.particles.moving_walls import matrix_of
+from cortado.particles.moving_walls import matrix_of, turn_functions
 
 SMALL = 1e-3
 """|w|^2 below which the factors of J are series, to which three terms are enough."""
@@ -28,11 +28,7 @@ class Rotations:
     angle: Any
     """The type of an angle."""
     rotation: Any
-    """R(w), a 3 x 3 matrix."""
-    further: Any
-    """J(w) w', a vector."""
-    back: Any
-    """The adjoint of w for that of J(w) w'."""
+    """R(w), a 3 x 3 matrix, of which Warp knows the derivative by J."""
 
 
 @cache
@@ -44,14 +40,6 @@ def rotations(precision: Precision, dimension: int) -> Rotations:
     def about_z(turn: real) -> matrix:
         c, s, no, one = wp.cos(turn), wp.sin(turn), real(0.0), real(1.0)
         return matrix(c, -s, no, s, c, no, no, no, one)
-
-    @wp.func
-    def further_about_z(turn: real, change: real) -> vector:
-        return vector(real(0.0), real(0.0), change)
-
-    @wp.func
-    def back_about_z(turn: real, bar: vector) -> real:
-        return bar[2]
 
     @wp.func
     def rotation(turn: vector) -> matrix:
@@ -76,10 +64,11 @@ def rotations(precision: Precision, dimension: int) -> Rotations:
         across = wp.cross(turn, change)
         return change + a * across + b * wp.cross(turn, across)
 
-    @wp.func
-    def back(turn: vector, bar: vector) -> vector:
-        return further(-turn, bar)
+    turning = turn_functions(precision)[0]
 
-    if dimension == 2:
-        return Rotations(real, about_z, further_about_z, back_about_z)
-    return Rotations(vector, rotation, further, back)
+    @wp.func_grad(rotation)
+    def rotation_adjoint(turn: vector, adj_ret: matrix):
+        """Apply J(w)^T, which is J(-w): Warp's own adjoint would be 0 at 0."""
+        wp.adjoint[turn] += further(-turn, turning(rotation(turn), adj_ret))
+
+    return Rotations(real, about_z) if dimension == 2 else Rotations(vector, rotation)

@@ -50,6 +50,9 @@ class Held:
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
         self.moved = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in "VWL"}
         """V, W and L of an iteration."""
+        names = ("faster", "turned_faster")
+        self.faster = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in names}
+        """V - V_0 and W - W_0."""
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
@@ -87,14 +90,15 @@ class Bodies:
         return other
 
     def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
-        """Return the arrays and constants of a body by the names that kernels have for them."""
-        own = held.known, held.shares, held.whole, held.start.motion, self.part.poses
+        """What kernels know of a body."""
+        own = held.known, held.shares, held.faster, held.whole, held.start.motion
         return *own, *held.body.known(context)
 
     def begin(self, context: StepContext, around: Arrays) -> None:
         """Find which particles bodies push in a step, and add the bodies' part to the pressure matrix' diagonal."""
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held), edge=around["edge"])
+            context.launch(self.kernels.measure.forward, *self.known(context, held))
             held.add_sizes()
             context.launch(self.kernels.weigh.forward, *self.known(context, held), a=around["a"])
 
@@ -112,9 +116,8 @@ class Bodies:
         """Return the drift of walls where bodies have the velocities that pressures y give them."""
         for held in self.held:
             self.move(context, held, y, held.moved)
-            context.launch(
-                self.motion.carry.forward, held.moved, *self.known(context, held), drift_in=drift, drift=self.drift
-            )
+            known = self.known(context, held)
+            context.launch(self.motion.carry.forward, *known, drift_in=drift, drift=self.drift)
             drift = self.drift
         return drift
 
@@ -142,7 +145,7 @@ class BodiesTangent:
     def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
         rates = {"density_dot": dot.parameters[density_name(held.body.table.name)]}
-        dots = own.known, own.shares, own.whole, own.start.motion, rates
+        dots = own.known, own.shares, own.faster, own.whole, own.start.motion, rates
         return *dots, *dot.named, *bodies.known(context, held)
 
     def begin(self, context: StepContext, dot: Tangents, around: Arrays, around_dot: Arrays) -> None:
@@ -150,6 +153,7 @@ class BodiesTangent:
         edges = {"edge": around["edge"], "edge_dot": around_dot["edge_dot"]}
         for k, own in enumerate(self._held):
             context.launch(kernels.hold.tangent, *self._known(context, dot, k), edges)
+            context.launch(kernels.measure.tangent, *self._known(context, dot, k))
             own.add_sizes()
             context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=around_dot["a_dot"])
 
@@ -173,7 +177,7 @@ class BodiesTangent:
             moved = self._bodies.held[k].moved
             self._move(context, dot, k, (y, y_dot), moved, own.moved)
             drifts = {"drift_in_dot": drift_dot, "drift_dot": self.drift}
-            context.launch(self._bodies.motion.carry.tangent, moved, own.moved, drifts, *self._known(context, dot, k))
+            context.launch(self._bodies.motion.carry.tangent, drifts, *self._known(context, dot, k))
             drift_dot = self.drift
         return drift_dot
 
@@ -193,9 +197,9 @@ class BodiesAdjoint:
         self.drift_bar = wp.zeros_like(bodies.drift)
         """The adjoint of the drift of one iteration."""
         self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
-        self._faster = {name: wp.zeros_like(changes[0].turned_end) for name in ("V_bar", "W_bar")}
-        self._none = {"L_bar": wp.zeros_like(changes[0].turned_end)}
-        self._weigh, self._sizes = layout.sum_of(layout.precision.pair), wp.zeros_like(bodies.held[0].known["sizes"])
+        self._none = {f"{name}_bar": wp.zeros_like(changes[0].turned_end) for name in "VWL"}
+        shares = layout.arrays("_bar", whole=layout.precision.pair, density=layout.precision.real)
+        self._weighed, self._sum = shares, {name: layout.sum_of(array.dtype) for name, array in shares.items()}
         vectors = {"dtype": layout.precision.vector, "device": layout.device}
         self._sums_bar = {f"{name}_sum_bar": wp.zeros(layout.members, **vectors) for name in ("pulled", "twisted")}
 
@@ -220,11 +224,11 @@ class BodiesAdjoint:
     def _move(
         self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array
     ) -> None:
-        """Turn the adjoints of V, W and L of a body into that of the pressures y."""
+        """Turn the adjoints of V, W and L of a body, and of V - V_0 and W - W_0, into that of the pressures y."""
         bodies, held = self._bodies, self._bodies.held[k]
         sums = bodies.move(context, held, y, moved)
         known = self._known(context, bar, k)
-        context.launch(bodies.motion.move.adjoint, bars, sums, moved, *known, threads=bodies.layout.members)
+        context.launch(bodies.motion.move.adjoint, bars, sums, *known, threads=bodies.layout.members)
         for total, given in zip(self._sums_bar.values(), self._held[k].start.given.values(), strict=False):
             add(total, given)
         context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
@@ -232,7 +236,10 @@ class BodiesAdjoint:
     def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of `Bodies.settle`, which wrote the bodies' new velocities."""
         for k, held in enumerate(self._bodies.held):
-            self._move(context, bar, k, y, held.body.moved, self._changes[k].moved, y_bar)
+            own = self._held[k]
+            for array in own.faster.values():
+                array.zero_()
+            self._move(context, bar, k, y, held.body.moved, {**self._changes[k].moved, **own.faster}, y_bar)
 
     def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add it to ``drift_bar`` and set it to 0."""
@@ -243,28 +250,26 @@ class BodiesAdjoint:
     def carried(self, context: StepContext, bar: Adjoints, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of the part that `Bodies.drifted` adds to the drift."""
         bodies = self._bodies
-        (adjoint, slower) = bodies.motion.carry.adjoint
         for k, held in enumerate(bodies.held):
             bodies.move(context, held, y, held.moved)
-            known = self._known(context, bar, k)
-            context.launch(adjoint, held.moved, *known, carried_bar=carried_bar)
-            for array, total in zip(self._faster.values(), held.sums().values(), strict=True):
+            faster = self._held[k].faster
+            shares = dict(zip(faster, held.shares.values(), strict=True))
+            context.launch(bodies.motion.carry.adjoint, shares, *self._known(context, bar, k), drift_bar=carried_bar)
+            for array, total in zip(faster.values(), held.sums().values(), strict=True):
                 wp.copy(array, total)
-            bars = {**self._faster, **self._none}
-            context.launch(slower, bars, *known, threads=bodies.layout.members)
-            self._move(context, bar, k, y, held.moved, bars, y_bar)
+            self._move(context, bar, k, y, held.moved, {**faster, **self._none}, y_bar)
 
     def finish(self, context: StepContext, bar: Adjoints, around: Arrays, around_bar: Arrays) -> None:
         """Apply the adjoint of `Bodies.begin`: add to the adjoints of particles, surroundings and poses."""
         bodies, a_bar = self._bodies, around_bar["a_bar"]
         edges = {"edge": around["edge"], "edge_bar": around_bar["edge_bar"]}
-        share, weigh, end = bodies.kernels.weigh.adjoint
         for k, held in enumerate(bodies.held):
             known = self._known(context, bar, k)
-            context.launch(share, *known, a_bar=a_bar, sizes_share=self._sizes)
-            weighed = {"weighed": self._weigh(self._sizes)}
-            context.launch(weigh, weighed, *known, a_bar=a_bar)
-            context.launch(end, weighed, *known, threads=bodies.layout.members)
+            context.launch(bodies.kernels.weigh.adjoint, self._weighed, *known, a_bar=a_bar)
+            sums = {name: self._sum[name](share) for name, share in self._weighed.items()}
+            add(sums["density_bar"], bar.parameters[density_name(held.body.table.name)])
+            context.launch(bodies.kernels.share, sums, *known)
+            context.launch(bodies.kernels.measure.adjoint, *known)
             given = bar.solids.of(held.body.table.number)
             context.launch(bodies.kernels.hold.adjoint, given, *known, edges)
             turned = self._turned[k]["turned_bar"]

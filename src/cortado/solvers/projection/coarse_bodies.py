@@ -59,11 +59,10 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         grid: grid_type,
         order: wp.array(dtype=wp.int32),
         first: int,
-        number: int,
         density: wp.array(dtype=real),
         volume: real,
         root: matrix,
-        turns: wp.array2d(dtype=matrix),
+        turns: wp.array(dtype=matrix),
         x: wp.array(dtype=vector),
         of: bundle(coarse=real, gamma_of=vector, arm=vector),
         # out
@@ -82,7 +81,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
                 force += pushed
                 torque += wp.cross(of.arm[i], pushed)
         force = force / wp.sqrt(density[member] * volume)
-        torque = root * (wp.transpose(turns[member, number]) * torque) / wp.sqrt(density[member])
+        torque = root * (wp.transpose(turns[member]) * torque) / wp.sqrt(density[member])
         B[first, node] = force[0]
         B[first + 1, node] = force[1]
         if FLAT:
