@@ -182,7 +182,7 @@ class ContactsTangent:
         self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
 
     def look(self, step: StepContext, dot: Tangents) -> None:
-        """The tangent of `Contacts.look`."""
+        """Write the tangents of the contacts, and of the momenta that bodies get from them in `Contacts.look`."""
         contacts = self._contacts
         for own in self._changes:
             for array in own.given.values():
