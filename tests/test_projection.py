@@ -11,7 +11,7 @@ from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation,
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.rollout.outcome import divergence_sentence
-from cortado.solvers.projection.coarse import Levels
+from cortado.solvers.projection.coarse_levels import Levels
 from finite_differences import both_modes, central_difference
 from reference_projection import Projection
 from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
@@ -371,7 +371,7 @@ SHAPES = {
 
 
 def system(dimension, shape, rng, empty=0.3):
-    """A of each offset and node, dense A and the nodes that have one: sums over cells of q q^T of their corners."""
+    """What cells have of A for each two corners, dense A and the nodes that have one: q q^T of the corners of cells."""
     n = np.array(shape)
     cells = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), -1).reshape(-1, 3)
     corners = np.array([[c & 1, (c >> 1) & 1, c >> 2] for c in range(2**dimension)])
@@ -379,18 +379,15 @@ def system(dimension, shape, rng, empty=0.3):
     def number(at):
         return np.ravel_multi_index(tuple((at % n)[::-1]), shape[::-1])
 
-    steps = np.array([[o % 3 - 1, o // 3 % 3 - 1, (o // 9 - 1) * (dimension == 3)] for o in range(3**dimension)])
-    stencil, dense = np.zeros((3**dimension, n.prod())), np.zeros((n.prod(), n.prod()))
+    pairs, dense = np.triu_indices(len(corners)), np.zeros((n.prod(), n.prod()))
+    parts = np.zeros((len(pairs[0]), n.prod()))
     for cell in cells[rng.random(len(cells)) > empty]:
         q = rng.normal(size=(4, len(corners)))
         q[0] = 0.1
-        part = q.T @ q
-        for a, one in enumerate(corners):
-            for b, other in enumerate(corners):
-                offset = np.flatnonzero((steps == other - one).all(1))[0]
-                stencil[offset, number(cell + one)] += part[a, b]
-                dense[number(cell + one), number(cell + other)] += part[a, b]
-    return stencil, dense, np.diag(dense) > 0.0
+        part, numbers = q.T @ q, [number(cell + corner) for corner in corners]
+        parts[:, number(cell)] = part[pairs]
+        np.add.at(dense, np.ix_(numbers, numbers), part)
+    return parts, dense, np.diag(dense) > 0.0
 
 
 @pytest.mark.parametrize("case", SHAPES)
@@ -403,8 +400,8 @@ def test_a_solve_is_the_dense_one_for_each_scene(case, precision, tolerance, mos
     rows = [rng.normal(size=(2, np.prod(shape))) * full for _, _, full in made]
     levels.B.assign(np.concatenate(rows, axis=1))
     r = rng.normal(size=(2, np.prod(shape))) * [full for _, _, full in made]
-    levels.A.assign(np.concatenate([stencil for stencil, _, _ in made], axis=1))
-    levels.begin(SimpleNamespace(launch=KernelLauncher(1, levels.A.device, False)))
+    levels.cells.assign(np.concatenate([parts for parts, _, _ in made], axis=1))
+    levels.begin(SimpleNamespace(launch=KernelLauncher(1, levels.r.device, False)))
     levels.r.assign(r.ravel())
     e = wp.zeros_like(levels.r)
     levels.solve(e, tolerance, 1_000)

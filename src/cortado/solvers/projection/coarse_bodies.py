@@ -49,8 +49,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     """Make the kernels of free bodies on the coarse grid, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
-    hat, at, corner_step = hats.hat, hats.at, hats.corner_step
-    number_of, node_of = among.number_of, among.node_of
+    hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step
     module = kernel_module(f"coarse_bodies_{dimension}d_{precision.name}")
     CORNERS, FLAT = wp.constant(2**dimension), wp.constant(dimension == 2)
 
@@ -69,12 +68,10 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         B: wp.array2d(dtype=real),
     ):
         """Write a body's rows of B from row ``first`` on, by node; ``root`` is a square root of I^-1."""
-        node = wp.tid()
-        nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
-        member = node // nodes
-        here, force, torque = node_of(node - member * nodes, grid.shape), vector(), vector()
+        node, force, torque = wp.tid(), vector(), vector()
+        member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
         for corner in range(CORNERS):
-            cell = member * nodes + number_of(here - corner_step(corner), grid.shape)
+            cell = beside(node, -corner_step(corner), grid.shape)
             for p in range(grid.starts[cell], grid.starts[cell + 1]):
                 i = order[p]
                 pushed = (hat(x[i], corner, grid).value * of.coarse[i]) * of.gamma_of[i]

@@ -38,19 +38,36 @@ class NodeFunctions:
     """The node of a number."""
     step_of: Any
     """The step from a node to one of its neighbours, itself among them, by the number of the step."""
-    offset_of: Any
-    """The number of a step to a neighbour."""
+    beside: Any
+    """The node a step away from another, of the same scene; both by their numbers among the nodes of all scenes."""
+    corner_step: Any
+    """The step from the lower corner of a cell to one of its corners."""
+    pair_of: Any
+    """The number of two corners of a cell, in any order."""
 
 
 @cache
 def node_functions(dimension: int) -> NodeFunctions:
     """Make Warp functions that number nodes and steps between them, in 2 or 3 dimensions."""
-    flat = wp.constant(dimension == 2)
+    flat, CORNERS = wp.constant(dimension == 2), wp.constant(2**dimension)
+
+    @wp.func
+    def wrapped(i: int, n: int) -> int:
+        return wp.where(i < 0, i + n, wp.where(i < n, i, i - n))
 
     @wp.func
     def number_of(node: wp.vec3i, shape: wp.vec3i) -> int:
-        x, y, z = (node[0] + shape[0]) % shape[0], (node[1] + shape[1]) % shape[1], (node[2] + shape[2]) % shape[2]
+        x, y, z = wrapped(node[0], shape[0]), wrapped(node[1], shape[1]), wrapped(node[2], shape[2])
         return (z * shape[1] + y) * shape[0] + x
+
+    @wp.func
+    def corner_step(corner: int) -> wp.vec3i:
+        return wp.vec3i(corner & 1, (corner >> 1) & 1, (corner >> 2) & 1)
+
+    @wp.func
+    def pair_of(a: int, b: int) -> int:
+        i, j = wp.min(a, b), wp.max(a, b)
+        return i * (2 * CORNERS - 1 - i) // 2 + j
 
     @wp.func
     def node_of(number: int, shape: wp.vec3i) -> wp.vec3i:
@@ -64,12 +81,12 @@ def node_functions(dimension: int) -> NodeFunctions:
         return wp.vec3i(offset % 3 - 1, (offset // 3) % 3 - 1, offset // 9 - 1)
 
     @wp.func
-    def offset_of(step: wp.vec3i) -> int:
-        if flat:
-            return 3 * step[1] + step[0] + 4
-        return 9 * step[2] + 3 * step[1] + step[0] + 13
+    def beside(node: int, step: wp.vec3i, shape: wp.vec3i) -> int:
+        nodes = shape[0] * shape[1] * shape[2]
+        first = node // nodes * nodes
+        return first + number_of(node_of(node - first, shape) + step, shape)
 
-    return NodeFunctions(number_of, node_of, step_of, offset_of)
+    return NodeFunctions(number_of, node_of, step_of, beside, corner_step, pair_of)
 
 
 @dataclass(frozen=True)
@@ -84,8 +101,6 @@ class HatFunctions:
     """The sum of e u over the nodes that a particle touches."""
     bend: Any
     """H v"""
-    corner_step: Any
-    """The step to one of the corners of a cell."""
     held: Any
     """The term eps + h^2 / 100, by which a particle holds the nodes around it."""
 
@@ -95,7 +110,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     """Make Warp functions of the hats of nodes, in 2 or 3 dimensions."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
-    number_of = node_functions(dimension).number_of
+    number_of, corner_step = node_functions(dimension).number_of, node_functions(dimension).corner_step
     CORNERS = wp.constant(2**dimension)
     flat = wp.constant(dimension == 2)
     alone = wp.constant(real(ALONE))
@@ -133,10 +148,6 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
         found.slope = vector(p * b * c, a * q * c, a * b * r)
         found.bent = vector(a * q * r, p * b * r, p * q * c)
         return found
-
-    @wp.func
-    def corner_step(corner: int) -> wp.vec3i:
-        return wp.vec3i(bit(corner, 0), bit(corner, 1), bit(corner, 2))
 
     @wp.func
     def first_corner(i: int, particles: int, x: vector, grid: grid_type):
@@ -177,7 +188,7 @@ def hat_functions(precision: Precision, dimension: int) -> HatFunctions:
     def held(eps: real, h: vector) -> real:
         return eps + alone * wp.dot(h, h)
 
-    return HatFunctions(hat, at, products, bend, corner_step, held)
+    return HatFunctions(hat, at, products, bend, held)
 
 
 @dataclass(frozen=True)
@@ -185,11 +196,11 @@ class NodeKernels:
     """Kernels that sum over the particles around each node of the coarse grid."""
 
     add_up: Any
-    """The part of A by the particles of a cell, for each two of its corners."""
-    fill: Any
-    """A, for each node and each of its neighbours, itself among them."""
+    """The part of A that the particles of a cell add, for each two of its corners."""
     spread: Any
-    """The sum over the particles around each node."""
+    """The part of a sum over particles that those of a cell add, for each of its corners."""
+    gather: Any
+    """The sum over particles at each node, from the parts of cells."""
 
 
 @cache
@@ -197,18 +208,13 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     """Make the kernels that sum over the particles around nodes, in 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     grid_type, source, own = cell_grid_type(precision), source_type(precision), hat_functions(precision, dimension)
-    hat, corner_step, held, among = own.hat, own.corner_step, own.held, node_functions(dimension)
-    number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
+    hat, held, among = own.hat, own.held, node_functions(dimension)
+    beside, corner_step, pair_of = among.beside, among.corner_step, among.pair_of
     module = kernel_module(f"coarse_nodes_{dimension}d_{precision.name}")
-    CORNERS, AROUND = wp.constant(2**dimension), wp.constant(3**dimension)
+    CORNERS = wp.constant(2**dimension)
     square = wp.types.matrix(shape=(2**dimension, 2**dimension), dtype=real)
+    row = wp.types.vector(length=2**dimension, dtype=real)
     pushes = wp.types.matrix(shape=(2**dimension, 3), dtype=real)
-
-    @wp.func
-    def pair_of(a: int, b: int) -> int:
-        """Return the number of a pair of a cell's corners, in any order."""
-        i, j = wp.min(a, b), wp.max(a, b)
-        return i * (2 * CORNERS - 1 - i) // 2 + j
 
     @wp.kernel(module=module, enable_backward=False)
     def add_up(
@@ -240,29 +246,6 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                 cells[pair_of(a, b), cell] = total[a, b]
 
     @wp.kernel(module=module, enable_backward=False)
-    def fill(
-        grid: grid_type,
-        cells: wp.array2d(dtype=real),
-        # out
-        A: wp.array2d(dtype=real),
-    ):
-        """Put the cells' entries together to the symmetric A; a thread is a node and writes half of its offsets."""
-        node = wp.tid()
-        nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
-        member = node // nodes
-        first, here = member * nodes, node_of(node - member * nodes, grid.shape)
-        for offset in range(AROUND // 2 + 1):
-            step, total = step_of(offset), real(0.0)
-            for corner in range(CORNERS):
-                own = corner_step(corner)
-                to = own + step
-                if wp.min(wp.min(to[0], to[1]), to[2]) >= 0 and wp.max(wp.max(to[0], to[1]), to[2]) <= 1:
-                    cell = first + number_of(here - own, grid.shape)
-                    total += cells[pair_of(corner, to[0] + 2 * to[1] + 4 * to[2]), cell]
-            A[offset, node] = total
-            A[AROUND - 1 - offset, first + number_of(here + step, grid.shape)] = total
-
-    @wp.kernel(module=module, enable_backward=False)
     def spread(
         grid: grid_type,
         order: wp.array(dtype=wp.int32),
@@ -270,19 +253,26 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
         of: source,
         e: wp.array(dtype=real),
         # out
-        r: wp.array(dtype=real),
+        parts: wp.array2d(dtype=real),
     ):
-        node = wp.tid()
-        nodes = grid.shape[0] * grid.shape[1] * grid.shape[2]
-        member = node // nodes
-        here, total = node_of(node - member * nodes, grid.shape), real(0.0)
+        """Add up the source of the particles in a cell, with a thread for each cell."""
+        cell, total, own = wp.tid(), row(), row()
         for corner in range(CORNERS):
-            cell = member * nodes + number_of(here - corner_step(corner), grid.shape)
-            for p in range(grid.starts[cell], grid.starts[cell + 1]):
-                i = order[p]
+            own[corner] = e[beside(cell, corner_step(corner), grid.shape)]
+        for p in range(grid.starts[cell], grid.starts[cell + 1]):
+            i = order[p]
+            for corner in range(CORNERS):
                 phi = hat(x[i], corner, grid)
-                total += phi.value * of.s_value[i] + wp.dot(phi.slope, of.s_slope[i]) + wp.dot(phi.bent, of.s_bent[i])
-                total += e[node] * of.s_own[i]
+                value = phi.value * of.s_value[i] + wp.dot(phi.slope, of.s_slope[i]) + wp.dot(phi.bent, of.s_bent[i])
+                total[corner] += value + own[corner] * of.s_own[i]
+        for corner in range(CORNERS):
+            parts[corner, cell] = total[corner]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gather(grid: grid_type, parts: wp.array2d(dtype=real), r: wp.array(dtype=real)):
+        node, total = wp.tid(), real(0.0)
+        for corner in range(CORNERS):
+            total += parts[corner, beside(node, -corner_step(corner), grid.shape)]
         r[node] = total
 
-    return NodeKernels(add_up, fill, spread)
+    return NodeKernels(add_up, spread, gather)

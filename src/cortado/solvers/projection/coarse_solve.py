@@ -19,9 +19,7 @@ from cortado.device.precision import Precision
 BLOCK = 512
 """Threads of a block on a GPU."""
 ALONE = 4 * BLOCK
-"""Greatest number of nodes of a level that one block works on alone."""
-SWEEPS = 8
-"""Number of smoothings of the coarsest level, an even number."""
+"""Nodes of a level that one block works on, at most."""
 
 ON_A_CPU = """
     const int first = thread, teams = system.members;
@@ -167,10 +165,6 @@ SOLVE = """
             T *x = of(system.x_values, last), *z = of(system.z_values, last);
             const T *w = of(system.weight, last), *r = of(system.residual, last);
             each(alone(levels - 1), last.nodes, [&](int i) { x[i] = w[i] * r[i]; });
-            for (int sweep = 2; sweep < SWEEPS; sweep += 2) {
-                each(alone(levels - 1), last.nodes, [&](int i) { z[i] = smoothed(last, i, r, x); });
-                each(alone(levels - 1), last.nodes, [&](int i) { x[i] = smoothed(last, i, r, z); });
-            }
             if (levels == 1) return sum(last.nodes, [&](int i) { z[i] = smoothed(last, i, r, x); return z[i] * r[i]; });
             each(alone(levels - 1), last.nodes, [&](int i) { z[i] = smoothed(last, i, r, x); });
             for (int l = levels - 2; ; --l) {
@@ -189,11 +183,10 @@ SOLVE = """
         const Level own = level(0);
         const T *w = of(system.weight, own), *z = of(system.z_values, own);
         T *r = of(system.residual, own), *p = of(system.direction, own), *q = of(system.image, own), *y = of(e, own);
-        each(false, own.nodes, [&](int i) { y[i] = T(0); });
         T size = cycle();
         const T enough = tolerance * tolerance * size;
         int done = 0;
-        if (size > T(0)) each(false, own.nodes, [&](int i) { p[i] = z[i]; });
+        each(false, own.nodes, [&](int i) { y[i] = T(0); p[i] = z[i]; });
         while (size > T(0)) {
             T curvature = sum(own.nodes, [&](int i) {
                 q[i] = w[i] > T(0) ? product(own, i, [&](int j) { return p[j]; }) : T(0);
@@ -268,14 +261,16 @@ def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
     real, system_kind = precision.real, system_type(precision)
     module = kernel_module(f"coarse_solve_{dimension}d_{precision.name}" + ("" if is_cpu else "_blocks"))
     text = f"typedef wp::{real.__name__} T;\n" + (ON_A_CPU if is_cpu else ON_A_GPU) + SOLVE
-    numbers = {"BLOCK": BLOCK, "ALONE": ALONE, "SWEEPS": SWEEPS, "AROUND": 3**dimension, "FLAT": dimension == 2}
+    numbers = {"BLOCK": BLOCK, "ALONE": ALONE, "AROUND": 3**dimension, "FLAT": dimension == 2}
     for word, value in numbers.items():
         text = text.replace(word, str(int(value)))
 
     @wp.func_native(text)
     def solve_all(thread: wp.int32, system: system_kind, tolerance: real, most: wp.int32, e: wp.array(dtype=real)): ...
 
-    @wp.kernel(module=module, enable_backward=False, grid_stride=False)
+    bounds = None if is_cpu else (BLOCK, 1)
+
+    @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def solve(
         system: system_kind,
         tolerance: real,

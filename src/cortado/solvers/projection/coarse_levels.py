@@ -1,0 +1,263 @@
+"""Ever coarser grids, which make the solves on the coarse grid of the pressure take few iterations.
+
+Each level has half of the nodes of the finer one along every axis that has an even number of them, and the matrix
+R A R^T of that level (Galerkin), with bilinear R: the sum of what each cell adds, as A is. The solve
+(`cortado.solvers.projection.coarse_solve`) smooths it by steps of Jacobi's method, x + w (r - A x), with
+w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 that converges for every matrix that is symmetric and
+not negative: those with W = 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is scaled to
+1) have no eigenvalue of w A above 1. The grids wrap around as those of cells do.
+"""
+
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from cortado.device.launching import launch
+from cortado.device.modules import kernel_module
+from cortado.device.precision import Precision
+from cortado.solvers.projection.coarse_nodes import node_functions
+from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_type
+from cortado.sph.parts import StepContext
+
+FEWEST = 4
+"""Fewest nodes along an axis that a coarser grid may halve."""
+W = wp.constant(1.9)
+
+
+class LevelKernels(NamedTuple):
+    """Kernels that make the matrices of ever coarser grids."""
+
+    coarsen: Any
+    """The parts of a level's matrix that its cells add, from those of the ``fine`` level."""
+    fill: Any
+    """The matrices of all levels, from the parts of their cells."""
+    weigh: Any
+    """The weight w of each node of all levels, 0 where there is no matrix."""
+
+
+@cache
+def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
+    """Make the kernels for the matrices of coarser grids, in 2 or 3 dimensions."""
+    real = precision.real
+    module = kernel_module(f"coarse_levels_{dimension}d_{precision.name}")
+    AROUND, CORNERS, among = wp.constant(3**dimension), wp.constant(2**dimension), node_functions(dimension)
+    PAIRS, row = wp.constant(pairs_of_corners(dimension)), wp.types.vector(length=2**dimension, dtype=real)
+    number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
+    corner_step, pair_of = among.corner_step, among.pair_of
+
+    @wp.struct
+    class Place:
+        """A node: how many nodes finer levels have, how many its level has in all scenes, the shape of the level, the
+        number of the node among those of its level, that of the first one of its scene, and where it is."""
+
+        start: int
+        all: int
+        shape: wp.vec3i
+        number: int
+        first: int
+        here: wp.vec3i
+
+    @wp.func
+    def place_of(node: int, members: int, shapes: wp.array(dtype=wp.int32), starts: wp.array(dtype=wp.int64)) -> Place:
+        """Return the place of a node, given its number among the nodes of all levels."""
+        level, found = int(0), Place()
+        for later in range(1, starts.shape[0]):
+            if node >= int(starts[later]):
+                level = later
+        found.shape = wp.vec3i(shapes[6 * level], shapes[6 * level + 1], shapes[6 * level + 2])
+        found.start = int(starts[level])
+        nodes = found.shape[0] * found.shape[1] * found.shape[2]
+        found.all = members * nodes
+        found.number = node - found.start
+        found.first = found.number // nodes * nodes
+        found.here = node_of(found.number - found.first, found.shape)
+        return found
+
+    @wp.func
+    def entry(rows: int, row: int, number: int, at: Place) -> wp.int64:
+        """Return the index of a node's entry in one row of its level, in an array with ``rows`` rows a level."""
+        return wp.int64(rows) * wp.int64(at.start) + wp.int64(row) * wp.int64(at.all) + wp.int64(number)
+
+    @wp.func
+    def entry_beside(rows: int, row: int, step: wp.vec3i, at: Place) -> wp.int64:
+        """Return the same of the node a step away."""
+        return entry(rows, row, at.first + number_of(at.here + step, at.shape), at)
+
+    @wp.func
+    def share(child: int, corner: int, halved: int) -> real:
+        """Return the hat function of a coarse cell's corner at a corner of one of its children, 0 to 1.
+
+        ``child`` and ``corner`` have a bit for each axis in which they are not on the side of the coarse corner,
+        ``halved`` for each one along which a coarse cell has two children."""
+        if ((child | ~halved) & corner) != 0:
+            return real(0.0)
+        bits = (child | corner) & halved
+        return real(0.125) * real(8 >> ((bits & 1) + ((bits >> 1) & 1) + ((bits >> 2) & 1)))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def coarsen(
+        fine: wp.vec3i,
+        shape: wp.vec3i,
+        factor: wp.vec3i,
+        cells_fine: wp.array2d(dtype=real),
+        # out
+        cells: wp.array2d(dtype=real),
+    ):
+        """Add up P^T M P of the matrices M of a coarse cell's children, with a thread for each corner of each cell."""
+        a = wp.tid() // cells.shape[1]
+        cell = wp.tid() - a * cells.shape[1]
+        nodes = shape[0] * shape[1] * shape[2]
+        member = cell // nodes
+        here, first = node_of(cell - member * nodes, shape), member * fine[0] * fine[1] * fine[2]
+        lower = wp.vec3i(here[0] * factor[0], here[1] * factor[1], here[2] * factor[2])
+        halved, total, corners = (factor[0] - 1) + 2 * (factor[1] - 1) + 4 * (factor[2] - 1), row(), int(CORNERS)
+        for child in range(corners):  # not a constant: Warp would write the loops out
+            own = first + number_of(lower + corner_step(child), fine)
+            if (child & ~halved) == 0 and cells_fine[0, own] > real(0.0):
+                left = row()
+                for u in range(corners):
+                    weight = share(child ^ a, u ^ a, halved)
+                    if weight > real(0.0):
+                        for v in range(CORNERS):
+                            left[v] += weight * cells_fine[pair_of(u, v), own]
+                for b in range(CORNERS):
+                    for v in range(CORNERS):
+                        total[b] += share(child ^ b, v ^ b, halved) * left[v]
+        for b in range(CORNERS):
+            if b >= a:
+                cells[pair_of(a, b), cell] = total[b]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def fill(
+        members: int,
+        shapes: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int64),
+        cells: wp.array(dtype=real),
+        all_nodes: int,
+        # out
+        A: wp.array(dtype=real),
+    ):
+        """Write the symmetric matrices of all levels, with a thread for each node and half of its offsets."""
+        offset = wp.tid() // all_nodes
+        at = place_of(wp.tid() - offset * all_nodes, members, shapes, starts)
+        step, total = step_of(offset), real(0.0)
+        for corner in range(CORNERS):
+            own = corner_step(corner)
+            to = own + step
+            if wp.min(wp.min(to[0], to[1]), to[2]) >= 0 and wp.max(wp.max(to[0], to[1]), to[2]) <= 1:
+                pair = pair_of(corner, to[0] + 2 * to[1] + 4 * to[2])
+                total += cells[entry_beside(PAIRS, pair, -own, at)]
+        A[entry(AROUND, offset, at.number, at)] = total
+        A[entry_beside(AROUND, AROUND - 1 - offset, step, at)] = total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def weigh(
+        members: int,
+        shapes: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int64),
+        A: wp.array(dtype=real),
+        # out
+        weight: wp.array(dtype=real),
+    ):
+        at = place_of(wp.tid(), members, shapes, starts)
+        own, total = A[entry(AROUND, AROUND // 2, at.number, at)], real(0.0)
+        if own > real(0.0):
+            for offset in range(AROUND):
+                coupling = wp.abs(A[entry(AROUND, offset, at.number, at)])
+                if coupling > real(0.0):
+                    total += coupling / wp.sqrt(A[entry_beside(AROUND, AROUND // 2, step_of(offset), at)])
+            total = real(W) / (wp.sqrt(own) * total)
+        weight[wp.tid()] = total
+
+    return LevelKernels(coarsen, fill, weigh)
+
+
+def pairs_of_corners(dimension: int) -> int:
+    """Return the number of pairs of a cell's corners, those of a corner with itself among them."""
+    return 2**dimension * (2**dimension + 1) // 2
+
+
+class Level(NamedTuple):
+    """One of the multigrid's grids."""
+
+    shape: wp.vec3i
+    factor: wp.vec3i
+    """Ratio of the finer grid's number of nodes to this grid's, along each axis."""
+    cells: wp.array
+    """(pairs, cells) the parts of the matrix that the cells of all scenes add, by pairs of a cell's corners."""
+
+
+class Levels:
+    """All grids of the multigrid for a solver's coarse pressure matrix."""
+
+    def __init__(
+        self,
+        precision: Precision,
+        dimension: int,
+        shape: tuple[int, int, int],
+        members: int,
+        device: Any,
+        rows: int = 0,
+    ):
+        """Allocate all levels below a finest grid of a ``shape``, to whose matrix B^T B with ``rows`` rows is added."""
+        self._kernels, self._device = level_kernels(precision, dimension), device
+        self._solve = solve_kernel(precision, dimension, device.is_cpu)
+        factors: list[tuple[int, ...]] = [(1, 1, 1)]
+        shapes: list[tuple[int, ...]] = [shape]
+        while max(halved := tuple(2 if n % 2 == 0 and n >= FEWEST else 1 for n in shapes[-1])) == 2:
+            factors.append(halved)
+            shapes.append(tuple(n // factor for n, factor in zip(shapes[-1], halved, strict=True)))
+        counts = [members * n[0] * n[1] * n[2] for n in shapes]
+        at, around, pairs = np.cumsum([0, *counts]).tolist(), 3**dimension, pairs_of_corners(dimension)
+
+        def numbers(count: int) -> wp.array:
+            return wp.zeros(count, dtype=precision.real, device=device)
+
+        cells, A, weight, residual = (numbers(n * at[-1]) for n in (pairs, around, 1, 1))
+        self._levels = [
+            Level(wp.vec3i(*n), wp.vec3i(*factor), cells[pairs * i : pairs * j].reshape((pairs, j - i)))
+            for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
+        ]
+        self.cells, self.r = self._levels[0].cells, residual[: counts[0]]
+        """(pairs, cells) what cells of the finest grid add to the matrix, and (nodes,) the right-hand side."""
+        self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
+        """(rows, nodes) of which B^T B is added to that matrix."""
+        self.count = wp.zeros(members, dtype=wp.int32, device=device)
+        """(members,) iterations of the last solve."""
+        table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
+        blocks = -(-counts[0] // members // BLOCK)
+        teams, team = members, 1
+        if not device.is_cpu:
+            teams = min(members, device.sm_count)
+            team = min(blocks, device.sm_count // teams)
+        self._threads = teams * team * (1 if device.is_cpu else BLOCK)
+        self._system = system = system_type(precision)()
+        system.shapes = wp.array(np.ravel(table), dtype=wp.int32, device=device)
+        system.starts = wp.array(at[:-1], dtype=wp.int64, device=device)
+        system.members, system.team, system.count = members, team, self.count
+        system.A, system.weight, system.residual = A, weight, residual
+        system.x_values, system.z_values = numbers(at[-1]), numbers(at[-1])
+        system.direction, system.image = numbers(counts[0]), numbers(counts[0])
+        system.partial = numbers(teams * blocks)
+        system.rows, system.B = rows, self.B.flatten()
+        system.gate = wp.zeros(2 * teams, dtype=wp.int32, device=device)
+        self._all = {"members": members, "shapes": system.shapes, "starts": system.starts, "A": A}
+        self._filled = {"cells": cells, "all_nodes": at[-1], "threads": (around // 2 + 1) * at[-1]}
+        self._weight, self._corners = weight, 2**dimension
+
+    def begin(self, context: StepContext) -> None:
+        """Compute the matrices and weights of all levels from the `cells` of the finest one."""
+        for finer, level in pairwise(self._levels):
+            both = {"fine": finer.shape, "shape": level.shape, "factor": level.factor, "cells_fine": finer.cells}
+            threads = self._corners * level.cells.shape[1]
+            context.launch(self._kernels.coarsen, both, cells=level.cells, threads=threads)
+        context.launch(self._kernels.fill, self._all, **self._filled)
+        context.launch(self._kernels.weigh, self._all, weight=self._weight, threads=len(self._weight))
+
+    def solve(self, e: wp.array, tolerance: float, most: int) -> None:
+        """Write to ``e`` (nodes,) the solution of (A + B^T B) e = `r`, which is overwritten."""
+        limits = {"tolerance": tolerance, "most": most}
+        launch(self._solve, self._threads, self._device, limits, system=self._system, e=e, block=BLOCK)
