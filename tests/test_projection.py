@@ -370,24 +370,48 @@ SHAPES = {
 }
 
 
-def system(dimension, shape, rng, empty=0.3):
-    """What cells have of A for each two corners, dense A and the nodes that have one: q q^T of the corners of cells."""
+def assembled(dimension, shape, parts):
+    """The dense matrix of what cells (pairs of corners, cells) have of it, on a grid that wraps around."""
     n = np.array(shape)
-    cells = np.stack(np.meshgrid(*(np.arange(k) for k in shape), indexing="ij"), -1).reshape(-1, 3)
     corners = np.array([[c & 1, (c >> 1) & 1, c >> 2] for c in range(2**dimension)])
+    dense, (first, second) = np.zeros((n.prod(), n.prod())), np.triu_indices(len(corners))
+    for number, own in enumerate(parts.T):
+        cell = np.array(np.unravel_index(number, shape[::-1]))[::-1]
+        nodes = [np.ravel_multi_index(tuple(((cell + corner) % n)[::-1]), shape[::-1]) for corner in corners]
+        part = np.zeros((len(corners), len(corners)))
+        part[first, second] = part[second, first] = own
+        np.add.at(dense, np.ix_(nodes, nodes), part)
+    return dense
 
-    def number(at):
-        return np.ravel_multi_index(tuple((at % n)[::-1]), shape[::-1])
 
-    pairs, dense = np.triu_indices(len(corners)), np.zeros((n.prod(), n.prod()))
-    parts = np.zeros((len(pairs[0]), n.prod()))
-    for cell in cells[rng.random(len(cells)) > empty]:
-        q = rng.normal(size=(4, len(corners)))
-        q[0] = 0.1
-        part, numbers = q.T @ q, [number(cell + corner) for corner in corners]
-        parts[:, number(cell)] = part[pairs]
-        np.add.at(dense, np.ix_(numbers, numbers), part)
+def system(dimension, shape, rng):
+    """What cells have of A for each two corners, q q^T in seven of ten; dense A, and the nodes that have one."""
+    pairs, count = np.triu_indices(2**dimension), np.prod(shape)
+    q = rng.normal(size=(4, 2**dimension, count))
+    q[0] = 0.1
+    parts = np.einsum("qan,qbn->abn", q, q)[pairs] * (rng.random(count) > 0.3)
+    dense = assembled(dimension, shape, parts)
     return parts, dense, np.diag(dense) > 0.0
+
+
+def prolongation(n, factor):
+    """(n, n / factor) along an axis that wraps around: nodes between two coarser ones have the mean of both."""
+    coarser = np.eye(n // factor)
+    return coarser if factor == 1 else np.stack([coarser, 0.5 * (coarser + np.roll(coarser, 1, 1))], 1).reshape(n, -1)
+
+
+@pytest.mark.parametrize("case", ["plane", "period of three", "space"])
+def test_coarser_matrices_are_those_of_galerkin(case):
+    dimension, shape = SHAPES[case]
+    levels = Levels(FLOAT64, dimension, shape, 1, wp.get_device("cpu"))
+    parts, dense, _ = system(dimension, shape, np.random.default_rng(4))
+    levels.cells.assign(parts)
+    levels.begin(SimpleNamespace(launch=KernelLauncher(1, levels.r.device, False)))
+    coarse = levels.levels[1]
+    x, y, z = (prolongation(n, factor) for n, factor in zip(shape, coarse.factor, strict=True))
+    P = np.kron(z, np.kron(y, x))
+    found = assembled(dimension, tuple(coarse.shape), coarse.cells.numpy())
+    np.testing.assert_allclose(found, P.T @ dense @ P, atol=1e-12 * np.abs(dense).max())
 
 
 @pytest.mark.parametrize("case", SHAPES)

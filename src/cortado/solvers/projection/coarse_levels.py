@@ -83,7 +83,7 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
 
     @wp.func
     def entry_beside(rows: int, row: int, step: wp.vec3i, at: Place) -> wp.int64:
-        """Return the same of the node a step away."""
+        """Return the index of the entry of the node a step away, as `entry` does."""
         return entry(rows, row, at.first + number_of(at.here + step, at.shape), at)
 
     @wp.func
@@ -217,12 +217,12 @@ class Levels:
             return wp.zeros(count, dtype=precision.real, device=device)
 
         cells, A, weight, residual = (numbers(n * at[-1]) for n in (pairs, around, 1, 1))
-        self._levels = [
+        self.levels = [
             Level(wp.vec3i(*n), wp.vec3i(*factor), cells[pairs * i : pairs * j].reshape((pairs, j - i)))
             for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
         ]
-        self.cells, self.r = self._levels[0].cells, residual[: counts[0]]
-        """(pairs, cells) what cells of the finest grid add to the matrix, and (nodes,) the right-hand side."""
+        self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
+        """(pairs, cells) the parts of the matrix that cells of the finest grid add; (nodes,) the right-hand side."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
         """(rows, nodes) of which B^T B is added to that matrix."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
@@ -250,7 +250,7 @@ class Levels:
 
     def begin(self, context: StepContext) -> None:
         """Compute the matrices and weights of all levels from the `cells` of the finest one."""
-        for finer, level in pairwise(self._levels):
+        for finer, level in pairwise(self.levels):
             both = {"fine": finer.shape, "shape": level.shape, "factor": level.factor, "cells_fine": finer.cells}
             threads = self._corners * level.cells.shape[1]
             context.launch(self._kernels.coarsen, both, cells=level.cells, threads=threads)
