@@ -1,5 +1,5 @@
 """Solves (A + B^T B) e = r on the coarse grid of the pressure in one launch: conjugate gradients (Hestenes and Stiefel
-1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse`. The V-cycle is that of A alone: the
+1952) with a V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle is that of A alone: the
 few rows of B cost an iteration each, or less.
 
 One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks does, which wait
@@ -232,7 +232,7 @@ def system_type(precision: Precision) -> Any:
         """Number of blocks for each scene."""
         A: numbers
         weight: numbers
-        """w of nodes, see `cortado.solvers.projection.coarse`."""
+        """w of nodes, see `cortado.solvers.projection.coarse_levels`."""
         residual: numbers
         """r, which is overwritten."""
         x_values: numbers
@@ -268,7 +268,7 @@ def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
     @wp.func_native(text)
     def solve_all(thread: wp.int32, system: system_kind, tolerance: real, most: wp.int32, e: wp.array(dtype=real)): ...
 
-    bounds = None if is_cpu else (BLOCK, 1)
+    bounds = None if is_cpu else (BLOCK, 1)  # so that registers suffice for a block; 3 to 9 % less time for a solve
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
     def solve(
