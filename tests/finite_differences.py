@@ -36,7 +36,7 @@ def all_ways_agree(
         slope = directional(found, direction)
         assert slope != 0.0, name
         np.testing.assert_allclose(problem.tangent(point, direction), slope, rtol=1e-9, err_msg=name)
-        np.testing.assert_allclose(taped[name], found[name], rtol=1e-8, atol=1e-12 * np.abs(found[name]).max())
+        np.testing.assert_allclose(taped[name], found[name], rtol=1e-9, atol=1e-12 * np.abs(found[name]).max())
         difference = central_difference(problem.value, point, direction, step(name))
         np.testing.assert_allclose(difference, slope, rtol=rtol, atol=atol, err_msg=name)
 

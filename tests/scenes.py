@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from cortado import Scene
+from cortado import Problem, Scene, Simulation
+from cortado.losses import FinalPositions
 from cortado.scene.stability import stability_limits
 
 
@@ -149,6 +150,11 @@ def thrown(simulation):
     spacing = simulation.scene.discretisation.spacing
     inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
     return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
+
+
+def aimed(simulation: Simulation, steps: int) -> Problem:
+    """A problem that is solved where each particle has gone by 0.02 sin(7 x)."""
+    return Problem(simulation, steps, FinalPositions(simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)))
 
 
 def stability_limit(scene: Scene) -> float:

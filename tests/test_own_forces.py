@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import InputError, Problem, Simulation, gradients
+from cortado import InputError, Problem, Simulation
 from cortado.errors import MissingDerivativeError
 from cortado.particles.state import Entry, StateField
 from cortado.scene.parameters import Axis, Parameter
@@ -15,7 +15,7 @@ from cortado.sph.parts import Carried, Part
 from finite_differences import all_ways_agree, both_modes, central_difference
 from own_forces import Breeze
 from remembering_force import TAU, Memory, MemoryForce, U
-from scenes import jet, plane, splash, two_layers
+from scenes import aimed, jet, plane, splash, two_layers
 
 STEPS = 8
 POINT = {
@@ -26,25 +26,12 @@ POINT = {
 }
 
 
-def problem(forces, **options):
-    simulation = Simulation(options.pop("scene", splash()), **{"precision": "float64", **options}, forces=forces)
-    steps = options.pop("steps", STEPS)
-    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
-    return Problem(simulation, steps, cortado.losses.FinalPositions(target))
+def problem(forces, made=None, steps=STEPS, **options):
+    return aimed(Simulation(made or splash(), **{"precision": "float64", **options}, forces=forces), steps)
 
 
-@pytest.mark.parametrize("name", POINT)
-def test_reverse_forward_tape_and_differences_agree(name):
-    judged = problem([Breeze()])
-    random = np.random.default_rng(5)
-    direction = random.standard_normal(np.shape(POINT[name]))
-    found = judged.value_and_gradient(POINT)[1][name]
-    along = float(np.sum(found * direction))
-    assert along != 0.0
-    np.testing.assert_allclose(along, judged.tangent(POINT, {name: direction}), rtol=1e-9)
-    np.testing.assert_allclose(found, judged.value_and_gradient(POINT, gradients.Tape())[1][name], rtol=1e-9)
-    h = 1e-6 * max(float(np.abs(POINT[name]).max()), 1e-3)
-    np.testing.assert_allclose(along, central_difference(judged.value, POINT, {name: direction}, h), rtol=3e-5)
+def test_reverse_forward_tape_and_differences_agree():
+    all_ways_agree(problem([Breeze()]), POINT, 5, lambda name: 1e-6, rtol=3e-5)
 
 
 def test_a_run_that_goes_on_has_the_same_bits_and_its_own_time():
@@ -177,14 +164,11 @@ def test_a_scene_without_them_has_no_more_parameters():
     assert "time" not in problem([Breeze()]).simulation.parameters()
 
 
-MEMORY_STEPS = 6
 SCENES = {"plane": plane, "two layers": two_layers, "jet": jet}
 
 
 def remembering(make, **options):
-    simulation = Simulation(make(), **{"precision": "float64", **options}, forces=[Memory()])
-    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
-    return Problem(simulation, MEMORY_STEPS, cortado.losses.FinalPositions(target))
+    return problem([Memory()], make(), 6, **options)
 
 
 def point_of(simulation):
@@ -198,9 +182,9 @@ def test_what_it_does_is_what_it_says():
     simulation = Simulation(free, precision="float64", forces=[Memory()])
     dt, gravity = free.solver.time_step, np.array([0.0, -9.81])
     v = u = np.zeros(2)
-    for _ in range(MEMORY_STEPS):
+    for _ in range(6):
         v, u = v + dt * (gravity + 30.0 * (u - v)), u + dt * (v - u) / TAU
-    run = simulation.run(MEMORY_STEPS)
+    run = simulation.run(6)
     np.testing.assert_allclose(run.velocities[-1], np.tile(v, (simulation.particles, 1)), rtol=1e-12)
     np.testing.assert_allclose(run.last_state[U.name], np.tile(u, (simulation.particles, 1)), rtol=1e-12)
     assert np.abs(u).max() > 0.0
@@ -215,10 +199,7 @@ def test_a_field_that_is_kept_has_right_derivatives(make):
 def test_a_run_that_is_cut_has_the_same_bits():
     simulation = Simulation(two_layers(), forces=[Memory()])
     state = simulation.state({"initial_velocities": simulation.velocities + 0.1})
-    whole, halves = (
-        simulation.step(state, steps=MEMORY_STEPS),
-        simulation.step(simulation.step(state, steps=2), steps=MEMORY_STEPS - 2),
-    )
+    whole, halves = simulation.step(state, steps=6), simulation.step(simulation.step(state, steps=2), steps=4)
     for name in (U.name, "positions", "velocities"):
         np.testing.assert_array_equal(halves[name], whole[name])
     assert np.abs(np.asarray(whole[U.name]) - whole["velocities"]).max() > 0.0
@@ -256,56 +237,49 @@ def test_a_part_without_derivatives_says_so():
         judged.tangent({"memory.k": 1.0}, {"memory.k": 1.0})
 
 
+class Duck(Gravity):
+    def __init__(self, setting):
+        super().__init__(setting.layout, False)
+
+    def settle(self, step):
+        """Never called."""
+
+
+def of_fields(*fields):
+    """A force that keeps them."""
+    return type("Odd", (MemoryForce,), {"fields": fields})
+
+
+def field(entry, first, *axis):
+    return StateField("u", "", entry, *axis, first=first)
+
+
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("force", "error", "message"),
     [
-        ((U, U), "several fields called 'remembered_velocities'"),
-        ((StateField("positions", "m", Entry.VECTOR),), "several fields called 'positions'"),
+        (of_fields(U, U), TypeError, "several fields called 'remembered_velocities'"),
+        (of_fields(StateField("positions", "m", Entry.VECTOR)), TypeError, "several fields called 'positions'"),
+        (of_fields(field(Entry.NUMBER, "weight")), TypeError, "'u' begins as 'weight', but must begin as one of"),
+        (of_fields(field(Entry.NUMBER, "initial_velocities")), TypeError, "which is not a number of each particle"),
+        (of_fields(field(Entry.VECTOR, "viscosity", Axis.SCALAR)), TypeError, "which is not a vector of the scene"),
+        (lambda setting: object(), InputError, r"object, which .*Made.* made, has no shares, but must have"),
+        (Duck, InputError, "the force Duck has the methods settle of a part, but is none"),
         (
-            (StateField("u", "", Entry.NUMBER, first="weight"),),
-            "field 'u' begins as 'weight', but must begin as one of",
-        ),
-        (
-            (StateField("u", "", Entry.NUMBER, first="initial_velocities"),),
-            "begins as 'initial_velocities', which is not a number of each particle",
-        ),
-        (
-            (StateField("u", "", Entry.VECTOR, Axis.SCALAR, first="viscosity"),),
-            "begins as 'viscosity', which is not a vector of the scene",
+            type("Idle", (MemoryForce,), {"end": Part.end}),
+            InputError,
+            "Idle has fields, but no method `end` that",
         ),
     ],
 )
-def test_fields_that_cannot_be_are_refused(fields, message):
-    with pytest.raises(TypeError, match=message):
-        Simulation(plane(), forces=[Made(type("Odd", (MemoryForce,), {"fields": fields}))])
+def test_a_force_that_cannot_be_is_refused(force, error, message):
+    with pytest.raises(error, match=message):
+        Simulation(plane(), forces=[Made(force)])
 
 
 def test_fields_of_a_scene_are_not_sorted():
     layout = Simulation(plane()).solver.layout
     with pytest.raises(TypeError, match="field 'u' has one entry, but must have one for each particle to be sorted"):
         Carried([StateField("u", "", Entry.NUMBER, Axis.SCALAR)], layout)
-
-
-def test_what_lacks_something_of_a_force_is_refused():
-    with pytest.raises(InputError, match=r"the force object, which .*Made.* made, has no shares, but must have"):
-        Simulation(plane(), forces=[Made(lambda setting: object())])
-
-
-def test_what_works_as_a_part_must_be_one():
-    class Duck(Gravity):
-        def __init__(self, setting):
-            super().__init__(setting.layout, False)
-
-        def settle(self, step):
-            """Never called."""
-
-    with pytest.raises(InputError, match="the force Duck has the methods settle of a part, but is none"):
-        Simulation(plane(), forces=[Made(Duck)])
-
-
-def test_a_part_writes_its_fields():
-    with pytest.raises(InputError, match="the force Idle has fields, but no method `end` that writes them"):
-        Simulation(plane(), forces=[Made(type("Idle", (MemoryForce,), {"end": Part.end}))])
 
 
 class Memories:

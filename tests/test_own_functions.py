@@ -15,7 +15,7 @@ import cortado
 from cortado import InputError, Problem, Simulation
 from cortado.forces import Body, OverTime, Pair
 from finite_differences import all_ways_agree
-from scenes import plane, splash, two_layers
+from scenes import aimed, plane, splash, two_layers
 
 ROOT = Path(__file__).parent.parent
 STEPS = 5
@@ -53,10 +53,7 @@ SCENES = {"in space": splash, "two phases": two_layers, "in the plane": plane}
 
 
 def problem(force, make=splash, **options):
-    made = make()
-    simulation = Simulation(made, **{"precision": "float64", **options}, forces=[force])
-    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
-    return Problem(simulation, STEPS, cortado.losses.FinalPositions(target))
+    return aimed(Simulation(make(), **{"precision": "float64", **options}, forces=[force]), STEPS)
 
 
 def point_of(judged):
@@ -220,46 +217,19 @@ def drag(x, v, t, k):
     return -k * v
 
 
-def no_vector(x, v, k):
-    return k
+def three(x, v, t, k, c):
+    return v
 
 
-def nothing(x, v, k):
-    wp.length(x)
+def time_second(x_ij, t, v_ij, k):
+    return -k * t * v_ij
 
 
-def unknown(x, v, k):
-    return -k * undefined(v)  # noqa: F821
+CALLED = """
+import numpy as np
+import warp as wp
 
-
-def numpy_inside(x, v, k):
-    return -k * np.tanh(v)
-
-
-def part(x, v, k):
-    f = -k * v
-    f[1] = 0.0
-    return f
-
-
-def long_loop(x, v, k):
-    for _ in range(17):
-        v = v * 0.5
-    return k * v
-
-
-def until(x, v, k):
-    while k > 1.0:
-        k = k - 1.0
-    return k * v
-
-
-def leaving(x, v, k):
-    for axis in range(3):
-        if v[axis] > 0.0:
-            break
-    return k * v
-
+AWAY = [1.0, 0.0, 0.0]
 
 @wp.func
 def looping(r: wp.float64):
@@ -267,190 +237,116 @@ def looping(r: wp.float64):
         r = r * r
     return r
 
-
-def with_looping(x, v, k):
-    return k * looping(x[0]) * v
-
-
-def many(x, v, *rest):
-    return v
-
-
-def three(x, v, t, k, c):
-    return v
-
-
-def one(x):
-    return x
-
-
-def turned(v, x, k):
-    return -k * v
-
-
-def time_second(x_ij, t, v_ij, k):
-    return -k * t * v_ij
-
-
-def forgotten(x, v, rate, wind):
-    return rate * (wind - v)
-
-
-def fixed_time(x, v, t=0.0, k=1.0):
-    return -k * t * v
-
-
-AWAY = [1.0, 0.0, 0.0]
-
-
-def listed(x, v, k):
-    return k * AWAY
-
-
-def sometimes(x, v, k):
-    if x[0] < 0.1:
-        return k * v
-
-
-def named_part(x, v, k):
-    f = k * x
-    f.y = 0.0
-    return f
-
-
-def added_part(x, v, k):
-    f = k * x
-    f.y += k
-    return f
-
-
 @wp.func
 def flattened(a: wp.vec3):
     a.y = 0.0
     return a
 
-
-def helped_part(x, v, k):
-    return k * flattened(x)
-
-
-def again(x, v):
-    return again(x, v)
-
-
 @wp.func
 def helping_itself(r: wp.float64):
     return helping_itself(r)
 
+"""
+NO_FORCES = {
+    "calls itself": ("def f(x, v): return f(x, v)", "Body function f calls itself, which Warp cannot"),
+    "calls what calls itself": (
+        "def f(x, v): return helping_itself(x[0]) * v",
+        "helping_itself that Body function f calls calls itself",
+    ),
+    "waits": ("async def f(x, v): return x", "Body function f waits or yields, but must be made by def"),
+    "yields": ("def f(x, v): yield x", "Body function f waits or yields, but must be made by def"),
+    "no axis": (
+        "def f(x, v): return x[3] * v",
+        r"Body function f has x\[3\], but must have an index of 0, 1 or 2 there",
+    ),
+    "order": ("def f(v, x, k): return -k * v", "f has the arguments v, x, k, but must have x, v first, and"),
+    "one": ("def f(x): return x", "Body function f has x without a value, but must have"),
+    "many": ("def f(x, v, *rest): return v", r"Body function f has the argument \*rest, but must have"),
+    "time": ("def f(x, v, t=0.0, k=1.0): return -k * t * v", "f is given a value of t, but must be given none"),
+    "no return": ("def f(x, v, k): wp.length(x)", "f may end without return, but must return a vector"),
+    "some return": ("def f(x, v, k):\n if x[0] < 0.1: return k * v", "Body function f may end without return"),
+    "unknown": ("def f(x, v, k): return k * undefined(v)", "f has the name .*, which stands for nothing"),
+    "list": ("def f(x, v, k): return k * AWAY", "AWAY, which is a list outside of it, but must take a number"),
+    "named part": (
+        "def f(x, v, k):\n a = k * x\n a.y = 0.0\n return a",
+        "f changes a.y alone, which Warp cannot differ",
+    ),
+    "added part": (
+        "def f(x, v, k):\n a = k * x\n a.y += k\n return a",
+        "f changes a.y alone, which Warp cannot differ",
+    ),
+    "called part": ("def f(x, v, k): return k * flattened(x)", "function f changes a.y alone, which Warp cannot"),
+    "index": (
+        "def f(x, v, k):\n a = -k * v\n a[1] = 0.0\n return a",
+        r"f changes a\[1\] alone, which Warp cannot diff",
+    ),
+    "long loop": (
+        "def f(x, v, k):\n for _ in range(17): v = v * 0.5\n return k * v",
+        r"f has 'for _ in range\(17\)', which Warp cannot differentiate",
+    ),
+    "while": (
+        "def f(x, v, k):\n while k > 1.0: k = k - 1.0\n return k * v",
+        "f has 'while k > 1.0', which Warp cannot differentiate",
+    ),
+    "break": (
+        "def f(x, v, k):\n for axis in range(3):\n  if v[axis] > 0.0: break\n return k * v",
+        "f has 'break', which Warp cannot differentiate",
+    ),
+    "called while": (
+        "def f(x, v, k): return k * looping(x[0]) * v",
+        "f has 'while r > 1.0', which Warp cannot differentiate",
+    ),
+    "no vector": ("def f(x, v, k): return k", "Body function f cannot be compiled: .* return a vector"),
+    "NumPy": ("def f(x, v, k): return -k * np.tanh(v)", "Body function f cannot be compiled: "),
+    "compares": (
+        "def f(x, v):\n if v < x: return v\n return x",
+        r"f cannot be compiled: invalid operands .* \(a vector and a vector\); it must use numbers",
+    ),
+    "nested": (
+        "def f(x, v): return wp.vec3(x, v[0], 1.0)",
+        "f cannot be compiled: no matching constructor for initialization of a vector; it must",
+    ),
+}
 
-def with_helping_itself(x, v):
-    return helping_itself(x[0]) * v
 
-
-async def waiting(x, v):
-    return x
-
-
-def yielding(x, v):
-    yield x
-
-
-def slower(x, v):
-    if v < x:
-        return v
-    return x
-
-
-def beyond_z(x, v):
-    return x[3] * v
-
-
-def nested(x, v):
-    return wp.vec3(x, v[0], 1.0)
+@pytest.mark.parametrize("name", NO_FORCES)
+def test_what_is_no_force_is_a_sentence(name, tmp_path, capfd):
+    """And nothing more: the compiler would print pages."""
+    text, said = NO_FORCES[name]
+    (tmp_path / "force.py").write_text(CALLED + text)
+    force = runpy.run_path(str(tmp_path / "force.py"))["f"]
+    with pytest.raises(InputError, match=said):
+        problem(Body(force, **{"k": 1.0} if ", k)" in text else {}))
+    captured = capfd.readouterr()
+    assert "error" not in captured.out + captured.err
 
 
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: Body(again), "Body function again calls itself, which Warp cannot"),
-        (lambda: Body(with_helping_itself), "helping_itself that Body function with_helping_itself calls calls itself"),
-        (lambda: Body(waiting), "Body function waiting waits or yields, but must be made by def"),
-        (lambda: Body(yielding), "Body function yielding waits or yields, but must be made by def"),
-        (lambda: Body(beyond_z), r"Body function beyond_z has x\[3\], but must have an index of 0, 1 or 2 there"),
         (lambda: Body(3.0), "Body has 3.0, but must have a function, made by def"),
-        (
-            lambda: Body(lambda x, v, k: -k * v, k=1.0),
-            "Body function <lambda> is no definition, but must be",
-        ),
+        (lambda: Body(lambda x, v, k: -k * v, k=1.0), "Body function <lambda> is no definition, but must be"),
         (lambda: Body(np.sin, k=1.0), "Body has <ufunc 'sin'>, but must have a function"),
         (lambda: Body(drag), "Body function drag is given no value of k, but must have one of each parameter"),
         (lambda: Body(three, k=1.0), "Body function three is given no value of c, but must have"),
-        (lambda: Body(forgotten, wind=AWAY), "Body function forgotten is given no value of rate, but must have"),
-        (lambda: Body(turned, k=1.0), "turned has the arguments v, x, k, but must have x, v first, and then t"),
+        (lambda: Body(three, c=[1.0, 0.0, 0.0]), "Body function three is given no value of k, but must have"),
         (lambda: Pair(time_second, k=1.0), "time_second has the arguments .*, but must have x_ij, v_ij first"),
-        (lambda: Body(fixed_time), "fixed_time is given a value of t, but must be given none"),
         (lambda: Body(drag, k=1.0, x=2.0), "drag is given a value of x, but must be given none"),
-        (lambda: Body(one), "Body function one has x without a value, but must have"),
-        (
-            lambda: Pair(drag, k=1.0, c=2.0),
-            r"is given a value of c, but .* among .*\(x, v, t, k\)",
-        ),
-        (lambda: Body(many), r"Body function many has the argument \*rest, but must have"),
+        (lambda: Pair(drag, k=1.0, c=2.0), r"is given a value of c, but .* among .*\(x, v, t, k\)"),
         (lambda: Body(drag, k="fast"), "parameter drag.k is 'fast', but must be"),
         (lambda: Body(drag, k=[[1.0]]), r"parameter drag.k has shape \(1, 1\), but must be a number, a vector"),
         (lambda: Body(drag, "a b", k=1.0), "Body has the name 'a b', but must have a word"),
         (lambda: problem(Body(drag, k=math.nan)), "parameter drag.k has a value that is not finite"),
         (lambda: problem(Body(drag, k=[1.0, 2.0])), r"parameter drag.k has shape \(2,\), but must be \(3,\)"),
-        (
-            lambda: problem(Body(no_vector, k=1.0)),
-            "Body function no_vector cannot be compiled: .* return a vector",
-        ),
-        (lambda: Body(nothing, k=1.0), "Body function nothing may end without return, but must return a vector"),
-        (lambda: Body(sometimes, k=1.0), "Body function sometimes may end without return"),
-        (lambda: Pair(unknown, k=1.0), "Pair function unknown has the name .*, which stands for nothing"),
-        (
-            lambda: Body(listed, k=1.0),
-            "listed has the name AWAY, which is a list outside of it, but must take a number",
-        ),
-        (
-            lambda: Body(named_part, k=1.0),
-            r"Body function named_part changes f.y alone, which Warp cannot differentiate",
-        ),
-        (lambda: Body(added_part, k=1.0), r"Body function added_part changes f.y alone, which Warp cannot"),
-        (lambda: Body(helped_part, k=1.0), r"Body function helped_part changes a.y alone, which Warp cannot"),
-        (lambda: problem(Body(numpy_inside, k=1.0)), "Body function numpy_inside cannot be compiled: "),
-        (lambda: Body(part, k=1.0), r"Body function part changes f\[1\] alone, which Warp cannot differentiate"),
-        (lambda: Body(long_loop, k=1.0), r"long_loop has 'for _ in range\(17\)', which Warp cannot differentiate"),
-        (lambda: Body(until, k=1.0), "until has 'while k > 1.0', which Warp cannot differentiate"),
-        (lambda: Body(leaving, k=1.0), "leaving has 'break', which Warp cannot differentiate"),
-        (lambda: Body(with_looping, k=1.0), "with_looping has 'while r > 1.0', which Warp cannot differentiate"),
-        (
-            lambda: OverTime([0.0, 0.0], [1.0, 2.0]),
-            "OverTime times are .*, but each must be greater than the one",
-        ),
+        (lambda: OverTime([0.0, 0.0], [1.0, 2.0]), "OverTime times are .*, but each must be greater than the one"),
         (lambda: OverTime([0.0], [1.0, 2.0]), r"OverTime values have shape \(2,\), but must be \(1,\) or \(1, d\)"),
         (lambda: OverTime([0.0], [math.nan]), "OverTime values have one that is not finite"),
         (lambda: OverTime([], []), "OverTime times are .*, but must be a list of finite times"),
     ],
 )
-def test_what_is_no_force_is_a_sentence(make, said):
+def test_values_that_make_no_force_are_a_sentence(make, said):
     with pytest.raises(InputError, match=said):
         make()
-
-
-@pytest.mark.parametrize(
-    ("force", "said"),
-    [
-        (slower, r"slower cannot be compiled: invalid operands .* \(a vector and a vector\); it must use numbers"),
-        (nested, "nested cannot be compiled: no matching constructor for initialization of a vector; it must"),
-    ],
-)
-def test_what_the_compiler_says_is_the_reason_and_nothing_more(force, said, capfd):
-    """It would print pages."""
-    with pytest.raises(InputError, match=said):
-        problem(Body(force))
-    captured = capfd.readouterr()
-    assert "error" not in captured.out + captured.err
 
 
 def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):

@@ -56,32 +56,38 @@ def test_a_parameter_that_a_scene_lacks_is_refused(name):
     assert str(error.value) == f"parameter {name} is given, but must be left out, as the scene {absent}."
 
 
-def test_a_rollout_does_not_go_back_through_states_of_other_parameters():
+def test_a_rollout_takes_derivatives_of_its_own_alone():
+    """Through states that it keeps."""
     simulation = Simulation(plane())
-    rollout = simulation.rollout(3)
+    rollout, other = simulation.rollout(3), simulation.rollout(3)
     rollout.forward(keep=False)
     with pytest.raises(InputError, match="run forward first, with keep=True"):
         rollout.backward(Exact().derivative(rollout), {})
-
-
-def test_a_rollout_takes_derivatives_of_its_own_alone():
-    simulation = Simulation(plane())
-    rollout, other = simulation.rollout(3), simulation.rollout(3)
     with pytest.raises(InputError, match="was made for another rollout"):
         rollout.backward(Exact().derivative(other), {})
     with pytest.raises(InputError, match="cannot go along a tangent"):
-        rollout.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
+        other.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
     rollout.forward()
     with pytest.raises(InputError, match="bars has the state 7, but must have states from 0 to 3"):
         rollout.backward(Exact().derivative(rollout), {7: simulation.initial})
 
 
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(plane())
+
+
 @pytest.mark.parametrize("given", [None, [1.0], 3, "gravity"])
-def test_parameters_are_a_table(given):
-    simulation = Simulation(plane())
+def test_parameters_are_a_table(simulation, given):
     problem = Problem(simulation, 3, losses.FinalPositions(simulation.positions))
     with pytest.raises(InputError, match=r"parameters are .*, but must be given by name, as \{'gravity': value\}"):
         problem.value(given)
+
+
+@pytest.mark.parametrize("budget", ["8GB", -1, 1.5, None])
+def test_a_memory_budget_is_a_number_of_bytes(simulation, budget):
+    with pytest.raises(InputError, match=r"memory_budget is .* must be a whole number of at least 0"):
+        Problem(simulation, 3, losses.FinalPositions(simulation.positions), memory_budget=budget)
 
 
 def test_a_part_that_forgets_its_shares_is_an_error():
@@ -90,13 +96,6 @@ def test_a_part_that_forgets_its_shares_is_an_error():
     bar = solver.adjoint(2).bar
     known = {name for group in bar.named for name in group}
     assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "flow_rate_bar" not in known
-
-
-@pytest.mark.parametrize("budget", ["8GB", -1, 1.5, None])
-def test_a_memory_budget_is_a_number_of_bytes(budget):
-    simulation = Simulation(plane())
-    with pytest.raises(InputError, match=r"memory_budget is .* must be a whole number of at least 0"):
-        Problem(simulation, 3, losses.FinalPositions(simulation.positions), memory_budget=budget)
 
 
 class Tensor:
@@ -130,20 +129,15 @@ def test_numbers_are_taken(value, wanted):
     np.testing.assert_array_equal(found, wanted)
 
 
-def test_warp_arrays_are_taken():
-    vectors = wp.array(np.ones((2, 3)), dtype=wp.vec3f, device="cpu")
+def test_arrays_are_taken():
+    """Those of Warp, and in float64 without a copy."""
+    vectors, values = wp.array(np.ones((2, 3)), dtype=wp.vec3f, device="cpu"), np.zeros(3)
     np.testing.assert_array_equal(as_numbers("positions", vectors), np.ones((2, 3)))
-
-
-def test_an_array_in_float64_is_not_copied():
-    values = np.zeros(3)
     assert as_numbers("gravity", values) is values
 
 
-def endless() -> list:
-    found: list = []
-    found.append(found)
-    return found
+ENDLESS: list = []
+ENDLESS.append(ENDLESS)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +161,7 @@ def endless() -> list:
         (None, "None"),
         ({"x": 1.0}, "a table"),
         (Tensor([1.0], RuntimeError("it requires grad")), "Tensor"),
-        (endless(), "[[...]]"),
+        (ENDLESS, "[[...]]"),
     ],
 )
 @pytest.mark.filterwarnings("error")

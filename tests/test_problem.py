@@ -40,13 +40,11 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
 
 @pytest.mark.parametrize("estimator", [gradients.Exact(), gradients.Tape()], ids=repr)
 def test_an_interruption_leaves_nothing_behind(simulation, estimator, monkeypatch):
-    problem = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
-    point = {**GRAVITY, "initial_positions": simulation.positions}
+    loss, point = losses.FinalPositions(np.zeros((125, 3))), {**GRAVITY, "initial_positions": simulation.positions}
+    problem, fresh = (Problem(simulation, 30, loss) for _ in range(2))
     _, wanted = problem.value_and_gradient(point, estimator)
-    fresh = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
-    solver = simulation.solver
-    recorded = type(solver).write_state
-    calls = []
+    solver, calls = type(simulation.solver), []
+    recorded = solver.write_state
 
     def interrupted(self, *rest):
         calls.append(1)
@@ -54,7 +52,7 @@ def test_an_interruption_leaves_nothing_behind(simulation, estimator, monkeypatc
             raise KeyboardInterrupt
         recorded(self, *rest)
 
-    monkeypatch.setattr(type(solver), "write_state", interrupted)
+    monkeypatch.setattr(solver, "write_state", interrupted)
     with pytest.raises(KeyboardInterrupt):
         for _ in range(3):
             fresh.value_and_gradient(point, estimator)
@@ -110,6 +108,9 @@ def test_fingerprints_tell_problems_apart(simulation, problem):
     ]
     assert len({problem.fingerprint, *(other.fingerprint for other in others)}) == 5
     assert problem.fingerprint == Problem(simulation, 60, losses.FinalPositions(simulation.positions)).fingerprint
+    scene, own = plane_of_three(), replace(MISCIBLE, name="own")
+    made = [Simulation(scene), Simulation(scene, free_energy=own), Simulation(scene, free_energy=MISCIBLE)]
+    assert len({Problem(s, 1, losses.FinalPositions(s.positions)).fingerprint for s in made}) == 3
 
 
 MISTAKES = {
@@ -150,14 +151,17 @@ def test_a_mistake_is_a_sentence(problem, mistake):
     assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
 
 
-def test_the_shape_of_a_users_adjoint_is_checked(simulation):
-    class Wrong(losses.FinalPositions):
-        def adjoint(self, end):
-            return np.zeros((7, 3)), np.zeros((7, 3))
+class Wrong(losses.FinalPositions):
+    def adjoint(self, end):
+        return np.zeros((7, 3)), np.zeros((7, 3))
 
-    problem = Problem(simulation, 5, Wrong(simulation.positions))
-    with pytest.raises(InputError, match=r"adjoint of positions has shape \(7, 3\)"):
-        problem.value_and_gradient(GRAVITY)
+
+def without_volume():
+    """A run of a scene in which particle 5 has none."""
+    simulation = Simulation(plane_of_three())
+    fractions = simulation.mass_fractions.copy()
+    fractions[5] = [3.0, -2.0, 0.0]
+    simulation.run(1, {"mass_fractions": fractions, "rest_density": [1000.0, 100.0, 1000.0]})
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 50, 1000])
@@ -176,31 +180,10 @@ def test_a_first_state_is_not_overwritten_by_the_next_evaluation(simulation):
 
 
 def test_without_steps_there_are_no_rows(simulation):
-    problem = Problem(simulation, 0, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    problem = Problem(simulation, 0, losses.FinalPositions(np.zeros((125, 3))))
     with pytest.raises(InputError, match=r"has shape \(0, 3\), but must be \(3,\) in"):
         problem.value({"gravity": np.zeros((0, 3))})
     assert not problem.value_and_gradient(GRAVITY)[1]["gravity"].any()
-
-
-def test_a_fingerprint_knows_the_free_energy():
-    scene, own = plane_of_three(), replace(MISCIBLE, name="own")
-    made = [Simulation(scene), Simulation(scene, free_energy=own), Simulation(scene, free_energy=MISCIBLE)]
-    assert len({Problem(s, 1, losses.FinalPositions(s.positions)).fingerprint for s in made}) == 3
-
-
-def test_a_particle_without_volume_is_a_sentence():
-    simulation = Simulation(plane_of_three())
-    fractions = simulation.mass_fractions.copy()
-    fractions[5] = [3.0, -2.0, 0.0]
-    with pytest.raises(InputError, match=r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"):
-        simulation.run(1, {"mass_fractions": fractions, "rest_density": [1000.0, 100.0, 1000.0]})
-
-
-def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
-    with pytest.raises(InputError, match=r"^free_energy is 'miscible', but must be a FreeEnergy"):
-        Simulation(plane_of_three(), free_energy="miscible")
-    with pytest.raises(InputError, match=r"must be left out, as the scene has only one phase\.$"):
-        Simulation(simulation.scene, free_energy=MISCIBLE)
 
 
 def test_a_forward_pass_is_gone_back_through_after_other_evaluations(problem, simulation):
@@ -222,16 +205,11 @@ def test_interleaved_evaluations_have_the_bits_of_evaluations_in_turn(make, esti
     """With other first states, numbers of diffusion substeps and lengths of loops."""
     made = make()
     simulation = made if isinstance(made, Simulation) else Simulation(made)
-    goal = np.zeros(simulation.dimension)
-    problem = Problem(simulation, 7, losses.CentreOfMass(goal), memory_budget=budget)
-    several = len(simulation.scene.phase) > 1
+    problem = Problem(simulation, 7, losses.CentreOfMass(np.zeros(simulation.dimension)), memory_budget=budget)
+    v, mu = simulation.velocities, simulation.parameters()["viscosity"]
     points = [
-        {
-            "initial_velocities": np.full_like(simulation.velocities, 0.1 * k),
-            "viscosity": np.full_like(simulation.parameters()["viscosity"], 0.05 + 0.1 * k),
-            "time_step": 0.001 + 0.0003 * k,
-            **({"mobility": 0.05 + 0.3 * k} if several else {}),
-        }
+        {"initial_velocities": 0.0 * v + 0.1 * k, "viscosity": 0.0 * mu + 0.05 + 0.1 * k, "time_step": 1e-3 + 3e-4 * k}
+        | ({"mobility": 0.05 + 0.3 * k} if len(simulation.scene.phase) > 1 else {})
         for k in range(3)
     ]
     wanted = [problem.value_and_gradient(point, estimator)[1] for point in points]
@@ -276,20 +254,11 @@ def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (
-            lambda it: Problem(it.simulation, 3),
-            r"^Problem is given no loss, but must be called as Problem",
-        ),
-        (
-            lambda it: cortado.optimise(it, {}, "adam"),
-            "^optimise is given no iterations, but must be called as",
-        ),
+        (lambda it: Problem(it.simulation, 3), r"^Problem is given no loss, but must be called as Problem"),
+        (lambda it: cortado.optimise(it, {}, "adam"), "^optimise is given no iterations, but must be called as"),
         (lambda it: cortado.certify(it, nmes=["gravity"]), "certify is called in a wrong way .* 'nmes'"),
         (lambda it: Simulation(), "^Simulation is given no scene, but must be called as Simulation"),
-        (
-            lambda it: cortado.forces.Body(k=1.0),
-            r"^Body is given no function, .* called as Body\(function, name, \*\*param",
-        ),
+        (lambda it: cortado.forces.Body(k=1.0), r"^Body is given no function, .* as Body\(function, name, \*\*param"),
         (lambda it: cortado.losses.SensorMatch(3), "^SensorMatch is given no target, but must be called as SensorM"),
         (lambda it: cortado.sensors.WaveGauge(rad=1.0), "^WaveGauge is given no position, but must be called as Wave"),
         (lambda it: cortado.measured.Tracks(), "^Tracks is given no simulation, but must be called as Tracks"),
@@ -298,9 +267,22 @@ def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
         (lambda it: it.simulation.run(number=3), "^Simulation.run is called in a wrong way .*'number'"),
         (lambda it: it.tangent({}), "^Problem.tangent is given no directions, but must be called as Problem.tangent"),
         (lambda it: cortado.load_scene(), "^load_scene is given no path, but must be called as load_scene"),
+        (
+            lambda it: Problem(it.simulation, 5, Wrong(it.simulation.positions)).value_and_gradient(GRAVITY),
+            r"adjoint of positions has shape \(7, 3\)",
+        ),
+        (lambda it: without_volume(), r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"),
+        (
+            lambda it: Simulation(plane_of_three(), free_energy="miscible"),
+            "^free_energy is .miscible., but must be a",
+        ),
+        (
+            lambda it: Simulation(splash(), free_energy=MISCIBLE),
+            r"left out, as the scene has only one phase\.$",
+        ),
     ],
 )
-def test_what_a_call_lacks_is_a_sentence(problem, call, said):
+def test_what_does_not_fit_is_a_sentence(problem, call, said):
     with pytest.raises(InputError, match=said):
         call(problem)
 

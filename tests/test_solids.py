@@ -9,47 +9,40 @@ from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.solids import (
-    BoxSolid,
-    CapsuleSolid,
-    CupSolid,
-    CylinderSolid,
-    PolygonSolid,
-    SphereSolid,
-    solids_of,
-)
+from cortado.scene.solids import BoxSolid, CapsuleSolid, CupSolid, CylinderSolid, PolygonSolid, SphereSolid, solids_of
 from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
-from scenes import pool
+from scenes import box, pool
 
+AT = {"name": "a", "base": [0.1, 0.2, 0.3], "radius": 0.4}
 SOLIDS = {
-    "rectangle": BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3),
-    "disc": SphereSolid(name="a", centre=[0.3, 0.2], radius=0.5),
-    "flat capsule": CapsuleSolid(name="a", start=[0.0, 0.0], end=[0.5, 0.8], radius=0.3),
-    "flat cup": CupSolid(name="a", base=[0.1, 0.2], radius=0.4, height=0.9, thickness=0.2, rotation=-0.4),
-    "polygon": PolygonSolid(name="a", corners=[[0.0, 0.0], [0.2, 0.9], [0.4, 0.3], [1.0, 0.1]], position=[0.5, 0.5]),
-    "box": BoxSolid(name="a", lower=[0.0, 0.1, 0.0], upper=[1.0, 0.6, 0.7], rotation=[0.3, -0.2, 0.5]),
-    "sphere": SphereSolid(name="a", centre=[0.3, 0.2, 0.1], radius=0.5),
-    "capsule": CapsuleSolid(name="a", start=[0.0, 0.0, 0.1], end=[0.5, 0.8, 0.3], radius=0.3),
-    "cylinder": CylinderSolid(
-        name="a", base=[0.1, 0.2, 0.3], radius=0.4, height=0.7, axis="x", rotation=[0.1, 0.0, 0.4]
+    "rectangle": (BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3), 0.5),
+    "disc": (SphereSolid(name="a", centre=[0.3, 0.2], radius=0.5), np.pi * 0.25),
+    "flat capsule": (
+        CapsuleSolid(name="a", start=[0.0, 0.0], end=[0.5, 0.8], radius=0.3),
+        np.pi * 0.09 + 0.6 * np.sqrt(0.89),
     ),
-    "cup": CupSolid(
-        name="a", base=[0.1, 0.2, 0.3], radius=0.4, height=0.9, thickness=0.2, axis="z", rotation=[0.5, 0.0, 0.0]
+    "flat cup": (
+        CupSolid(**{**AT, "base": [0.1, 0.2]}, height=0.9, thickness=0.2, rotation=-0.4),
+        1.2 * 0.9 - 0.8 * 0.7,
+    ),
+    "polygon": (
+        PolygonSolid(name="a", corners=[[0.0, 0.0], [0.2, 0.9], [0.4, 0.3], [1.0, 0.1]], position=[0.5, 0.5]),
+        0.28,
+    ),
+    "box": (BoxSolid(name="a", lower=[0.0, 0.1, 0.0], upper=[1.0, 0.6, 0.7], rotation=[0.3, -0.2, 0.5]), 0.35),
+    "sphere": (SphereSolid(name="a", centre=[0.3, 0.2, 0.1], radius=0.5), np.pi / 6.0),
+    "capsule": (
+        CapsuleSolid(name="a", start=[0.0, 0.0, 0.1], end=[0.5, 0.8, 0.3], radius=0.3),
+        np.pi * (0.036 + 0.09 * np.sqrt(0.93)),
+    ),
+    "cylinder": (CylinderSolid(**AT, height=0.7, axis="x", rotation=[0.1, 0.0, 0.4]), np.pi * 0.16 * 0.7),
+    "cup": (
+        CupSolid(**AT, height=0.9, thickness=0.2, axis="z", rotation=[0.5, 0.0, 0.0]),
+        np.pi * (0.36 * 0.9 - 0.16 * 0.7),
     ),
 }
-VOLUMES = {
-    "rectangle": 0.5,
-    "disc": np.pi * 0.25,
-    "flat capsule": np.pi * 0.09 + 0.6 * np.sqrt(0.89),
-    "flat cup": 1.2 * 0.9 - 0.8 * 0.7,
-    "polygon": 0.28,
-    "box": 0.35,
-    "sphere": np.pi / 6.0,
-    "capsule": np.pi * (0.036 + 0.09 * np.sqrt(0.93)),
-    "cylinder": np.pi * 0.16 * 0.7,
-    "cup": np.pi * (0.36 * 0.9 - 0.16 * 0.7),
-}
+"""Each with its area or its volume."""
 
 
 def volume_and_middle(faces):
@@ -78,16 +71,16 @@ def winding(points, faces):
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_a_shape_has_its_volume_and_its_middle(name):
-    table = SOLIDS[name]
+    table, area_or_volume = SOLIDS[name]
     volume, middle = volume_and_middle(table.body().faces(0.01))
-    assert volume == pytest.approx(VOLUMES[name], rel=2e-3)
+    assert volume == pytest.approx(area_or_volume, rel=2e-3)
     wanted = table.shape_about()[1] if table.position is None else table.position
     np.testing.assert_allclose(middle, wanted, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_distances_and_nearest_points_are_those_of_the_faces(name):
-    solid, random = SOLIDS[name].body(), np.random.default_rng(1)
+    solid, random = SOLIDS[name][0].body(), np.random.default_rng(1)
     lower, upper = solid.extent()
     d = len(lower)
     points = random.uniform(lower - 0.2, upper + 0.2, (300, d))
@@ -108,6 +101,17 @@ def scene(solids, dimension=2, kind="projection", spacing=0.05, **tables):
     solid = [{"name": f"solid {k}", **table} for k, table in enumerate(solids)]
     own = {"solver": {"kind": kind, "time_step": 0.001}, "solid": solid}
     return pool([0.4, 0.6, 0.5][:dimension], [1.0, 1.0, 0.5][:dimension], spacing, **{**own, **tables})
+
+
+def energies_of(run):
+    """Of a run, in each frame, over the mass."""
+    return (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
+
+
+def deepest(run, one):
+    """The least distance of a particle of a run from the solid of its scene [m], which is negative in it."""
+    (solid,) = solids_of(one.solid)
+    return min(solid.distance(x.astype(float)).min() for x in run.positions)
 
 
 PILLAR = {"shape": "box", "lower": [0.55, 0.0], "upper": [0.65, 0.3]}
@@ -177,42 +181,28 @@ def test_an_open_cup_with_a_solid_in_it_ends_at_its_rim():
 def test_a_dam_break_against_a_solid_gains_no_energy_and_does_not_enter_it(name, kind):
     one = scene([OBSTACLES[name]], kind=kind, spacing=0.025)
     run = Simulation(one, precision="float64").run(800, record_every=10)
-    energies = (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
-    assert energies.max() < 1.0005 * energies[0]
-    (solid,) = solids_of(one.solid)
-    assert min(solid.distance(x).min() for x in run.positions) > -0.6 * 0.025
+    energies = energies_of(run)
+    assert energies.max() < 1.0005 * energies[0] and deepest(run, one) > -0.6 * 0.025
     assert np.ptp(run.positions[-1][:, 0]) > 0.5  # it has moved
 
 
 @pytest.mark.parametrize("rotation", [0.0, 0.2, 0.785])
 def test_a_tank_may_be_turned(rotation):
     """A block falls into it; no wall is along the lattice."""
-    tank = {"shape": "box", "lower": [-0.6, -0.5], "upper": [0.6, 0.5], "rotation": rotation, "side": "inside"}
-    block = {"shape": "box", "lower": [-0.25, -0.2], "upper": [0.25, 0.2], "phase": "water"}
-    one = scene([tank], spacing=0.05, container={"shape": "none"}, fluid=[block])
+    tank = box([-0.6, -0.5], [0.6, 0.5], rotation=rotation, side="inside")
+    one = scene([tank], container={"shape": "none"}, fluid=[box([-0.25, -0.2], [0.25, 0.2], phase="water")])
     run = Simulation(one, precision="float64").run(1200, record_every=20)
-    energies = (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
-    assert np.diff(energies).max() < 1e-3 * (energies[0] - energies[-1])
-    (solid,) = solids_of(one.solid)
-    assert min(solid.distance(x).min() for x in run.positions) > 0.0
-
-
-CUP = {
-    "shape": "cup",
-    "base": [0.5, 0.1, 0.5],
-    "radius": 0.3,
-    "height": 0.6,
-    "thickness": 0.1,
-    "rotation": [0.1, 0, 0.2],
-}
+    energies = energies_of(run)
+    assert np.diff(energies).max() < 1e-3 * (energies[0] - energies[-1]) and deepest(run, one) > 0.0
 
 
 def test_a_cup_that_leans_holds_water():
+    cup = {"shape": "cup", "base": [0.5, 0.1, 0.5], "radius": 0.3, "height": 0.6, "thickness": 0.1}
     water = {"shape": "cylinder", "base": [0.5, 0.2, 0.5], "radius": 0.3, "height": 0.25, "phase": "water"}
-    one = scene([CUP], 3, fluid=[water], container={"shape": "none"}, solver={"kind": "projection", "time_step": 0.002})
+    tables = {"container": {"shape": "none"}, "solver": {"kind": "projection", "time_step": 0.002}}
+    one = scene([{**cup, "rotation": [0.1, 0, 0.2]}], 3, fluid=[water], **tables)
     run = Simulation(one).run(250, record_every=50)
-    (solid,) = solids_of(one.solid)
-    assert min(solid.distance(x.astype(float)).min() for x in run.positions) > -0.5 * 0.05
+    assert deepest(run, one) > -0.5 * 0.05
     assert run.positions[-1][:, 1].min() > 0.1  # nothing has fallen past it
 
 
@@ -230,15 +220,10 @@ def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
 @pytest.mark.parametrize("slips", [("no", "free"), ("free", "no")])
 def test_each_solid_has_its_own_slip(slips):
     """A layer of fluid between two plates that slides along them is held back by the one without slip."""
-    plates = [
-        {"shape": "box", "lower": [0.0, -0.2], "upper": [1.0, 0.0], "slip": slips[0]},
-        {"shape": "box", "lower": [0.0, 0.4], "upper": [1.0, 0.6], "slip": slips[1]},
-    ]
-    layer = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water", "velocity": [1.0, 0.0]}
     one = scene(
-        plates,
-        fluid=[layer],
-        container={"shape": "box", "lower": [0.0, -0.5], "upper": [1.0, 1.0], "periodic": [True, False]},
+        [box([0.0, low], [1.0, low + 0.2], slip=slip) for low, slip in zip((-0.2, 0.4), slips, strict=True)],
+        fluid=[box([0.0, 0.0], [1.0, 0.4], phase="water", velocity=[1.0, 0.0])],
+        container=box([0.0, -0.5], [1.0, 1.0], periodic=[True, False]),
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
         forces={"gravity": [0.0, 0.0]},
     )
@@ -252,8 +237,7 @@ def test_each_solid_has_its_own_slip(slips):
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 def test_gradients_beside_a_solid(kind):
     """Reverse and forward mode, and differences."""
-    one = scene([LEANING], kind=kind)
-    simulation = Simulation(one, precision="float64")
+    simulation = Simulation(scene([LEANING], kind=kind), precision="float64")
     moved = simulation.run(120)
     problem = Problem(simulation, 20, CentreOfMass([0.5, 0.3]))
     values = {"initial_positions": moved.positions[-1], "initial_velocities": moved.velocities[-1]}
@@ -275,6 +259,10 @@ def test_gradients_beside_a_solid(kind):
         ({"shape": "cup", "base": [0.5, 0.0], "radius": 0.2, "height": 0.1, "thickness": 0.2}, "less than height, 0.1"),
         ({"shape": "cone"}, "solid[0].shape is 'cone'"),
         ({**DISC, "centre": [1e12, 0.0]}, "m from the origin"),
+        *(
+            ({"shape": "polygon", "corners": [[0.1 * k, 0.3] for k in range(count)]}, "at least 3 entries, each a list")
+            for count in (0, 1, 2)
+        ),
     ],
 )
 def test_a_bad_solid_is_a_sentence(table, sentence):
@@ -306,12 +294,6 @@ def test_positions_in_a_solid_are_refused():
     places[3] = [0.6, 0.1]
     with pytest.raises(InputError, match="outside the container or in a solid"):
         simulation.run(1, {"initial_positions": places})
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_a_polygon_needs_three_corners(count):
-    with pytest.raises(SceneError, match="but must be a list of at least 3 entries, each a list"):
-        PolygonSolid(name="a", corners=[[0.1 * k, 0.3] for k in range(count)])
 
 
 # ---- thin walls ----------------------------------------------------------------------------------------------------
@@ -346,9 +328,8 @@ THICK = {
 
 @pytest.mark.parametrize("name", THIN)
 def test_a_solid_that_is_too_thin_to_hold_fluid_is_warned_of(name):
-    with pytest.warns(
-        CortadoWarning, match=r"the solid 'solid 0' is thinner than 0\.075 m, 1\.5 times the spacing, at"
-    ):
+    words = r"the solid 'solid 0' is thinner than 0\.075 m, 1\.5 times the spacing, at"
+    with pytest.warns(CortadoWarning, match=words):
         discretise(scene([THIN[name]]))
 
 
@@ -385,10 +366,9 @@ def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behin
     """At the same depths as one solid in the place of both, and about as heavy."""
     solids, upper = LININGS[name]
     whole = wall(1.5) if name == "of another" else wall(4.0)
-    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [upper, 1.0]}
 
     def layers(tables):
-        walls = discretise(scene(tables, container=room)).walls
+        walls = discretise(scene(tables, container=box([0.0, 0.0], [upper, 1.0]))).walls
         x, y = walls.positions.T
         beside = np.abs(y - 0.5) < 0.25
         return np.histogram(x[beside], [0.4, 0.43, 0.445, 0.5], weights=walls.weights[beside])[0]
@@ -396,18 +376,14 @@ def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behin
     np.testing.assert_allclose(layers(solids), layers([whole]), rtol=0.4)
 
 
-HOLDING = {
-    "lining": LININGS["of the container"],
-    "piston": ([{**wall(1.5), "motion": "path", "velocity": [-0.1, 0.0]}], 1.0),
-}
+PISTON = ([{**wall(1.5), "motion": "path", "velocity": [-0.1, 0.0]}], 1.0)
 
 
-@pytest.mark.parametrize("name", HOLDING)
+@pytest.mark.parametrize(("solids", "upper"), [LININGS["of the container"], PISTON], ids=["lining", "piston"])
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_linings_and_walls_that_move_hold_water_too(name):
-    solids, upper = HOLDING[name]
-    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [upper, 1.0]}
-    run = Simulation(scene(solids, container=room, solver={"kind": "projection", "time_step": "auto"})).run(80)
+def test_linings_and_walls_that_move_hold_water_too(solids, upper):
+    tables = {"container": box([0.0, 0.0], [upper, 1.0]), "solver": {"kind": "projection", "time_step": "auto"}}
+    run = Simulation(scene(solids, **tables)).run(80)
     assert run.positions[-1, :, 0].max() < 0.4 + 0.25 * 0.05
 
 

@@ -15,271 +15,14 @@ from cortado.optimisation.inverse.task import load_task, setup
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 
-
-@pytest.fixture
-def task_file(tmp_path):
-    path = tmp_path / "task.toml"
-    path.write_text(GOOD_TASK)
-    return path
-
-
-# ---- loading -----------------------------------------------------------------------------------------------------
-
-
-def test_a_task_keeps_what_its_file_says(task_file):
-    task = load_task(task_file)
-    assert task.scene.name == "tiny" and task.problem.steps == 5
-    np.testing.assert_array_equal(task.problem.target["gravity"], [1.5, -9.81])
-    np.testing.assert_array_equal(task.optimise.start["gravity"], [0.0, -7.0])
-    assert task.optimise.algorithm() == Adam(learning_rate=0.5) and task.optimise.iterations == 6
-    assert (task.optimise.check.loss_reduction, task.optimise.check.parameter_error) == (2.0, 0.5)
-
-
-def test_a_task_without_a_check_asks_for_nothing(task_file):
-    task_file.write_text(GOOD_TASK[: GOOD_TASK.index("[optimise.check]")].replace('optimiser = "adam"', ""))
-    task = load_task(task_file)
-    assert judge(task, result({"gravity": [900.0, 0.0]}, [1.0, 1.0])).failures == []
-    assert isinstance(task.optimise.algorithm(), Adam)
-
-
-def test_overrides_replace_values(task_file):
-    task = load_task(task_file, ["optimise.iterations=3", "problem.target.viscosity=0.1", "solver.time_step=0.001"])
-    assert (task.optimise.iterations, task.scene.solver.time_step) == (3, 0.001)
-    assert task.problem.target["viscosity"].shape == () and task.problem.target["viscosity"] == 0.1
-
-
-@pytest.mark.parametrize(
-    ("name", "wanted"),
-    [("adam", Adam(0.5)), ("gradient_descent", GradientDescent(0.5)), ("lbfgs", LBFGS(scale=0.5))],
-)
-def test_an_optimiser_is_chosen_by_name(task_file, name, wanted):
-    assert load_task(task_file, [f"optimise.optimiser={name}"]).optimise.algorithm() == wanted
-
-
-def test_a_tolerance_of_lbfgs(task_file):
-    task = load_task(task_file, ["optimise.optimiser=lbfgs", "optimise.tolerance=1e-5"])
-    assert task.optimise.algorithm() == LBFGS(scale=0.5, tolerance=1e-5)
-
-
-def test_gravity_may_change_with_time(task_file):
-    table = [[0.0, -float(step)] for step in range(5)]
-    task = load_task(task_file, [f"problem.target.gravity={table}", f"optimise.start.gravity={table}"])
-    np.testing.assert_array_equal(task.true_parameters["gravity"], table)
-    np.testing.assert_array_equal(task.start["gravity"], table)
-
-
-def test_a_few_rows_are_interpolated_to_one_for_each_step(task_file):
-    task = load_task(
-        task_file, ["problem.target.gravity=[[0,-9],[4,-5]]", "optimise.start.gravity=[[0,-7],[2,-7],[0,-5]]"]
-    )
-    np.testing.assert_allclose(
-        task.true_parameters["gravity"], [[0, -9], [1, -8], [2, -7], [3, -6], [4, -5]], atol=1e-15
-    )
-    np.testing.assert_allclose(task.start["gravity"], [[0, -7], [1, -7], [2, -7], [1, -6], [0, -5]], atol=1e-15)
-
-
-def test_a_tilt_is_a_parameter_over_time(task_file):
-    task_file.write_text(GOOD_TASK.replace("gravity", "tilt").replace("[1.5, -9.81]", "[[9.0], [-3.0]]"))
-    task = load_task(task_file, ["optimise.start.tilt=[[0],[0]]", "optimise.knots=2", "optimise.bounds.tilt=[-30,30]"])
-    np.testing.assert_allclose(task.true_parameters["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
-    assert task.start["tilt"].shape == (5, 1) and not task.start["tilt"].any()
-
-
-def test_what_may_be_left_out(task_file):
-    task = load_task(task_file)
-    assert (task.problem.loss, task.problem.frames, task.problem.picture) == ("positions", 1, None)
-    assert (task.optimise.knots, task.optimise.logarithmic, task.optimise.bounds) == (None, (), None)
-    assert task.folder == task_file.parent and task.problem.compared == [5]
-
-
-@pytest.mark.parametrize(
-    ("steps", "frames", "wanted"),
-    [(0, 1, [0]), (5, 1, [5]), (5, 2, [2, 5]), (6, 3, [2, 4, 6]), (7, 7, [*range(1, 8)]), (100, 4, [25, 50, 75, 100])],
-)
-def test_frames_are_spread_evenly_up_to_the_last(task_file, steps, frames, wanted):
-    task = load_task(task_file, [f"problem.steps={steps}", f"problem.frames={frames}"])
-    assert task.problem.compared == wanted
-
-
-def test_a_picture_needs_no_hidden_parameters(task_file):
-    task_file.write_text(GOOD_TASK.replace("target.gravity = [1.5, -9.81]", 'loss = "image"\npicture = "heart"'))
-    with pytest.raises(SceneError, match=r"parameter_error is 0\.5, but must be left out"):
-        load_task(task_file)
-    task_file.write_text(task_file.read_text().replace("parameter_error = 0.5", "psnr = 10.0"))
-    task = load_task(task_file)
-    assert (task.problem.loss, task.problem.picture, task.true_parameters) == ("image", "heart", {})
-    assert task.optimise.check.psnr == 10.0
-
-
-def test_options_of_the_search(task_file):
-    task = load_task(
-        task_file,
-        [
-            "problem.target.viscosity=0.1",
-            "optimise.start.viscosity=0.05",
-            "optimise.start.gravity=[[0,-7],[0,-8]]",
-            "optimise.knots=2",
-            'optimise.logarithmic=["viscosity"]',
-            "optimise.bounds.viscosity=[0.01,1]",
-            "optimise.bounds.gravity=[[-5,-20],[5,0]]",
-        ],
-    )
-    assert (task.optimise.knots, task.optimise.logarithmic) == (2, ("viscosity",))
-    np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
-
-
-SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
-SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"]
-ESTIMATORS = {
-    "exact": ([], gradients.Exact()),
-    "a fixed point": (['optimise.gradient.name="implicit_pressure"'], gradients.ImplicitPressure()),
-    "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
-    "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
-    "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
-    "averaged without position_noise": (
-        [*SMOOTHING, *SEVERAL, "optimise.gradient.position_noise=0"],
-        gradients.EnsembleMean({"gravity": 0.5}, 4, 0.0),
-    ),
-    "averaged without smoothing": (SEVERAL, gradients.EnsembleMean({"gravity": 0.5}, 4, estimator=gradients.Exact())),
-}
-
-
-@pytest.mark.parametrize(("overrides", "wanted"), ESTIMATORS.values(), ids=ESTIMATORS)
-def test_a_gradient_is_chosen_by_name(task_file, overrides, wanted):
-    assert load_task(task_file, overrides).optimise.gradient.estimator() == wanted
-
-
-def test_random_values_are_drawn_later(task_file):
-    places = np.full((64, 2), 0.1).tolist()
-    task = load_task(
-        task_file, [f"problem.target={{initial_positions={places}}}", 'optimise.start={initial_positions="random"}']
-    )
-    assert task.start == {"initial_positions": "random"}
-
-
-EXAMPLES = [
-    path
-    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.toml"))
-    if "[optimise]" in path.read_text("utf-8")
-]
-
-
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_a_task(path):
-    task = load_task(path)
-    assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
-
-
-# ---- bad tasks ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
-def test_a_bad_task_is_a_sentence(task_file, old, new, field):
-    assert old in GOOD_TASK
-    task_file.write_text(GOOD_TASK.replace(old, new, 1))
-    with one_sentence(error=SceneError) as caught:
-        load_task(task_file)
-    assert caught.value.field == field
-    assert str(caught.value).startswith(f"{task_file}: {field} ")
-
-
-def test_a_missing_file_is_a_sentence(tmp_path):
-    with one_sentence("cannot be read", error=SceneError):
-        load_task(tmp_path / "absent.toml")
-
-
-# ---- judging -----------------------------------------------------------------------------------------------------
-
-
-def result(parameters, losses):
-    """What an optimisation with these losses would give back."""
-    found = {name: np.asarray(value, dtype=float) for name, value in parameters.items()}
-    history = tuple(Record(k, k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
-    return Result(found, min(losses), found, history, len(losses) - 1, len(losses), "done", converged=False)
-
-
-TRUE, OFF = [1.5, -9.81], [3.0, 5.0]
-FELL = [4.0, 1.0]
-NOT_REACHED = [
-    "The loss fell 1.5 times, but the task asks for 2 times.",
-    "The parameter gravity is 20% off, but the task asks for 10%.",
-]
-JUDGED = {
-    "reached": ([], TRUE, [1.0, 0.25], 0.0, 4.0, []),
-    "not reached": (
-        ["problem.target.gravity=[3,4]", "optimise.check.parameter_error=0.1"],
-        *(OFF, [3.0, 4.0, 2.0], 0.2, 1.5, NOT_REACHED),
-    ),
-    "no loss": ([], TRUE, [0.0], 0.0, math.inf, []),
-    "no loss any more": ([], TRUE, [1.0, 0.0], 0.0, math.inf, []),
-    "distance from a hidden zero": (["problem.target.gravity=[0,0]"], [0.3, 0.4], FELL, 0.5, 4.0, None),
-    "target over time": ([f"problem.target.gravity={[[3.0, 4.0]] * 5}"], OFF, FELL, 0.2, 4.0, []),
-    "found over time": (["problem.target.gravity=[3,4]"], [OFF] * 5, FELL, 0.2, 4.0, []),
-    "a target that is not optimised": (["problem.target.viscosity=0.1"], TRUE, FELL, 0.0, 4.0, []),
-}
-
-
-@pytest.mark.parametrize(
-    ("overrides", "found", "losses", "error", "reduction", "failures"), JUDGED.values(), ids=JUDGED
-)
-def test_a_result_is_judged_as_its_task_asks(task_file, overrides, found, losses, error, reduction, failures):
-    task = load_task(task_file, overrides)
-    verdict = judge(task, result({"gravity": found}, losses))
-    assert verdict.errors == {"gravity": pytest.approx(error)} and verdict.reduction == reduction
-    assert failures is None or verdict.failures == failures
-    assert verdict.first == losses[0]
-    coordinates = judge(task, result({"gravity": [9.0, 9.0]}, losses), {"gravity": np.array(found)})
-    assert coordinates.errors == verdict.errors, "what is found is judged, not its coordinates"
-
-
-def test_an_image_is_judged_by_its_noise(task_file):
-    task_file.write_text(GOOD_TASK.replace("steps = 5", 'steps = 5\nloss = "image"'))
-    task, reached = load_task(task_file, ["optimise.check.psnr=30"]), result({"gravity": [1.5, -9.81]}, [4.0, 1.0])
-    assert judge(task, reached, noise=30.5).failures == []
-    assert judge(task, reached, noise=math.inf).psnr == math.inf
-    assert judge(task, reached, noise=29.5).failures == [
-        "The image is matched to 29.5 dB, but the task asks for 30 dB."
-    ]
-
-
-@pytest.mark.parametrize("table", ["problem", "optimise"])
-def test_a_misspelt_table_of_a_task_is_recognised(task_file, table):
-    task_file.write_text(GOOD_TASK.replace(f"[{table}", f"[{table}s"))
-    with pytest.raises(SceneError, match=rf"{table}s is not a key of the scene; did you mean {table}\?"):
-        load_task(task_file)
-
-
-@pytest.mark.parametrize("error, words", [(0.004, "found with an error of 0.4%"), (0.81, "not found, 81% off")])
-def test_what_is_far_off_is_not_called_found(error, words):
-    assert found_in_words(error).startswith(words)
-
-
-@pytest.mark.parametrize(
-    "override", ["optimise.start.mobilty=1", 'optimise.logarithmic=["mobilty"]', "problem.target.mobilty=1"]
-)
-def test_only_parameters_of_the_scene_are_offered(task_file, override):
-    with pytest.raises(SceneError, match="must be one of gravity, tilt, ") as caught:
-        load_task(task_file, [override])
-    said = str(caught.value)
-    assert "viscosity" in said and not any(word in said for word in ("flow_rate", "surface", "mass_fractions", "width"))
-
-
 TASK = """
 dimension = 2
 discretisation.spacing = 0.05
 container = {shape = "box", lower = [0.0, 0.0], upper = [1.0, 1.0], slip = "no"}
 solver = {kind = "projection", time_step = 0.001}
 
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 1.0
-
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.6, 0.4]
-phase = "water"
+phase = [{name = "water", rest_density = 1000.0, viscosity = 1.0}]
+fluid = [{shape = "box", lower = [0.0, 0.0], upper = [0.6, 0.4], phase = "water"}]
 
 [[solid]]
 name = "rotor"
@@ -308,11 +51,242 @@ iterations = 20
 """
 
 
-def test_a_task_searches_a_path_by_its_knots(tmp_path):
+@pytest.fixture
+def task_file(tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text(GOOD_TASK)
+    return path
+
+
+# ---- loading -----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_keeps_what_its_file_says(task_file):
+    task = load_task(task_file)
+    assert task.scene.name == "tiny" and task.problem.steps == 5
+    np.testing.assert_array_equal(task.problem.target["gravity"], [1.5, -9.81])
+    np.testing.assert_array_equal(task.optimise.start["gravity"], [0.0, -7.0])
+    assert task.optimise.algorithm() == Adam(learning_rate=0.5) and task.optimise.iterations == 6
+    assert (task.optimise.check.loss_reduction, task.optimise.check.parameter_error) == (2.0, 0.5)
+    assert (task.problem.loss, task.problem.frames, task.problem.picture) == ("positions", 1, None)
+    assert (task.optimise.knots, task.optimise.logarithmic, task.optimise.bounds) == (None, (), None)
+    assert task.folder == task_file.parent and task.problem.compared == [5]
+
+
+def test_a_task_without_a_check_asks_for_nothing(task_file):
+    task_file.write_text(GOOD_TASK[: GOOD_TASK.index("[optimise.check]")].replace('optimiser = "adam"', ""))
+    task = load_task(task_file)
+    assert judge(task, result({"gravity": [900.0, 0.0]}, [1.0, 1.0])).failures == []
+    assert isinstance(task.optimise.algorithm(), Adam)
+
+
+def test_overrides_replace_values(task_file):
+    task = load_task(task_file, ["optimise.iterations=3", "problem.target.viscosity=0.1", "solver.time_step=0.001"])
+    assert (task.optimise.iterations, task.scene.solver.time_step) == (3, 0.001)
+    assert task.problem.target["viscosity"].shape == () and task.problem.target["viscosity"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "wanted"),
+    [
+        ("adam", [], Adam(0.5)),
+        ("gradient_descent", [], GradientDescent(0.5)),
+        ("lbfgs", [], LBFGS(scale=0.5)),
+        ("lbfgs", ["optimise.tolerance=1e-5"], LBFGS(scale=0.5, tolerance=1e-5)),
+    ],
+)
+def test_an_optimiser_is_chosen_by_name(task_file, name, more, wanted):
+    assert load_task(task_file, [f"optimise.optimiser={name}", *more]).optimise.algorithm() == wanted
+
+
+ROWS = [[0.0, -float(step)] for step in range(5)]
+BETWEEN = [[0, -9], [1, -8], [2, -7], [3, -6], [4, -5]], [[0, -7], [1, -7], [2, -7], [1, -6], [0, -5]]
+
+
+@pytest.mark.parametrize(
+    ("target", "start", "wanted"),
+    [(ROWS, ROWS, (ROWS, ROWS)), ([[0, -9], [4, -5]], [[0, -7], [2, -7], [0, -5]], BETWEEN)],
+)
+def test_gravity_may_change_with_time(task_file, target, start, wanted):
+    """A few rows are interpolated to one for each step."""
+    task = load_task(task_file, [f"problem.target.gravity={target}", f"optimise.start.gravity={start}"])
+    found = task.true_parameters["gravity"], task.start["gravity"]
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
+
+
+def test_a_tilt_is_a_parameter_over_time(task_file):
+    task_file.write_text(GOOD_TASK.replace("gravity", "tilt").replace("[1.5, -9.81]", "[[9.0], [-3.0]]"))
+    task = load_task(task_file, ["optimise.start.tilt=[[0],[0]]", "optimise.knots=2", "optimise.bounds.tilt=[-30,30]"])
+    np.testing.assert_allclose(task.true_parameters["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
+    assert task.start["tilt"].shape == (5, 1) and not task.start["tilt"].any()
+
+
+@pytest.mark.parametrize(
+    ("steps", "frames", "wanted"),
+    [(0, 1, [0]), (5, 1, [5]), (5, 2, [2, 5]), (6, 3, [2, 4, 6]), (7, 7, [*range(1, 8)]), (100, 4, [25, 50, 75, 100])],
+)
+def test_frames_are_spread_evenly_up_to_the_last(task_file, steps, frames, wanted):
+    task = load_task(task_file, [f"problem.steps={steps}", f"problem.frames={frames}"])
+    assert task.problem.compared == wanted
+
+
+def test_a_picture_needs_no_hidden_parameters(task_file):
+    task_file.write_text(GOOD_TASK.replace("target.gravity = [1.5, -9.81]", 'loss = "image"\npicture = "heart"'))
+    with pytest.raises(SceneError, match=r"parameter_error is 0\.5, but must be left out"):
+        load_task(task_file)
+    task_file.write_text(task_file.read_text().replace("parameter_error = 0.5", "psnr = 10.0"))
+    task = load_task(task_file)
+    assert (task.problem.loss, task.problem.picture, task.true_parameters) == ("image", "heart", {})
+    assert task.optimise.check.psnr == 10.0
+
+
+def test_options_of_the_search(task_file):
+    overrides = ["problem.target.viscosity=0.1", "optimise.start.viscosity=0.05", "optimise.bounds.viscosity=[0.01,1]"]
+    overrides += ["optimise.start.gravity=[[0,-7],[0,-8]]", "optimise.bounds.gravity=[[-5,-20],[5,0]]"]
+    task = load_task(task_file, [*overrides, "optimise.knots=2", 'optimise.logarithmic=["viscosity"]'])
+    assert (task.optimise.knots, task.optimise.logarithmic) == (2, ("viscosity",))
+    np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
+
+
+SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
+SEVERAL, STILL = (
+    ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"],
+    "optimise.gradient.position_noise=0",
+)
+ESTIMATORS = {
+    "exact": ([], gradients.Exact()),
+    "a fixed point": (['optimise.gradient.name="implicit_pressure"'], gradients.ImplicitPressure()),
+    "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
+    "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
+    "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
+    "averaged in place": ([*SMOOTHING, *SEVERAL, STILL], gradients.EnsembleMean({"gravity": 0.5}, 4, 0.0)),
+    "averaged without smoothing": (SEVERAL, gradients.EnsembleMean({"gravity": 0.5}, 4, estimator=gradients.Exact())),
+}
+
+
+@pytest.mark.parametrize(("overrides", "wanted"), ESTIMATORS.values(), ids=ESTIMATORS)
+def test_a_gradient_is_chosen_by_name(task_file, overrides, wanted):
+    assert load_task(task_file, overrides).optimise.gradient.estimator() == wanted
+
+
+def test_random_values_are_drawn_later(task_file):
+    places = np.full((64, 2), 0.1).tolist()
+    overrides = [f"problem.target={{initial_positions={places}}}", 'optimise.start={initial_positions="random"}']
+    task = load_task(task_file, overrides)
+    assert task.start == {"initial_positions": "random"}
+
+
+FILES = sorted((Path(__file__).parents[1] / "examples").glob("*.toml"))
+EXAMPLES = [path for path in FILES if "[optimise]" in path.read_text("utf-8")]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_a_task(path):
+    task = load_task(path)
+    assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
+
+
+# ---- bad tasks ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
+def test_a_bad_task_is_a_sentence(task_file, old, new, field):
+    assert old in GOOD_TASK
+    task_file.write_text(GOOD_TASK.replace(old, new, 1))
+    with one_sentence(error=SceneError) as caught:
+        load_task(task_file)
+    assert caught.value.field == field
+    assert str(caught.value).startswith(f"{task_file}: {field} ")
+
+
+def test_a_missing_file_is_a_sentence(tmp_path):
+    with one_sentence("cannot be read", error=SceneError):
+        load_task(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD_TASK.replace("[problem", "[problems"), r"problems is not a key of the scene; did you mean problem\?"),
+        (GOOD_TASK.replace("[optimise", "[optimises"), r"optimises is not a key of the scene; did you mean optimise\?"),
+        (TASK.replace("rotor.turn", "rotor.turns"), r"'rotor\.turns' is unknown, but must be one of .*, rotor\.turn, "),
+    ],
+)
+def test_a_word_that_is_no_key_is_told_those_that_are(task_file, text, words):
+    task_file.write_text(text)
+    with pytest.raises(SceneError, match=words):
+        load_task(task_file)
+
+
+# ---- judging -----------------------------------------------------------------------------------------------------
+
+
+def result(parameters, losses):
+    """What an optimisation with these losses would give back."""
+    found = {name: np.asarray(value, dtype=float) for name, value in parameters.items()}
+    history = tuple(Record(k, k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
+    return Result(found, min(losses), found, history, len(losses) - 1, len(losses), "done", converged=False)
+
+
+TRUE, OFF = [1.5, -9.81], [3.0, 5.0]
+FELL, ASKED = [4.0, 1.0], "problem.target.gravity=[3,4]"
+NOT_REACHED = [
+    "The loss fell 1.5 times, but the task asks for 2 times.",
+    "The parameter gravity is 20% off, but the task asks for 10%.",
+]
+JUDGED = {
+    "reached": ([], TRUE, [1.0, 0.25], 0.0, 4.0, []),
+    "not reached": ([ASKED, "optimise.check.parameter_error=0.1"], OFF, [3.0, 4.0, 2.0], 0.2, 1.5, NOT_REACHED),
+    "no loss": ([], TRUE, [0.0], 0.0, math.inf, []),
+    "no loss any more": ([], TRUE, [1.0, 0.0], 0.0, math.inf, []),
+    "distance from a hidden zero": (["problem.target.gravity=[0,0]"], [0.3, 0.4], FELL, 0.5, 4.0, None),
+    "target over time": ([f"problem.target.gravity={[[3.0, 4.0]] * 5}"], OFF, FELL, 0.2, 4.0, []),
+    "found over time": ([ASKED], [OFF] * 5, FELL, 0.2, 4.0, []),
+    "a target that is not optimised": (["problem.target.viscosity=0.1"], TRUE, FELL, 0.0, 4.0, []),
+}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found", "losses", "error", "reduction", "failures"), JUDGED.values(), ids=JUDGED
+)
+def test_a_result_is_judged_as_its_task_asks(task_file, overrides, found, losses, error, reduction, failures):
+    task = load_task(task_file, overrides)
+    verdict = judge(task, result({"gravity": found}, losses))
+    assert verdict.errors == {"gravity": pytest.approx(error)} and verdict.reduction == reduction
+    assert failures is None or verdict.failures == failures
+    assert verdict.first == losses[0]
+    coordinates = judge(task, result({"gravity": [9.0, 9.0]}, losses), {"gravity": np.array(found)})
+    assert coordinates.errors == verdict.errors, "what is found is judged, not its coordinates"
+
+
+def test_an_image_is_judged_by_its_noise(task_file):
+    task_file.write_text(GOOD_TASK.replace("steps = 5", 'steps = 5\nloss = "image"'))
+    task, reached = load_task(task_file, ["optimise.check.psnr=30"]), result({"gravity": [1.5, -9.81]}, [4.0, 1.0])
+    assert judge(task, reached, noise=30.5).failures == []
+    assert judge(task, reached, noise=math.inf).psnr == math.inf
+    missed = "The image is matched to 29.5 dB, but the task asks for 30 dB."
+    assert judge(task, reached, noise=29.5).failures == [missed]
+
+
+@pytest.mark.parametrize("error, words", [(0.004, "found with an error of 0.4%"), (0.81, "not found, 81% off")])
+def test_what_is_far_off_is_not_called_found(error, words):
+    assert found_in_words(error).startswith(words)
+
+
+@pytest.mark.parametrize(
+    "override", ["optimise.start.mobilty=1", 'optimise.logarithmic=["mobilty"]', "problem.target.mobilty=1"]
+)
+def test_only_parameters_of_the_scene_are_offered(task_file, override):
+    with pytest.raises(SceneError, match="must be one of gravity, tilt, ") as caught:
+        load_task(task_file, [override])
+    said = str(caught.value)
+    assert "viscosity" in said and not any(word in said for word in ("flow_rate", "surface", "mass_fractions", "width"))
+
+
+def test_a_task_searches_a_path_by_its_knots(task_file):
     """Also one of numbers, and a knot is where the solid is at the end of its step; and how large the solid is."""
-    file = tmp_path / "task.toml"
-    file.write_text(TASK)
-    made = setup(load_task(file), "cpu", "float64")
+    task_file.write_text(TASK)
+    made = setup(load_task(task_file), "cpu", "float64")
     assert made.start["rotor.displacement"].shape == (3, 2) and made.start["rotor.turn"].shape == (3,)
     assert made.start["rotor.scale"] == 1.0
     found = optimise(made.search, made.start, optimiser="lbfgs", iterations=8, bounds=made.bounds)
@@ -320,10 +294,3 @@ def test_a_task_searches_a_path_by_its_knots(tmp_path):
     knots = knot_values(made, found.parameters, made.search.parameters(found.parameters))
     np.testing.assert_allclose(knots["rotor.turn"].times, [0.001, 0.0055, 0.01], rtol=1e-12)
     np.testing.assert_allclose(knots["rotor.turn"].true, [0.0, 0.025, 0.05], atol=1e-12)
-
-
-def test_a_task_offers_what_its_solids_have(tmp_path):
-    file = tmp_path / "task.toml"
-    file.write_text(TASK.replace("rotor.turn", "rotor.turning"))
-    with pytest.raises(SceneError, match=r"'rotor\.turning' is unknown, but must be one of .*, rotor\.turn, "):
-        load_task(file)
