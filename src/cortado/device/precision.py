@@ -1,5 +1,8 @@
-"""The two floating-point precisions: scalar, vector and NumPy types that belong together; roots and reciprocals."""
+"""The two floating-point precisions: scalar, vector and NumPy types that belong together; roots and reciprocals; and
+types of parameters by their names.
+"""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -60,6 +63,45 @@ def precision_named(name: str) -> Precision:
         if isinstance(name, str) and precision.name == name:
             return precision
     raise InputError(f'precision is {shown(name)}, but must be "float32" or "float64".')
+
+
+class TypesByName:
+    """The types of names that many functions of Warp share, so that each is told once, and not at every parameter.
+
+        typed = TypesByName(real, {vector: "x v", neighbourhood: "s"})
+
+        @fluid_sum(discretisation)
+        @typed
+        def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
+
+    A parameter without a type has that of the longest of these names with which its words begin, as those of x_dot_ij
+    begin with x. One that begins with none of them is a number."""
+
+    def __init__(self, real: Any, names: Mapping[Any, str] | None = None):
+        """Take the type of numbers, and words that are names of each other type."""
+        self._real = real
+        self._types = {name: kind for kind, words in (names or {}).items() for name in words.split()}
+
+    def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Give types to the parameters of a function."""
+        return self._give(function, lambda kind: kind)
+
+    def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Give types to the parameters of a kernel: those without a type are arrays of entries, or Warp's structs, and
+        those that a kernel writes come last."""
+        return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
+
+    def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
+        given = function.__annotations__
+        names = function.__code__.co_varnames[: function.__code__.co_argcount]
+        types = {name: given[name] if name in given else whole(self._of(name)) for name in names}
+        function.__annotations__ = types | given
+        return function
+
+    def _of(self, name: str) -> Any:
+        while name and name not in self._types:
+            name = name.rpartition("_")[0]
+        return self._types.get(name, self._real)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.modules import kernel_module
-from cortado.device.precision import FLOAT64
+from cortado.device.precision import FLOAT64, TypesByName
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 
@@ -149,20 +149,11 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         counts[i] = count
         sums[i] = total
 
+    typed = TypesByName(real, {wp.bool: "free", wp.int32: "starts ends listed", vector: "moves"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def linearise(
-        around: Around,
-        free: wp.array(dtype=wp.bool),
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        listed: wp.array(dtype=wp.int32),
-        close: real,
-        # in and out
-        sums: wp.array(dtype=real),
-        equations: Equations,
-        # out
-        distances: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def linearise(around: Around, free, starts, ends, listed, close: real, sums, equations: Equations, distances):
         """Add up the weighted kernels of points ``listed`` between ``starts`` and ``ends``. Behind the pairs of the
         particles before it, each particle appends its own to the equations, if one of them is free; and the distances
         of pairs nearer than ``close`` [m]."""
@@ -201,13 +192,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
         equations.close_starts[i + 1] = close_place
 
     @wp.kernel(module=module, enable_backward=False)
-    def multiply(
-        equations: Equations,
-        moves: wp.array(dtype=vector),
-        # in and out
-        changes: wp.array(dtype=real),
-        approaches: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def multiply(equations: Equations, moves, changes, approaches):
         """Add the changes of sums of kernels and distances by the particles' moves."""
         i = wp.tid()
         move = moves[i]
@@ -222,13 +208,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> PackingKernels:
             approaches[k] = wp.dot(equations.directions[k], move - moves[equations.close_others[k]])
 
     @wp.kernel(module=module, enable_backward=False)
-    def multiply_back(
-        equations: Equations,
-        changes: wp.array(dtype=real),
-        approaches: wp.array(dtype=real),
-        # in and out
-        moves: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def multiply_back(equations: Equations, changes, approaches, moves):
         """Add the product of changes and approaches with the transposed derivatives to the moves."""
         i = wp.tid()
         change = changes[i]

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 
 FAR = wp.constant(1.0e30)
 
@@ -53,16 +53,11 @@ def environment_kernels(precision: Precision) -> Any:
         c, s = wp.cos(angle), wp.sin(angle)
         return vector(c * r[0] - s * r[1], s * r[0] + c * r[1], r[2])
 
+    typed = TypesByName(real, {vector: "r period frequency x", wp.int32: "chosen step", wp.float64: "value"})
+
     @wp.func
-    def outside(
-        r: vector,
-        angle: real,
-        period: vector,
-        frequency: vector,
-        b: int,
-        lower: wp.array2d(dtype=vector),
-        upper: wp.array2d(dtype=vector),
-    ):
+    @typed
+    def outside(r, angle, period, frequency, b: int, lower: wp.array2d(dtype=vector), upper: wp.array2d(dtype=vector)):
         """Return the place of a particle's image in the frame of the boxes, and the vector to it from the nearest point
         of the nearest box."""
         place, found, least = vector(), vector(), real(FAR)
@@ -126,15 +121,8 @@ def environment_kernels(precision: Precision) -> Any:
         turn_bar[i] = g[0] * y[1] - g[1] * y[0]
 
     @wp.kernel(module=module, enable_backward=False)
-    def apart(
-        per: int,
-        period: vector,
-        frequency: vector,
-        chosen: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        # out
-        value: wp.array2d(dtype=wp.float64),
-    ):
+    @typed.arrays
+    def apart(per: int, period: vector, frequency: vector, chosen, x, value: wp.array2d(dtype=wp.float64)):
         """Write for each of some particles the sum of its distances |dx| + |dy| + |dz| to all of them, by the nearest
         images."""
         b, p = wp.tid()
@@ -145,16 +133,8 @@ def environment_kernels(precision: Precision) -> Any:
         value[b, p] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def apart_adjoint(
-        per: int,
-        period: vector,
-        frequency: vector,
-        factor: wp.array(dtype=real),
-        chosen: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        # out
-        x_bar: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def apart_adjoint(per: int, period: vector, frequency: vector, factor, chosen, x, x_bar):
         b, p = wp.tid()
         i = b * per + chosen[p]
         total = vector()
@@ -168,15 +148,8 @@ def environment_kernels(precision: Precision) -> Any:
         x_bar[i] += real(2.0) * factor[b] * total
 
     @wp.kernel(module=module, enable_backward=False)
-    def missed(
-        per: int,
-        step: wp.array(dtype=wp.int32),
-        target: wp.array2d(dtype=vector),
-        weight: wp.array2d(dtype=real),
-        x: wp.array(dtype=vector),
-        # out
-        value: wp.array(dtype=wp.float64),
-    ):
+    @typed.arrays
+    def missed(per: int, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, value):
         """Write each particle's weighted squared distance to its own target; targets change from step to step."""
         i = wp.tid()
         k, p = step[i // per], i % per
@@ -184,15 +157,9 @@ def environment_kernels(precision: Precision) -> Any:
         value[i] = wp.float64(weight[k, p] * wp.dot(r, r))
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def missed_adjoint(
-        per: int,
-        factor: wp.array(dtype=real),
-        step: wp.array(dtype=wp.int32),
-        target: wp.array2d(dtype=vector),
-        weight: wp.array2d(dtype=real),
-        x: wp.array(dtype=vector),
-        # out
-        x_bar: wp.array(dtype=vector),
+        per: int, factor, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, x_bar
     ):
         i = wp.tid()
         k, p = step[i // per], i % per

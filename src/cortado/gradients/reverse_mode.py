@@ -12,6 +12,7 @@ import warp as wp
 
 from cortado.arrays import as_number, is_whole
 from cortado.device.lanes import lane_functions
+from cortado.device.precision import TypesByName
 from cortado.errors import InputError, shown
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
@@ -49,27 +50,17 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         """Return the squared strain rate gamma_i^2 as a sum over neighbours."""
         return weight(x_ij, s) / wp.max(most_i, most_j) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
 
+    typed = TypesByName(real, {vector: "x a b v", neighbourhood: "s", wp.vec2d: "found squares sums"})
+
     @fluid_sum(discretisation)
-    def exchange(
-        x_ij: vector,
-        most_i: real,
-        most_j: real,
-        strengths_i: real,
-        strengths_j: real,
-        a_ij: vector,
-        b_ij: vector,
-        s: neighbourhood,
-    ) -> tuple[vector, vector]:
+    @typed
+    def exchange(x_ij, most_i, most_j, strengths_i, strengths_j, a_ij, b_ij, s) -> tuple[vector, vector]:
         share = wp.max(strengths_i, strengths_j) * (weight(x_ij, s) / wp.max(most_i, most_j))
         return share * a_ij, share * b_ij
 
     @wp.kernel(module=module, enable_backward=False)
-    def crowd(
-        s: neighbourhood,
-        x: wp.array(dtype=vector),
-        # out
-        most: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def crowd(s, x, most):
         """Write max(S_i, W(h / 2)) with the sum S_i of weights over neighbours."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
@@ -78,16 +69,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
 
     @wp.kernel(module=module, enable_backward=False)
-    def strength(
-        s: neighbourhood,
-        coefficient: real,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        most: wp.array(dtype=real),
-        # out
-        strengths: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def strength(s, coefficient: real, time_step, x, v, most, strengths):
         """Write the strength s_i of the viscosity for sorted particles, from sorted arguments."""
         i = s.first + wp.tid() // LANES
         total = strain(i, x, v, most, s)
@@ -96,31 +79,15 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         strengths[i] = wp.min(coefficient * time_step[i // s.particles] * wp.sqrt(total), strongest)
 
     @wp.kernel(module=module, enable_backward=False)
-    def sort(
-        order: wp.array(dtype=wp.int32),
-        a: wp.array(dtype=vector),
-        b: wp.array(dtype=vector),
-        # out
-        a_sorted: wp.array(dtype=vector),
-        b_sorted: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def sort(order: wp.array(dtype=wp.int32), a, b, a_sorted, b_sorted):
         i = wp.tid()
         a_sorted[i] = a[order[i]]
         b_sorted[i] = b[order[i]]
 
     @wp.kernel(module=module, enable_backward=False)
-    def viscosity(
-        s: neighbourhood,
-        order: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        most: wp.array(dtype=real),
-        strengths: wp.array(dtype=real),
-        a_sorted: wp.array(dtype=vector),
-        b_sorted: wp.array(dtype=vector),
-        # out
-        a: wp.array(dtype=vector),
-        b: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def viscosity(s, order: wp.array(dtype=wp.int32), x, most, strengths, a_sorted, b_sorted, a, b):
         """Blend two fields of an adjoint at once, written in the scene's order."""
         i = s.first + wp.tid() // LANES
         a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
@@ -130,12 +97,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         b[order[i]] = b_sorted[i] - b_total
 
     @wp.kernel(module=module, enable_backward=False)
-    def squares(
-        a: wp.array(dtype=vector),
-        b: wp.array(dtype=vector),
-        # out
-        found: wp.array(dtype=wp.vec2d),
-    ):
+    @typed.arrays
+    def squares(a, b, found):
         """Write |a_i|^2 and |b_i|^2 in float64, as adjoints may have squares beyond float32."""
         i = wp.tid()
         a_i = wp.vec3d(a[i])
@@ -143,16 +106,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
         found[i] = wp.vec2d(wp.dot(a_i, a_i), wp.dot(b_i, b_i))
 
     @wp.kernel(module=module, enable_backward=False)
-    def limit(
-        times: wp.float64,
-        particles: int,
-        squares: wp.array(dtype=wp.vec2d),
-        sums: wp.array(dtype=wp.vec2d),
-        strengths: wp.array(dtype=real),
-        # in and out
-        a: wp.array(dtype=vector),
-        b: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def limit(times: wp.float64, particles: int, squares, sums, strengths, a, b):
         """Limit a and b, given their ``squares`` by particle, their ``sums`` over each scene, and the sum of the
         viscosity's strengths: a flow without strain is not limited."""
         i = wp.tid()

@@ -13,7 +13,7 @@ from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
 from cortado.calls import fixed
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import TreeReduction, sum_of
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
@@ -32,25 +32,18 @@ def matching_kernels(precision: Precision) -> tuple[Any, Any]:
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
 
+    typed = TypesByName(real, {vector: "x target bar", wp.float64: "squares"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def squared_distance(
-        x: wp.array(dtype=vector),
-        target: wp.array(dtype=vector),
-        # out
-        squares: wp.array(dtype=wp.float64),
-    ):
+    @typed.arrays
+    def squared_distance(x, target, squares):
         i = wp.tid()
         miss = wp.vec3d(x[i] - target[i % target.shape[0]])
         squares[i] = wp.dot(miss, miss)
 
     @wp.kernel(module=module, enable_backward=False)
-    def difference(
-        factor: real,
-        x: wp.array(dtype=vector),
-        target: wp.array(dtype=vector),
-        # out
-        bar: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def difference(factor: real, x, target, bar):
         i = wp.tid()
         bar[i] = factor * (x[i] - target[i % target.shape[0]])
 

@@ -23,7 +23,7 @@ import warp as wp
 from cortado.device.launching import launch
 from cortado.device.memory import field_parts, picture_parts, require, sample_parts
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
 from cortado.render.cameras import Camera
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
@@ -97,17 +97,11 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         """Return the diagonal vector of one cell [m]."""
         return vector(nodes.cell, nodes.cell, nodes.cell)
 
+    typed = TypesByName(real, {camera_struct: "camera", nodes_struct: "nodes", vector: "image", wp.vec2i: "spans"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def march(
-        camera: camera_struct,
-        nodes: nodes_struct,
-        thickness: real,
-        background: vector,
-        field: wp.array3d(dtype=rgba),
-        # out
-        image: wp.array(dtype=vector),
-        spans: wp.array(dtype=wp.vec2i),
-    ):
+    @typed.arrays
+    def march(camera, nodes, thickness: real, background: vector, field: wp.array3d(dtype=rgba), image, spans):
         """Write the image of a field, and as ``spans`` the range of samples of each ray that may lie in the field."""
         pixel = wp.tid()
         o = start(pixel, camera)
@@ -207,14 +201,8 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         pose_bar[pixel] = pose(push[0], push[1], push[2], turn[0], turn[1], turn[2])
 
     @wp.kernel(module=module, enable_backward=False)
-    def gather(
-        camera: camera_struct,
-        nodes: nodes_struct,
-        spans: wp.array(dtype=wp.vec2i),
-        samples_bar: wp.array2d(dtype=rgba),
-        # out
-        field_bar: wp.array3d(dtype=rgba),
-    ):
+    @typed.arrays
+    def gather(camera, nodes, spans, samples_bar: wp.array2d(dtype=rgba), field_bar: wp.array3d(dtype=rgba)):
         """Sum each node's adjoint from the samples in the eight cells around it, found by way of the screen."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)

@@ -22,7 +22,7 @@ from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.memory import field_parts, require
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
@@ -110,47 +110,28 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
     colours_matrix = colours_type(precision, phases)
     module = kernel_module(f"phase_colour_{phases}_{precision.name}")
 
+    kinds = {colours_matrix: "colours", wp.int32: "order", vector: "x colour", fractions: "c"}
+    typed = TypesByName(precision.real, kinds)
+
     @wp.kernel(module=module, enable_backward=False)
-    def phase_colour(
-        colours: wp.array(dtype=colours_matrix),
-        order: wp.array(dtype=wp.int32),
-        x_scene: wp.array(dtype=vector),
-        c_scene: wp.array(dtype=fractions),
-        # out
-        x: wp.array(dtype=vector),
-        colour: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def phase_colour(colours, order, x_scene, c_scene, x, colour):
         i = wp.tid()
         j = order[i]
         x[i] = x_scene[j]
         colour[i] = wp.transpose(colours[0]) * c_scene[j]
 
     @wp.kernel(module=module, enable_backward=False)
-    def phase_colour_tangent(
-        colours: wp.array(dtype=colours_matrix),
-        order: wp.array(dtype=wp.int32),
-        c_scene: wp.array(dtype=fractions),
-        x_scene_dot: wp.array(dtype=vector),
-        c_scene_dot: wp.array(dtype=fractions),
-        colours_dot: wp.array(dtype=colours_matrix),
-        # out
-        x_dot: wp.array(dtype=vector),
-        colour_dot: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def phase_colour_tangent(colours, order, c_scene, x_scene_dot, c_scene_dot, colours_dot, x_dot, colour_dot):
         i = wp.tid()
         j = order[i]
         x_dot[i] = x_scene_dot[j]
         colour_dot[i] = wp.transpose(colours[0]) * c_scene_dot[j] + wp.transpose(colours_dot[0]) * c_scene[j]
 
     @wp.kernel(module=module, enable_backward=False)
-    def phase_colour_adjoint(
-        colours: wp.array(dtype=colours_matrix),
-        c_scene: wp.array(dtype=fractions),
-        colour_scene_bar: wp.array(dtype=vector),
-        # out
-        c_scene_bar: wp.array(dtype=fractions),
-        colours_bar: wp.array(dtype=colours_matrix),
-    ):
+    @typed.arrays
+    def phase_colour_adjoint(colours, c_scene, colour_scene_bar, c_scene_bar, colours_bar):
         """Write the adjoint of mass fractions, and particle by particle that of the phase colours."""
         j = wp.tid()
         bar = colour_scene_bar[j]
@@ -172,18 +153,12 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     place, nearest, image = node_functions(precision)
     module = discretisation.module(False, "colour_field")
 
+    typed = TypesByName(real, {vector: "x colour", nodes_struct: "nodes", grid_type: "grid"})
+
     @wp.func
+    @typed
     def row_sum(
-        row: int,
-        c_x: int,
-        x_g: vector,
-        x: wp.array(dtype=vector),
-        colour: wp.array(dtype=vector),
-        nodes: nodes_struct,
-        grid: grid_type,
-        h: real,
-        per_h: real,
-        sigma: real,
+        row: int, c_x: int, x_g, x: wp.array(dtype=vector), colour: wp.array(dtype=vector), nodes, grid, h, per_h, sigma
     ) -> rgba:
         """Return a node's sum over the particles of cells c_x - 1, c_x and c_x + 1 of one row."""
         n = grid.shape[0]
@@ -197,17 +172,9 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
         return total
 
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def colour_field(
-        nodes: nodes_struct,
-        grid: grid_type,
-        h: real,
-        per_h: real,
-        sigma: real,
-        volume: real,
-        x: wp.array(dtype=vector),
-        colour: wp.array(dtype=vector),
-        # out
-        field: wp.array3d(dtype=rgba),
+        nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, field: wp.array3d(dtype=rgba)
     ):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)

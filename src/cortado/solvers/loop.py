@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_and_maximum
 from cortado.particles.state import Layout
 from cortado.solvers.containment import NO_PARTICLE, Containment
@@ -72,18 +72,12 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
 
     reached = root_of_mean if measure.is_weighted else average_and_maximum
 
+    typed = TypesByName(real, {pair: "sums", wp.int32: "iteration rounds active bad step count"})
+
     @wp.kernel(module=module, enable_backward=False)
+    @typed.arrays
     def decide(
-        done: int,
-        most: int,
-        particles: int,
-        tolerance: real,
-        greatest_tolerance: real,
-        sums: wp.array(dtype=pair),
-        # in and out
-        iteration: wp.array(dtype=wp.int32),
-        rounds: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
+        done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
         """Decide which scenes go on iterating: add ``done`` iterations to their counts, set ``rounds`` where the error
         is below the tolerances, and count the other scenes in ``active``."""
@@ -136,21 +130,13 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Con
             end_step(b, bad, bad_step, step)
 
     @wp.kernel(module=module, enable_backward=False)
-    def count_step(
-        bad: wp.array(dtype=wp.int32),
-        # in and out
-        bad_step: wp.array(dtype=wp.int32),
-        step: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def count_step(bad, bad_step, step):
         end_step(wp.tid(), bad, bad_step, step)
 
     @wp.kernel(module=module, enable_backward=False)
-    def note(
-        count: wp.array(dtype=wp.int32),
-        step: wp.array(dtype=wp.int32),
-        # out
-        iterations: wp.array2d(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def note(count, step, iterations: wp.array2d(dtype=wp.int32)):
         b = wp.tid()
         iterations[step[b], b] = count[b]
 

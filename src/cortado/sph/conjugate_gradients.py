@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.device.precision import FLOAT32, Precision
+from cortado.device.precision import FLOAT32, Precision, TypesByName
 from cortado.device.reduction import type_name
 from cortado.particles.state import Layout
 from cortado.sph.parts import StepContext
@@ -42,30 +42,19 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
     module = kernel_module(f"conjugate_gradients_{type_name(kind)}")
     square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
 
+    typed = TypesByName(real, {kind: "r p y product", wp.int32: "count going active"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def begin(
-        w: wp.array(dtype=real),
-        r: wp.array(dtype=kind),
-        # out
-        p: wp.array(dtype=kind),
-        y: wp.array(dtype=kind),
-        share: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def begin(w, r, p, y, share):
         i = wp.tid()
         p[i] = r[i]
         y[i] = kind(real(0.0))
         share[i] = w[i] * square(r[i])
 
     @wp.kernel(module=module, enable_backward=False)
-    def start(
-        total: wp.array(dtype=real),
-        # out
-        first: wp.array(dtype=real),
-        size: wp.array(dtype=real),
-        count: wp.array(dtype=wp.int32),
-        going: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def start(total, first, size, count, going, active):
         """Begin the solve of each scene that has a residual; ``active`` becomes the number of scenes that go on."""
         b = wp.tid()
         first[b] = total[b]
@@ -77,20 +66,8 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
             wp.atomic_add(active, 0, 1)
 
     @wp.kernel(module=module, enable_backward=False)
-    def descend(
-        particles: int,
-        going: wp.array(dtype=wp.int32),
-        size: wp.array(dtype=real),
-        curvature: wp.array(dtype=real),
-        w: wp.array(dtype=real),
-        p: wp.array(dtype=kind),
-        product: wp.array(dtype=kind),
-        # in and out
-        y: wp.array(dtype=kind),
-        r: wp.array(dtype=kind),
-        # out
-        share: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def descend(particles: int, going, size, curvature, w, p, product, y, r, share):
         i = wp.tid()
         b = i // particles
         if going[b] == 0:
@@ -102,32 +79,16 @@ def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
         share[i] = w[i] * square(left)
 
     @wp.kernel(module=module, enable_backward=False)
-    def turn(
-        particles: int,
-        going: wp.array(dtype=wp.int32),
-        size: wp.array(dtype=real),
-        total: wp.array(dtype=real),
-        r: wp.array(dtype=kind),
-        # in and out
-        p: wp.array(dtype=kind),
-    ):
+    @typed.arrays
+    def turn(particles: int, going, size, total, r, p):
         i = wp.tid()
         b = i // particles
         if going[b] == 1:
             p[i] = r[i] + (total[b] / size[b]) * p[i]
 
     @wp.kernel(module=module, enable_backward=False)
-    def decide(
-        tolerance: real,
-        most: int,
-        total: wp.array(dtype=real),
-        first: wp.array(dtype=real),
-        # in and out
-        size: wp.array(dtype=real),
-        count: wp.array(dtype=wp.int32),
-        going: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-    ):
+    @typed.arrays
+    def decide(tolerance: real, most: int, total, first, size, count, going, active):
         b = wp.tid()
         if going[b] == 0:
             return

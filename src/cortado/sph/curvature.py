@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
@@ -244,18 +244,13 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         turn = e_j - e_i
         return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(turn, g), even_terms(turn, g)
 
+    typed = TypesByName(real, {vector: "x e", neighbourhood: "s", matrix: "B D"})
+
     @tangent_of(bend)
     @fluid_sum(discretisation, ahead=False)
+    @typed
     def bend_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        e_i: vector,
-        e_j: vector,
-        e_dot_i: vector,
-        e_dot_j: vector,
-        w_j: real,
-        w_dot_j: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, e_i, e_j, e_dot_i, e_dot_j, w_j, w_dot_j, s
     ) -> tuple[vector, vector, vector, vector]:
         """Return a pair's tangents of B and D; g x^T is symmetric, and so is the sum of its tangent's two terms."""
         g = (s.volume * w_j) * gradient(x_ij, s)
@@ -269,18 +264,8 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         )
 
     @fluid_sum(discretisation)
-    def bend_back(
-        x_ij: vector,
-        e_i: vector,
-        e_j: vector,
-        w_i: real,
-        w_j: real,
-        B_bar_i: matrix,
-        B_bar_j: matrix,
-        D_bar_i: matrix,
-        D_bar_j: matrix,
-        s: neighbourhood,
-    ) -> tuple[vector, real, vector]:
+    @typed
+    def bend_back(x_ij, e_i, e_j, w_i, w_j, B_bar_i, B_bar_j, D_bar_i, D_bar_j, s) -> tuple[vector, real, vector]:
         """Return a pair's adjoints of e, w and x; in the sums of i it has w_j, in those of j w_i as a factor."""
         g, turn = s.volume * gradient(x_ij, s), e_j - e_i
         moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
@@ -303,18 +288,8 @@ def curvature_sums(discretisation: Discretisation) -> CurvatureSums:
         return W_dot * c_j + W * c_dot_j, W_dot * w_j + W * w_dot_j
 
     @fluid_sum(discretisation)
-    def mean_back(
-        x_ij: vector,
-        c_i: real,
-        c_j: real,
-        w_i: real,
-        w_j: real,
-        a_i: real,
-        a_j: real,
-        b_i: real,
-        b_j: real,
-        s: neighbourhood,
-    ) -> tuple[real, real, vector]:
+    @typed
+    def mean_back(x_ij, c_i, c_j, w_i, w_j, a_i, a_j, b_i, b_j, s) -> tuple[real, real, vector]:
         W, both = s.volume * weight(x_ij, s), a_i * c_j + a_j * c_i + b_i * w_j + b_j * w_i
         return W * a_j, W * b_j, (s.volume * both) * gradient(x_ij, s)
 

@@ -30,7 +30,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.curvature import curvature_functions, curvature_sums
@@ -202,17 +202,12 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     own = curvature_functions(precision, dimension, module)
     normal_back, curvature_of, outermost = own.normal_back, own.curvature, own.outermost
 
+    typed = TypesByName(real, {vector: "q acceleration x e", matrix: "B D", neighbourhood: "s"})
+
     @particle_kernel(module, "+m_bar +surface_tension_bar q_bar w_bar a_bar b_bar", numbers=["depth", "per_width"])
+    @typed
     def force_adjoint(
-        depth: real,
-        per_width: real,
-        surface_tension: real,
-        m_i: real,
-        q_i: vector,
-        w_i: real,
-        a_i: real,
-        b_i: real,
-        acceleration_bar_i: vector,
+        depth, per_width, surface_tension, m_i, q_i, w_i, a_i, b_i, acceleration_bar_i
     ) -> tuple[real, real, vector, real, real, real]:
         """Turn the adjoint of the acceleration into those of a particle's own m, sigma, q, w, a and b."""
         k = outermost(a_i, b_i, depth)
@@ -230,17 +225,9 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
     @particle_kernel(
         module, "+x_bar +w_bar B_bar D_bar", [over(sums.mean_back, "c_part w_part x_part", a="a_bar", b="b_bar")]
     )
+    @typed
     def mean_adjoint(
-        i: int,
-        c_part: real,
-        w_part: real,
-        x_part: vector,
-        w_i: real,
-        a_bar_i: real,
-        b_bar_i: real,
-        B_i: matrix,
-        D_i: matrix,
-        s: neighbourhood,
+        i: int, c_part, w_part, x_part, w_i, a_bar_i, b_bar_i, B_i, D_i, s
     ) -> tuple[vector, real, matrix, matrix]:
         """Turn the adjoints of a and b into those of B and D, and add to those of x and w."""
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
@@ -251,16 +238,8 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         return x_part, w_bar, half * (by_B + wp.transpose(by_B)), half * (by_D + wp.transpose(by_D))
 
     @particle_kernel(module, "+x_bar r z_bar", [over(sums.bend_back, "e_bar w_part x_part")], numbers=["spacing"])
-    def bend_adjoint(
-        e_bar: vector,
-        w_part: real,
-        x_part: vector,
-        spacing: real,
-        q_i: vector,
-        z_i: real,
-        w_bar_i: real,
-        q_bar_i: vector,
-    ) -> tuple[vector, vector, real]:
+    @typed
+    def bend_adjoint(e_bar, w_part, x_part, spacing, q_i, z_i, w_bar_i, q_bar_i) -> tuple[vector, vector, real]:
         """Turn the adjoints of B, D, w and q into those of z and of V sum W_ij g_j, which is r."""
         r = (q_bar_i + normal_back(q_i, spacing, w_bar_i + w_part, e_bar)) / z_i
         return x_part, r, -wp.dot(q_i, r)

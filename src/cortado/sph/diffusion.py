@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.discretise.calibration import diffusion_limit
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import OutOfRangeError
@@ -54,22 +55,13 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
     ) -> fractions:
         return ((w_i / n_j + w_j / n_i) * factor(x_ij, s)) * u_ij
 
+    typed = TypesByName(real, {vector: "x", fractions: "u y", neighbourhood: "s"})
+
     @tangent_of(spread)
     @fluid_sum(discretisation, ahead=False)
+    @typed
     def spread_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        n_i: real,
-        n_j: real,
-        n_dot_i: real,
-        n_dot_j: real,
-        w_i: real,
-        w_j: real,
-        w_dot_i: real,
-        w_dot_j: real,
-        u_ij: fractions,
-        u_dot_ij: fractions,
-        s: neighbourhood,
+        x_ij, x_dot_ij, n_i, n_j, n_dot_i, n_dot_j, w_i, w_j, w_dot_i, w_dot_j, u_ij, u_dot_ij, s
     ) -> fractions:
         weight = w_i / n_j + w_j / n_i
         weight_dot = (w_dot_i - w_i * n_dot_j / n_j) / n_j + (w_dot_j - w_j * n_dot_i / n_i) / n_i
@@ -79,17 +71,8 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
     @adjoint_of(spread)
     @fluid_sum(discretisation)
-    def spread_adjoint(
-        x_ij: vector,
-        n_i: real,
-        n_j: real,
-        w_i: real,
-        w_j: real,
-        u_ij: fractions,
-        y_i: fractions,
-        y_ij: fractions,
-        s: neighbourhood,
-    ) -> tuple[vector, real, real, fractions, real]:
+    @typed
+    def spread_adjoint(x_ij, n_i, n_j, w_i, w_j, u_ij, y_i, y_ij, s) -> tuple[vector, real, real, fractions, real]:
         """Return a pair's adjoints of x_i, n_i, w_i and u_i for an adjoint y of the sums, and y_i times the sum."""
         f = factor(x_ij, s)
         weight = w_i / n_j + w_j / n_i
@@ -188,16 +171,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
             result[k] = u[k] - mean
         return result
 
+    typed = TypesByName(real, {fractions: "total c chi", neighbourhood: "s", vector: "x"})
+
     @particle_kernel(module, "chi w", [over(spread, "total", **of_c)], numbers=["strength"])
-    def potential(
-        total: fractions,
-        strength: real,
-        interface_width: real,
-        mobility: real,
-        m_i: real,
-        c_i: fractions,
-        s: neighbourhood,
-    ) -> tuple[fractions, real]:
+    @typed
+    def potential(total, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
         """Return the chemical potential chi of a particle, and m M as ``w``."""
         stiffness = interface_width * interface_width * s.volume / m_i
         return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
@@ -237,17 +215,8 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     both = [over(spread, "total", **of_chi), over(spread_tangent, "total_dot", **of_chi, **dotted(of_chi))]
 
     @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"])
-    def flux_tangent(
-        total: fractions,
-        total_dot: fractions,
-        substeps: int,
-        time_step: real,
-        time_step_dot: real,
-        m_i: real,
-        m_dot_i: real,
-        c_dot_i: fractions,
-        s: neighbourhood,
-    ) -> fractions:
+    @typed
+    def flux_tangent(total, total_dot, substeps: int, time_step, time_step_dot, m_i, m_dot_i, c_dot_i, s) -> fractions:
         scale = time_step / real(substeps) * s.volume / m_i
         return c_dot_i + scale * (total_dot + (time_step_dot / time_step - m_dot_i / m_i) * total)
 
@@ -262,19 +231,9 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         [over(spread_adjoint, "x_sum n_sum w_bar chi_bar own", **of_chi)],
         numbers=["strength"],
     )
+    @typed
     def flux_adjoint(
-        x_sum: vector,
-        n_sum: real,
-        w_bar: real,
-        chi_bar: fractions,
-        own: real,
-        strength: real,
-        time_step: real,
-        interface_width: real,
-        mobility: real,
-        m_i: real,
-        c_i: fractions,
-        s: neighbourhood,
+        x_sum, n_sum, w_bar, chi_bar, own, strength, time_step, interface_width, mobility, m_i, c_i, s
     ) -> tuple[vector, real, real, fractions, real, real, fractions]:
         """Add to the adjoints of the flux's inputs, and return z, the adjoint of the potential's raw sum."""
         m_part = w_bar * mobility * mobile(c_i) - own / m_i

@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.device.warp_start import c_stderr_to
 from cortado.errors import InputError
 from cortado.particles.state import Layout, Parameters
@@ -42,25 +42,17 @@ def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
     real, vector = precision.real, precision.vector
     forward, backward = integration_module(precision, True, taped), integration_module(precision, False)
 
+    typed = TypesByName(real, {wp.int32: "step"})
+
     @wp.kernel(module=forward)
-    def pack_number(
-        first: int,
-        step: wp.array(dtype=wp.int32),
-        values: wp.array2d(dtype=real),
-        # out
-        theta: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def pack_number(first: int, step, values: wp.array2d(dtype=real), theta: wp.array2d(dtype=real)):
         member = wp.tid()
         theta[member, first] = values[member, wp.min(step[member], values.shape[1] - 1)]
 
     @wp.kernel(module=forward)
-    def pack_vector(
-        first: int,
-        step: wp.array(dtype=wp.int32),
-        values: wp.array2d(dtype=vector),
-        # out
-        theta: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def pack_vector(first: int, step, values: wp.array2d(dtype=vector), theta: wp.array2d(dtype=real)):
         member = wp.tid()
         value = values[member, wp.min(step[member], values.shape[1] - 1)]
         theta[member, first] = value[0]
@@ -68,25 +60,15 @@ def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
         theta[member, first + 2] = value[2]
 
     @wp.kernel(module=backward, enable_backward=False)
-    def add_number(
-        first: int,
-        step: wp.array(dtype=wp.int32),
-        total: wp.array2d(dtype=real),
-        # in and out
-        values_bar: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def add_number(first: int, step, total: wp.array2d(dtype=real), values_bar: wp.array2d(dtype=real)):
         member = wp.tid()
         row = wp.min(step[member], values_bar.shape[1] - 1)
         values_bar[member, row] = values_bar[member, row] + total[member, first]
 
     @wp.kernel(module=backward, enable_backward=False)
-    def add_vector(
-        first: int,
-        step: wp.array(dtype=wp.int32),
-        total: wp.array2d(dtype=real),
-        # in and out
-        values_bar: wp.array2d(dtype=vector),
-    ):
+    @typed.arrays
+    def add_vector(first: int, step, total: wp.array2d(dtype=real), values_bar: wp.array2d(dtype=vector)):
         member = wp.tid()
         row = wp.min(step[member], values_bar.shape[1] - 1)
         bar = vector(total[member, first], total[member, first + 1], total[member, first + 2])

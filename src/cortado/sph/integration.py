@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module, kind_of
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 
 
@@ -98,31 +98,19 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
     differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
 
+    typed = TypesByName(real, {wp.int32: "order", vector: "x v acceleration"})
+
     @wp.kernel(module=integration_module(precision, True, taped))
-    def sort(
-        order: wp.array(dtype=wp.int32),
-        x_scene: wp.array(dtype=vector),
-        v_scene: wp.array(dtype=vector),
-        m_scene: wp.array(dtype=real),
-        # out
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def sort(order, x_scene, v_scene, m_scene, x, v, m):
         i = wp.tid()
         x[i] = x_scene[order[i]]
         v[i] = v_scene[order[i]]
         m[i] = m_scene[order[i]]
 
     @wp.kernel(module=integration_module(precision, True, taped))
-    def unsort(
-        order: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        # out
-        x_scene: wp.array(dtype=vector),
-        v_scene: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def unsort(order, x, v, x_scene, v_scene):
         i = wp.tid()
         x_scene[order[i]] = x[i]
         v_scene[order[i]] = v[i]
@@ -133,14 +121,9 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         return x_i + time_step * velocity, velocity
 
     @particle_kernel(integration_module(precision, False), "x_star_dot v_star_dot")
+    @typed
     def predict_tangent(
-        time_step: real,
-        time_step_dot: real,
-        x_dot_i: vector,
-        v_dot_i: vector,
-        acceleration_i: vector,
-        acceleration_dot_i: vector,
-        v_star_i: vector,
+        time_step, time_step_dot, x_dot_i, v_dot_i, acceleration_i, acceleration_dot_i, v_star_i
     ) -> tuple[vector, vector]:
         velocity_dot = v_dot_i + time_step * acceleration_dot_i + time_step_dot * acceleration_i
         return x_dot_i + time_step * velocity_dot + time_step_dot * v_star_i, velocity_dot
@@ -151,12 +134,8 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         return time_step * v_bar_i
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def collect_masses(
-        order: wp.array(dtype=wp.int32),
-        m_bar: wp.array(dtype=real),
-        # in and out
-        m_scene_bar: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def collect_masses(order, m_bar, m_scene_bar):
         i = wp.tid()
         m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.sph.moment_functions import matrix_type
@@ -112,50 +113,20 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
     summed = rubbing_sum(discretisation, sticks)
     matrix = matrix_type(precision)
 
-    def wall_force(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        T_i: matrix,
-        mu_i: real,
-        control: real,
-        least: real,
-        foot: vector,
-        s: neighbourhood,
-    ) -> vector:
+    typed = TypesByName(real, {vector: "x v foot turn bar", matrix: "T", neighbourhood: "s"})
+
+    @typed
+    def wall_force(x_ij, v_ij, m_i, T_i, mu_i, control, least, foot, s) -> vector:
         return (-hold(x_ij, foot, least, s) / m_i) * (T_i * fall(x_ij, foot) + (control * mu_i) * v_ij)
 
     @summed(wall_force)
-    def force(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        T_i: matrix,
-        T_j: matrix,
-        mu_i: real,
-        mu_j: real,
-        control: real,
-        least: real,
-        s: neighbourhood,
-    ) -> vector:
+    @typed
+    def force(x_ij, v_ij, m_i, T_i, T_j, mu_i, mu_j, control, least, s) -> vector:
         return (-weight(x_ij, s) / m_i) * ((T_i + T_j) * x_ij + (control * (mu_i + mu_j)) * v_ij)
 
+    @typed
     def wall_force_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        m_i: real,
-        m_dot_i: real,
-        T_i: matrix,
-        T_dot_i: matrix,
-        mu_i: real,
-        mu_dot_i: real,
-        control: real,
-        least: real,
-        foot: vector,
-        turn_dot: vector,
-        s: neighbourhood,
+        x_ij, x_dot_ij, v_ij, v_dot_ij, m_i, m_dot_i, T_i, T_dot_i, mu_i, mu_dot_i, control, least, foot, turn_dot, s
     ) -> vector:
         """Return the tangent of a wall's viscous pull; a wall that turns turns its pull."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
@@ -193,68 +164,30 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         change = (T_dot_i + T_dot_j) * x_ij + T * x_dot_ij + (control * (mu_dot_i + mu_dot_j)) * v_ij + mu * v_dot_ij
         return (real(-1.0) / m_i) * (w_dot * pull + w * change)
 
-    def wall_traction_back(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        bar_i: vector,
-        control: real,
-        least: real,
-        foot: vector,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, vector, real]:
+    @typed
+    def wall_traction_back(x_ij, v_ij, m_i, bar_i, control, least, foot, s) -> tuple[vector, vector, vector, real]:
         z = (-hold(x_ij, foot, least, s) / m_i) * bar_i
         y = fall(x_ij, foot)
         return z[0] * y, z[1] * y, z[2] * y, control * wp.dot(z, v_ij)
 
     @summed(wall_traction_back)
-    def traction_back(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        m_j: real,
-        bar_i: vector,
-        bar_j: vector,
-        control: real,
-        least: real,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, vector, real]:
+    @typed
+    def traction_back(x_ij, v_ij, m_i, m_j, bar_i, bar_j, control, least, s) -> tuple[vector, vector, vector, real]:
         """Return a pair's part in the adjoints of the rows of T and of mu."""
         z = -weight(x_ij, s) * (bar_i / m_i - bar_j / m_j)
         return z[0] * x_ij, z[1] * x_ij, z[2] * x_ij, control * wp.dot(z, v_ij)
 
-    def wall_force_back(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        T_i: matrix,
-        mu_i: real,
-        bar_i: vector,
-        control: real,
-        least: real,
-        foot: vector,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, real]:
+    @typed
+    def wall_force_back(x_ij, v_ij, m_i, T_i, mu_i, bar_i, control, least, foot, s) -> tuple[vector, vector, real]:
         w, y, u = hold(x_ij, foot, least, s), fall(x_ij, foot), bar_i / m_i
         level = -wp.dot(u, T_i * y + (control * mu_i) * v_ij)
         x_part = level * hold_gradient(x_ij, foot, least, s) - w * fall_change(x_ij, wp.transpose(T_i) * u, foot)
         return x_part, (-w * control * mu_i) * u, -level * w / m_i
 
     @summed(wall_force_back)
+    @typed
     def force_back(
-        x_ij: vector,
-        v_ij: vector,
-        m_i: real,
-        m_j: real,
-        T_i: matrix,
-        T_j: matrix,
-        mu_i: real,
-        mu_j: real,
-        bar_i: vector,
-        bar_j: vector,
-        control: real,
-        least: real,
-        s: neighbourhood,
+        x_ij, v_ij, m_i, m_j, T_i, T_j, mu_i, mu_j, bar_i, bar_j, control, least, s
     ) -> tuple[vector, vector, real]:
         """Return a pair's part in the adjoints of x, v and m of i, for an adjoint of the acceleration."""
         w, T, mu, own_u = weight(x_ij, s), T_i + T_j, control * (mu_i + mu_j), bar_i / m_i

@@ -43,7 +43,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
@@ -186,17 +186,11 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         rub = wp.dot(z, x_ij) * fluidity(mu_j)
         return wp.cw_mul(z, x_ij), cross_terms(z, x_ij), v_ij[0] * z, v_ij[1] * z, v_ij[2] * z, rub
 
+    typed = TypesByName(real, {vector: "x v foot turn", neighbourhood: "s", matrix: "M A"})
+
+    @typed
     def wall_moments_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        mu_i: real,
-        mu_dot_i: real,
-        least: real,
-        foot: vector,
-        turn_dot: vector,
-        s: neighbourhood,
+        x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_dot_i, least, foot, turn_dot, s
     ) -> tuple[vector, vector, vector, vector, vector, real]:
         """Return the tangent of a wall particle's terms; a turning wall turns y, and the rest moves it."""
         w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
@@ -216,17 +210,9 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
 
     @tangent_of(moments)
     @summed(wall_moments_tangent, ahead=False, grows=moments)
+    @typed
     def moments_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        mu_i: real,
-        mu_j: real,
-        mu_dot_i: real,
-        mu_dot_j: real,
-        least: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_j, mu_dot_i, mu_dot_j, least, s
     ) -> tuple[vector, vector, vector, vector, vector, real]:
         w, w_dot = weight(x_ij, s), -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij)
         thin = fluidity(mu_j)
@@ -242,17 +228,8 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
             rub,
         )
 
-    def wall_moments_back(
-        x_ij: vector,
-        v_ij: vector,
-        mu_i: real,
-        M_bar_i: matrix,
-        A_bar_i: matrix,
-        R_bar_i: real,
-        least: real,
-        foot: vector,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, real]:
+    @typed
+    def wall_moments_back(x_ij, v_ij, mu_i, M_bar_i, A_bar_i, R_bar_i, least, foot, s) -> tuple[vector, vector, real]:
         w, y, thin = hold(x_ij, foot, least, s), fall(x_ij, foot), fluidity(mu_i)
         turned, pulled, square = M_bar_i * y, A_bar_i * y, wp.dot(y, y)
         level = wp.dot(y, turned) + wp.dot(v_ij, pulled) + R_bar_i * square * thin
@@ -261,19 +238,9 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         return x_part, w * pulled, -R_bar_i * w * square * thin * thin
 
     @summed(wall_moments_back)
+    @typed
     def moments_back(
-        x_ij: vector,
-        v_ij: vector,
-        mu_i: real,
-        mu_j: real,
-        M_bar_i: matrix,
-        M_bar_j: matrix,
-        A_bar_i: matrix,
-        A_bar_j: matrix,
-        R_bar_i: real,
-        R_bar_j: real,
-        least: real,
-        s: neighbourhood,
+        x_ij, v_ij, mu_i, mu_j, M_bar_i, M_bar_j, A_bar_i, A_bar_j, R_bar_i, R_bar_j, least, s
     ) -> tuple[vector, vector, real]:
         """Return a pair's part in the adjoints of x, v and mu of i, for adjoints of M, of A and of R."""
         w, square, thin_i = weight(x_ij, s), wp.dot(x_ij, x_ij), fluidity(mu_i)

@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import warn
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
@@ -112,21 +113,13 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
         return (-sigma * scale / m_i * pull(x_ij, s.support * s.support)) * both
 
+    typed = TypesByName(real, {vector: "x normals bar", neighbourhood: "s"})
+
     @tangent_of(tension)
     @fluid_sum(discretisation, ahead=False)
+    @typed
     def tension_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        normals_i: vector,
-        normals_j: vector,
-        normals_dot_i: vector,
-        normals_dot_j: vector,
-        m_i: real,
-        m_dot_i: real,
-        sigma: real,
-        sigma_dot: real,
-        scale: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, normals_i, normals_j, normals_dot_i, normals_dot_j, m_i, m_dot_i, sigma, sigma_dot, scale, s
     ) -> vector:
         h2 = s.support * s.support
         g = pull(x_ij, h2)
@@ -139,17 +132,9 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
 
     @adjoint_of(tension)
     @fluid_sum(discretisation)
+    @typed
     def tension_adjoint(
-        x_ij: vector,
-        normals_i: vector,
-        normals_j: vector,
-        m_i: real,
-        m_j: real,
-        bar_i: vector,
-        bar_j: vector,
-        sigma: real,
-        scale: real,
-        s: neighbourhood,
+        x_ij, normals_i, normals_j, m_i, m_j, bar_i, bar_j, sigma, scale, s
     ) -> tuple[vector, vector, real, real]:
         """Return a pair's part in the adjoints of x, the normals, m and sigma of i."""
         h2 = s.support * s.support

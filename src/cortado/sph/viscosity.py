@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import arithmetic
+from cortado.device.precision import TypesByName, arithmetic
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernels
@@ -106,41 +106,20 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         wp.adjoint[a] += pair_viscosity_derivative(a, b) * bar
         wp.adjoint[b] += pair_viscosity_derivative(b, a) * bar
 
-    def wall_force(
-        x_ij: vector, v_ij: vector, n_i: real, m_i: real, mu_i: real, kappa: real, s: neighbourhood
-    ) -> vector:
-        # v_ij is against the wall's velocity, and `rubbing_sum` multiplies by w_b
+    typed = TypesByName(real, {vector: "x v bar", neighbourhood: "s"})
+
+    @typed
+    def wall_force(x_ij, v_ij, n_i, m_i, mu_i, kappa, s) -> vector:
         return (kappa * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
     @summed(wall_force)
-    def force(
-        x_ij: vector,
-        v_ij: vector,
-        n_i: real,
-        n_j: real,
-        m_i: real,
-        mu_i: real,
-        mu_j: real,
-        kappa: real,
-        s: neighbourhood,
-    ) -> vector:
+    @typed
+    def force(x_ij, v_ij, n_i, n_j, m_i, mu_i, mu_j, kappa, s) -> vector:
         weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
         return (kappa * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
 
-    def wall_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        v_ij: vector,
-        v_dot_ij: vector,
-        n_i: real,
-        n_dot_i: real,
-        m_i: real,
-        m_dot_i: real,
-        mu_i: real,
-        mu_dot_i: real,
-        kappa: real,
-        s: neighbourhood,
-    ) -> vector:
+    @typed
+    def wall_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, n_i, n_dot_i, m_i, m_dot_i, mu_i, mu_dot_i, kappa, s) -> vector:
         change = mu_dot_i - mu_i * (m_dot_i / m_i + n_dot_i / n_i)
         total = change * phi_force(x_ij, v_ij, s) + mu_i * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
         return (kappa * s.volume / (m_i * n_i)) * total
@@ -172,16 +151,8 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         total = change * phi_force(x_ij, v_ij, s) + mu_ij * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
         return (kappa * s.volume / (m_i * n_i * n_j)) * total
 
-    def wall_adjoint(
-        x_ij: vector,
-        v_ij: vector,
-        n_i: real,
-        m_i: real,
-        mu_i: real,
-        bar_i: vector,
-        kappa: real,
-        s: neighbourhood,
-    ) -> tuple[vector, vector, real, real, real]:
+    @typed
+    def wall_adjoint(x_ij, v_ij, n_i, m_i, mu_i, bar_i, kappa, s) -> tuple[vector, vector, real, real, real]:
         w_i = (kappa * s.volume / (m_i * n_i)) * bar_i
         work = wp.dot(phi_force(x_ij, v_ij, s), w_i)
         x_part = phi_adjoint_x(x_ij, v_ij, mu_i * w_i, s)
@@ -190,19 +161,9 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @adjoint_of(force)
     @summed(wall_adjoint)
+    @typed
     def force_adjoint(
-        x_ij: vector,
-        v_ij: vector,
-        n_i: real,
-        n_j: real,
-        m_i: real,
-        m_j: real,
-        mu_i: real,
-        mu_j: real,
-        bar_i: vector,
-        bar_j: vector,
-        kappa: real,
-        s: neighbourhood,
+        x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, kappa, s
     ) -> tuple[vector, vector, real, real, real]:
         """Return a pair's part in the adjoints of x, v, n, m and mu of i; seen from i, it is that of j too."""
         w_i = bar_i * reciprocal(m_i)

@@ -20,6 +20,7 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import adjoint_of, pair_sum, tangent_of
 from cortado.particles.wall_terms import solid_kernel
@@ -229,23 +230,11 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
         return change, a * wp.dot(x_ij, scaled_bar_ij), (c_ij * a) * wp.dot(x_ij, scaled_bar_i)
 
+    typed = TypesByName(real, {neighbourhood: "s", wp.int32: "rounds", vector: "x v acceleration scaled"})
+
     @wp.kernel(module=discretisation.module(True, "pcisph"))
-    def pressure_force(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        acceleration: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        x_before: wp.array(dtype=vector),
-        v_before: wp.array(dtype=vector),
-        # out
-        x_star: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def pressure_force(s, k: int, rounds, time_step, m, x, v, acceleration, c, x_before, v_before, x_star, v_star):
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -266,18 +255,9 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_star[i] = x_i + dt * velocity
 
     @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
+    @typed.arrays
     def pressure_force_tangent(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
-        at: moved,
-        dot: moved,
-        v_star: wp.array(dtype=vector),
-        # out
-        x_star_dot: wp.array(dtype=vector),
-        v_star_dot: wp.array(dtype=vector),
+        s, k: int, rounds, time_step, time_step_dot, at: moved, dot: moved, v_star, x_star_dot, v_star_dot
     ):
         i = s.first + wp.tid() // LANES
         member = i // s.particles
@@ -295,22 +275,9 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_star_dot[i] = dot.x[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
+    @typed.arrays
     def pressure_force_adjoint(
-        s: neighbourhood,
-        k: int,
-        rounds: wp.array(dtype=wp.int32),
-        stiffness: real,
-        time_step: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        at: values,
-        c: wp.array(dtype=real),
-        scaled_bar: wp.array(dtype=vector),
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        bar: adjoints,
-        # out
-        r: wp.array(dtype=real),
+        s, k: int, rounds, stiffness: real, time_step, x, at: values, c, scaled_bar, x_bar, n_bar, bar: adjoints, r
     ):
         """Turn ``scaled_bar``, the adjoint of the pressure acceleration over m, into those of c, p and (r) of n*; every
         sum is a gather."""

@@ -20,7 +20,7 @@ import warp as wp
 from cortado.device.cells import cell_grid_type
 from cortado.device.launching import Named, bundle
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.state import Layout
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
@@ -94,17 +94,11 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
     def lift(i: int, grid: grid_type, particles: int, factor: real, x_i: vector, coarse_i: real, e: values) -> real:
         return factor * coarse_i * at(i, particles, x_i, e, grid).value
 
+    typed = TypesByName(real, {grid_type: "grid", vector: "x", values: "e multiplier"})
+
     @particle_kernel(module, "lifted_dot", numbers=numbers)
-    def lift_tangent(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        x_i: vector,
-        x_dot_i: vector,
-        coarse_i: real,
-        coarse_dot_i: real,
-        e: values,
-    ) -> real:
+    @typed
+    def lift_tangent(i: int, grid, particles: int, x_i, x_dot_i, coarse_i, coarse_dot_i, e) -> real:
         """Return the tangent of the lifted pressure c E for fixed node values e."""
         f = at(i, particles, x_i, e, grid)
         return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
@@ -116,16 +110,9 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> CoarseBodyKerne
         return -coarse_dot_i * carried_i - coarse_i * carried_dot_i, -(coarse_i * carried_i) * x_dot_i
 
     @particle_kernel(module, "+coarse_bar +x_bar", numbers=numbers)
+    @typed
     def source_adjoint(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        x_i: vector,
-        coarse_i: real,
-        e: values,
-        multiplier: values,
-        carried_i: real,
-        lifted_bar_i: real,
+        i: int, grid, particles: int, x_i, coarse_i, e, multiplier, carried_i, lifted_bar_i
     ) -> tuple[real, vector]:
         """Add to the adjoints of c and x; ``multiplier`` is lambda, and ``carried`` G c E."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)

@@ -17,7 +17,7 @@ import warp as wp
 
 from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.solvers.projection.coarse_nodes import node_functions
 from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_type
 from cortado.sph.parts import StepContext
@@ -130,16 +130,11 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
             if b >= a:
                 cells[pair_of(a, b), cell] = total[b]
 
+    typed = TypesByName(real, {wp.int32: "shapes", wp.int64: "starts"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def fill(
-        members: int,
-        shapes: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int64),
-        cells: wp.array(dtype=real),
-        all_nodes: int,
-        # out
-        A: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def fill(members: int, shapes, starts, cells, all_nodes: int, A):
         """Write the symmetric matrices of all levels, with a thread for each node and half of its offsets."""
         offset = wp.tid() // all_nodes
         at = place_of(wp.tid() - offset * all_nodes, members, shapes, starts)
@@ -154,14 +149,8 @@ def level_kernels(precision: Precision, dimension: int) -> LevelKernels:
         A[entry_beside(AROUND, AROUND - 1 - offset, step, at)] = total
 
     @wp.kernel(module=module, enable_backward=False)
-    def weigh(
-        members: int,
-        shapes: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int64),
-        A: wp.array(dtype=real),
-        # out
-        weight: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def weigh(members: int, shapes, starts, A, weight):
         at = place_of(wp.tid(), members, shapes, starts)
         own, total = A[entry(AROUND, AROUND // 2, at.number, at)], real(0.0)
         if own > real(0.0):

@@ -16,7 +16,7 @@ import warp as wp
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.launching import bundle
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.sph.moment_functions import matrix_type
 
 ALONE = 0.01
@@ -216,18 +216,11 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
     row = wp.types.vector(length=2**dimension, dtype=real)
     pushes = wp.types.matrix(shape=(2**dimension, 3), dtype=real)
 
+    typed = TypesByName(real, {grid_type: "grid", wp.int32: "order", vector: "x h", matrix: "N"})
+
     @wp.kernel(module=module, enable_backward=False)
-    def add_up(
-        grid: grid_type,
-        order: wp.array(dtype=wp.int32),
-        eps: real,
-        x: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        h: wp.array(dtype=vector),
-        N: wp.array(dtype=matrix),
-        # out
-        cells: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def add_up(grid, order, eps: real, x, m, h, N, cells: wp.array2d(dtype=real)):
         """Sum the particles of each cell into the matrix entries of its pairs of corners; a thread is a cell."""
         cell = wp.tid()
         total, own = square(), pushes()
@@ -246,15 +239,8 @@ def node_kernels(precision: Precision, dimension: int) -> NodeKernels:
                 cells[pair_of(a, b), cell] = total[a, b]
 
     @wp.kernel(module=module, enable_backward=False)
-    def spread(
-        grid: grid_type,
-        order: wp.array(dtype=wp.int32),
-        x: wp.array(dtype=vector),
-        of: source,
-        e: wp.array(dtype=real),
-        # out
-        parts: wp.array2d(dtype=real),
-    ):
+    @typed.arrays
+    def spread(grid, order, x, of: source, e, parts: wp.array2d(dtype=real)):
         """Add up the source of the particles in a cell, with a thread for each cell."""
         cell, total, own = wp.tid(), row(), row()
         for corner in range(CORNERS):

@@ -31,7 +31,7 @@ import warp as wp
 
 from cortado.device.cells import cell_grid_type
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.solvers.projection.coarse_nodes import ALONE, hat_functions
 from cortado.solvers.projection.effects import weights_type
@@ -66,18 +66,11 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
 
     numbers, values = ["grid", "particles"], wp.array(dtype=real)
 
+    typed = TypesByName(real, {grid_type: "grid", vector: "x h", weights4: "weights", values: "e multiplier"})
+
     @particle_kernel(module, "change T", numbers=numbers)
-    def correct(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        x_i: vector,
-        L_i: matrix,
-        coarse_i: real,
-        weights_i: weights4,
-        y_i: real,
-        e: values,
-    ) -> tuple[real, six]:
+    @typed
+    def correct(i: int, grid, particles: int, x_i, L_i: matrix, coarse_i, weights_i, y_i, e) -> tuple[real, six]:
         """Return the clamped change d of a particle's pressure y by the coarse pressure e, and T = d L."""
         z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
         new = z
@@ -143,16 +136,9 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         return rise * z_dot + fall * (z_dot - below_dot + weights_dot_i[0] * below + sigma * below_dot) - y_dot_i
 
     @particle_kernel(module, "+weights_bar +coarse_bar +x_bar +y_bar s_value s_slope s_bent s_own", numbers=numbers)
+    @typed
     def correct_adjoint(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        x_i: vector,
-        coarse_i: real,
-        weights_i: weights4,
-        y_i: real,
-        e: values,
-        change_bar_i: real,
+        i: int, grid, particles: int, x_i, coarse_i, weights_i, y_i, e, change_bar_i
     ) -> tuple[weights4, real, vector, real, real, vector, vector, real]:
         no, f = real(0.0), at(i, particles, x_i, e, grid)
         z = y_i + coarse_i * f.value
@@ -175,19 +161,9 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> CoarsePress
         )
 
     @particle_kernel(module, "+r_bar +coarse_bar +h_bar +N_bar +m_bar +x_bar", numbers=[*numbers, "eps"])
+    @typed
     def source_adjoint(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        eps: real,
-        x_i: vector,
-        m_i: real,
-        coarse_i: real,
-        h_i: vector,
-        N_i: matrix,
-        r_i: real,
-        e: values,
-        multiplier: values,
+        i: int, grid, particles: int, eps, x_i, m_i, coarse_i, h_i, N_i: matrix, r_i, e, multiplier
     ) -> tuple[real, real, vector, matrix, real, vector]:
         """Add to the adjoints of r, c, h, N, m and x, given the ``multiplier`` lambda."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
@@ -256,18 +232,11 @@ def length_kernels(precision: Precision) -> LengthKernels:
         v = small * spacing / dt
         return m * v * v
 
+    typed = TypesByName(real, {vector: "thrust u", pair_of: "sums"})
+
     @particle_kernel(module, "parts", numbers=["first", "spacing"])
-    def share(
-        first: int,
-        spacing: real,
-        stays: int,
-        time_step: real,
-        m_i: real,
-        r_i: real,
-        change_i: real,
-        carried_i: real,
-        thrust_i: vector,
-    ) -> pair_of:
+    @typed
+    def share(first: int, spacing, stays: int, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
         """Return a particle's addends to both sums whose ratio is alpha, which is 0 in a scene that ``stays``
         uncorrected."""
         if stays != 0:
@@ -307,15 +276,9 @@ def length_kernels(precision: Precision) -> LengthKernels:
         return pair_of(along + real(1 - first) * own_dot, energy + own_dot)
 
     @particle_kernel(module, "k_dot y_dot u_dot")
+    @typed
     def apply_tangent(
-        sums: pair_of,
-        sums_dot: pair_of,
-        y_dot_i: real,
-        u_dot_i: vector,
-        change_i: real,
-        change_dot_i: real,
-        thrust_i: vector,
-        thrust_dot_i: vector,
+        sums, sums_dot, y_dot_i, u_dot_i, change_i, change_dot_i, thrust_i, thrust_dot_i
     ) -> tuple[real, real, vector]:
         alpha, alpha_dot = length(sums), real(0.0)
         if bends(sums):

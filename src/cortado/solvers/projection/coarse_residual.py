@@ -19,6 +19,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
@@ -100,17 +101,11 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def pull(coarse_i: real, L_i: matrix) -> six:
         return coarse_i * pack(L_i)
 
+    typed = TypesByName(real, {vector: "total row g beside diagonal others x h", six: "T", matrix: "L"})
+
     @particle_kernel(module, "h N", [over(push, "total row_x row_y row_z")])
-    def coarse_push(
-        total: vector,
-        row_x: vector,
-        row_y: vector,
-        row_z: vector,
-        T_i: six,
-        g_i: vector,
-        coarse_i: real,
-        beside_i: vector,
-    ) -> tuple[vector, matrix]:
+    @typed
+    def coarse_push(total, row_x, row_y, row_z, T_i, g_i, coarse_i, beside_i) -> tuple[vector, matrix]:
         return total + times(T_i, g_i) + coarse_i * beside_i, wp.matrix_from_rows(row_x, row_y, row_z)
 
     @particle_kernel(tangent_module, "T T_dot")
@@ -118,19 +113,9 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         return coarse_i * pack(L_i), coarse_dot_i * pack(L_i) + coarse_i * pack(L_dot_i)
 
     @particle_kernel(tangent_module, "h_dot N_dot", [over(push_tangent, "total row_x row_y row_z")])
+    @typed
     def coarse_push_tangent(
-        total: vector,
-        row_x: vector,
-        row_y: vector,
-        row_z: vector,
-        T_i: six,
-        T_dot_i: six,
-        g_i: vector,
-        g_dot_i: vector,
-        coarse_i: real,
-        coarse_dot_i: real,
-        beside_i: vector,
-        beside_dot_i: vector,
+        total, row_x, row_y, row_z, T_i, T_dot_i, g_i, g_dot_i, coarse_i, coarse_dot_i, beside_i, beside_dot_i
     ) -> tuple[vector, matrix]:
         own_part = times(T_dot_i, g_i) + times(T_i, g_dot_i)
         own_part += coarse_dot_i * beside_i + coarse_i * beside_dot_i
@@ -139,16 +124,9 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     back = over(push_back, "diagonal others x_part")
 
     @particle_kernel(adjoint_module, "+x_bar +L_bar +coarse_bar +g_bar +beside_bar", [back])
+    @typed
     def coarse_push_adjoint(
-        diagonal: vector,
-        others: vector,
-        x_part: vector,
-        L_i: matrix,
-        T_i: six,
-        g_i: vector,
-        coarse_i: real,
-        beside_i: vector,
-        h_bar_i: vector,
+        diagonal, others, x_part, L_i, T_i, g_i, coarse_i, beside_i, h_bar_i
     ) -> tuple[vector, matrix, real, vector, vector]:
         T_bar = whole(diagonal, others) + real(0.5) * (wp.outer(h_bar_i, g_i) + wp.outer(g_i, h_bar_i))
         coarse_part = wp.ddot(L_i, T_bar) + wp.dot(beside_i, h_bar_i)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, image_sum
@@ -109,19 +109,12 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def images(x_ij: vector, k_i: real, k_j: real, image_i: real, image_j: real, s: neighbourhood) -> real:
         return real(-0.5) * s.volume * (image_i * k_i + image_j * k_j) * wp.dot(gradient(x_ij, s), x_ij)
 
+    typed = TypesByName(real, {vector: "x reach mirrors", neighbourhood: "s"})
+
     @image_sum(discretisation)
+    @typed
     def images_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        k_i: real,
-        k_j: real,
-        k_dot_i: real,
-        k_dot_j: real,
-        image_i: real,
-        image_j: real,
-        image_dot_i: real,
-        image_dot_j: real,
-        s: neighbourhood,
+        x_ij, x_dot_ij, k_i, k_j, k_dot_i, k_dot_j, image_i, image_j, image_dot_i, image_dot_j, s
     ) -> real:
         c, g = image_i * k_i + image_j * k_j, gradient(x_ij, s)
         c_dot = image_dot_i * k_i + image_i * k_dot_i + image_dot_j * k_j + image_j * k_dot_j
@@ -141,16 +134,8 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         return per * (fluid + mirrored - k_i * (reach_i[0] + mirrors_i[0]))
 
     @particle_kernel(tangent_module, "q_dot", [over(spread_tangent, "fluid"), over(images_tangent, "mirrored")])
-    def mean_stress_tangent(
-        fluid: real,
-        mirrored: real,
-        k_i: real,
-        k_dot_i: real,
-        reach_i: vector,
-        reach_dot_i: vector,
-        mirrors_i: vector,
-        mirrors_dot_i: vector,
-    ) -> real:
+    @typed
+    def mean_stress_tangent(fluid, mirrored, k_i, k_dot_i, reach_i, reach_dot_i, mirrors_i, mirrors_dot_i) -> real:
         change = k_dot_i * (reach_i[0] + mirrors_i[0]) + k_i * (reach_dot_i[0] + mirrors_dot_i[0])
         return per * (fluid + mirrored - change)
 

@@ -41,7 +41,7 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.particle_kernels import particle_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
@@ -224,22 +224,12 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         out.y_out_dot[i] = found + beta * (found - dot.k[i])  # before k, which may be the same array
         out.k_out_dot[i] = found
 
+    typed = TypesByName(real, {seen: "of", bars: "bar", six: "S", neighbourhood: "s", vector: "x g u", matrix: "A"})
+
     @wp.kernel(module=adjoint_module, enable_backward=False)
+    @typed.arrays
     def clamp_adjoint(
-        particles: int,
-        omega: real,
-        beta: real,
-        time_step: wp.array(dtype=real),
-        n: wp.array(dtype=real),
-        of: seen,
-        at: iterate,
-        # in and out: at first those of k' and y', at last those of k and y
-        k_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        bar: bars,
-        # out
-        d_bar: wp.array(dtype=real),
-        S: wp.array(dtype=six),
+        particles: int, omega: real, beta: real, time_step, n, of, at: iterate, k_bar, y_bar, bar, d_bar, S
     ):
         """Apply the adjoint of the clamp, from those of k' and y' to d_bar of the divergence and S = d_bar L."""
         i = wp.tid()
@@ -273,20 +263,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
         """Make the kernel from the adjoint of D, and of A for a whole matrix S, to that of u."""
 
-        def divergence_adjoint(
-            s: neighbourhood,
-            x: wp.array(dtype=vector),
-            g: wp.array(dtype=vector),
-            of: seen,
-            u: wp.array(dtype=vector),
-            A: wp.array(dtype=matrix),
-            d_bar: wp.array(dtype=real),
-            S: wp.array(dtype=kind),
-            # in and out
-            bar: bars,
-            # out
-            u_bar: wp.array(dtype=vector),
-        ):
+        @typed.arrays
+        def divergence_adjoint(s, x, g, of, u, A, d_bar, S: wp.array(dtype=kind), bar, u_bar):
             i = s.first + wp.tid() // LANES
             u_part, x_part = back(i, x, u, S, s)
             u_lift = lift(i, x, d_bar, of.image, s)

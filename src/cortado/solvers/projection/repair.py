@@ -22,6 +22,7 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
+from cortado.device.precision import TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.solvers.projection.effects import image_sums, weights_type
@@ -77,18 +78,11 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
             return held * (change - (wp.dot(back, change) / wp.dot(back, back)) * back)
         return change
 
+    typed = TypesByName(real, {neighbourhood: "s", seen: "of dot", vector: "x pushed lifted gamma f", bars: "bar"})
+
     @wp.kernel(module=module)
-    def measure(
-        s: neighbourhood,
-        omega: real,
-        of: seen,
-        x_now: wp.array(dtype=vector),
-        c_in: wp.array(dtype=real),
-        # out
-        c_out: wp.array(dtype=real),
-        excess: wp.array(dtype=real),
-        error: wp.array(dtype=pair_of),
-    ):
+    @typed.arrays
+    def measure(s, omega: real, of, x_now, c_in, c_out, excess, error: wp.array(dtype=pair_of)):
         """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for
         a sum and a maximum)."""
         i = s.first + wp.tid() // LANES
@@ -107,19 +101,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         error[i] = pair_of(compression, compression)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
-    def measure_tangent(
-        s: neighbourhood,
-        omega: real,
-        of: seen,
-        dot: seen,
-        x_now: wp.array(dtype=vector),
-        x_now_dot: wp.array(dtype=vector),
-        c_in: wp.array(dtype=real),
-        c_in_dot: wp.array(dtype=real),
-        excess: wp.array(dtype=real),
-        # out
-        c_out_dot: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def measure_tangent(s, omega: real, of, dot, x_now, x_now_dot, c_in, c_in_dot, excess, c_out_dot):
         i = s.first + wp.tid() // LANES
         total = s.volume * weights_tangent(i, x_now, x_now_dot, s)
         solid = mirror_of(x_now[i], s)
@@ -136,16 +119,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         c_out_dot[i] = z_dot
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def measure_adjoint(
-        s: neighbourhood,
-        x_now: wp.array(dtype=vector),
-        image: wp.array(dtype=real),
-        n_now_bar: wp.array(dtype=real),
-        # in and out
-        image_bar: wp.array(dtype=real),
-        # out
-        x_now_bar: wp.array(dtype=vector),
-    ):
+    @typed.arrays
+    def measure_adjoint(s, x_now, image, n_now_bar, image_bar, x_now_bar):
         i = s.first + wp.tid() // LANES
         total = weights_adjoint(i, x_now, n_now_bar, s)
         solid = mirror_of(x_now[i], s)
@@ -172,19 +147,9 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
     both = [over(push_tangent, "pushed"), over(lift_tangent, "lifted", y="c", y_dot="c_dot")]
 
     @particle_kernel(tangent_module, "x_now_dot", both)
+    @typed
     def move_tangent(
-        pushed: vector,
-        lifted: vector,
-        m_i: real,
-        m_dot_i: real,
-        gamma_i: vector,
-        gamma_dot_i: vector,
-        c_i: real,
-        c_dot_i: real,
-        x_moved_i: vector,
-        x_moved_dot_i: vector,
-        x_now_i: vector,
-        held_i: real,
+        pushed, lifted, m_i, m_dot_i, gamma_i, gamma_dot_i, c_i, c_dot_i, x_moved_i, x_moved_dot_i, x_now_i, held_i
     ) -> vector:
         change = pushed + lifted + c_dot_i * gamma_i + c_i * gamma_dot_i
         back = (x_moved_i - x_now_i) / held_i
@@ -200,21 +165,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def move_adjoint(
-        s: neighbourhood,
-        omega: real,
-        x: wp.array(dtype=vector),
-        of: seen,
-        c_in: wp.array(dtype=real),
-        c_out: wp.array(dtype=real),
-        excess: wp.array(dtype=real),
-        f: wp.array(dtype=vector),
-        # in and out: at first that of lambda', at last that of lambda
-        c_bar: wp.array(dtype=real),
-        bar: bars,
-        # out
-        n_now_bar: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def move_adjoint(s, omega: real, x, of, c_in, c_out, excess, f, c_bar, bar, n_now_bar):
         """Apply the adjoint of the sum over neighbours in x_k+1, and of lambda' with respect to n."""
         i = s.first + wp.tid() // LANES
         by_c, x_part = push_back(i, x, c_out, f, s)

@@ -24,6 +24,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import Named
+from cortado.device.precision import TypesByName
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
@@ -77,22 +78,12 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
 
     widened = over(spread, "widened")
 
+    typed = TypesByName(real, {matrix: "L A", vector: "gamma u row", weights4: "weights"})
+
     @particle_kernel(module, "d root rest w r", [widened], numbers=["omega"])
+    @typed
     def linearise(
-        widened: real,
-        omega: real,
-        time_step: real,
-        n_i: real,
-        L_i: matrix,
-        gamma_i: vector,
-        drift_i: real,
-        a_i: real,
-        weights_i: weights4,
-        image_i: real,
-        u_i: vector,
-        A_i: matrix,
-        y_i: real,
-        k_bar_i: real,
+        widened, omega, time_step, n_i, L_i, gamma_i, drift_i, a_i, weights_i, image_i, u_i, A_i, y_i, k_bar_i
     ) -> tuple[real, real, real, real, real]:
         D = wp.ddot(L_i, A_i) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         b = wanted(n_i, weights_i[1], time_step)
@@ -104,19 +95,9 @@ def fixed_point_kernels(discretisation: Discretisation) -> FixedPointKernels:
         return D, wp.sqrt(c), rest, w, wp.sqrt(c) * k_bar_i / w
 
     @particle_kernel(module, "product share", [over(gradient, "row_x row_y row_z", v="u"), widened])
+    @typed
     def multiply(
-        row_x: vector,
-        row_y: vector,
-        row_z: vector,
-        widened: real,
-        L_i: matrix,
-        gamma_i: vector,
-        image_i: real,
-        u_i: vector,
-        root_i: real,
-        rest_i: real,
-        w_i: real,
-        p_i: real,
+        row_x, row_y, row_z, widened, L_i, gamma_i, image_i, u_i, root_i, rest_i, w_i, p_i
     ) -> tuple[real, real]:
         """Apply the operator of the adjoint system, divided by the weights w, to p; ``u`` is -D^T y / m."""
         total = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + image_i * widened

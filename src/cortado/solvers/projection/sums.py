@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import arithmetic
+from cortado.device.precision import TypesByName, arithmetic
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel
@@ -285,17 +285,11 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     whole = moment_functions(precision, dimension).change
     module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
+    typed = TypesByName(real, {vector: "total lifted g gamma v diagonal others x f", six: "T", matrix: "L"})
+
     @particle_kernel(module, "kick u", [over(sums.force, "total"), over(mirrors.lift, "lifted")])
-    def velocity(
-        total: vector,
-        lifted: vector,
-        m_i: real,
-        y_i: real,
-        T_i: six,
-        g_i: vector,
-        gamma_i: vector,
-        v_star_i: vector,
-    ) -> tuple[vector, vector]:
+    @typed
+    def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
         """Return the kick -D^T y / m by the pressure y, and the velocity u = v* + kick; T is y L."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
@@ -333,17 +327,9 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     both = [over(sums.force_back, "diagonal others x_part"), over(mirrors.lift_back, "widened x_lift")]
 
     @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both)
+    @typed
     def velocity_adjoint(
-        diagonal: vector,
-        others: vector,
-        x_part: vector,
-        widened: real,
-        x_lift: vector,
-        y_i: real,
-        L_i: matrix,
-        gamma_i: vector,
-        image_i: real,
-        f_i: vector,
+        diagonal, others, x_part, widened, x_lift, y_i, L_i, gamma_i, image_i, f_i
     ) -> tuple[real, real, matrix, vector, vector]:
         """Add to the adjoints of y, L, gamma and x by the f of all particles; T is y L."""
         A = whole(diagonal, others)

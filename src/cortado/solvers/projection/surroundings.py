@@ -10,7 +10,7 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums, weights_type
@@ -69,20 +69,11 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
+    typed = TypesByName(real, {neighbourhood: "s", vector: "x v", around: "of dot", bars: "bar", six: "M Q"})
+
     @wp.kernel(module=module)
-    def surroundings(
-        s: neighbourhood,
-        least: real,
-        per_nearest: real,
-        per_apart: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        # out
-        n: wp.array(dtype=real),
-        of: around,
-        surfaced: wp.array(dtype=int),
-    ):
+    @typed.arrays
+    def surroundings(s, least: real, per_nearest: real, per_apart: real, x, v, m, n, of, surfaced: wp.array(dtype=int)):
         """Write a particle's surroundings; ``surfaced`` is 0 for each scene before."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
@@ -123,21 +114,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
             surfaced[i // s.particles] = 1
 
     @wp.kernel(module=tangent_module, enable_backward=False)
+    @typed.arrays
     def surroundings_tangent(
-        s: neighbourhood,
-        least: real,
-        per_nearest: real,
-        per_apart: real,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        of: around,
-        # out
-        n_dot: wp.array(dtype=real),
-        dot: around,
+        s, least: real, per_nearest: real, per_apart: real, x, x_dot, v, v_dot, m, m_dot, of, n_dot, dot
     ):
         """Write the tangent of surroundings, put together from the gradients of each entry."""
         i = s.first + wp.tid() // LANES
@@ -203,18 +182,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.coarse[i] = coarse_dot
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def own_adjoint(
-        least: real,
-        m: wp.array(dtype=real),
-        n_bar: wp.array(dtype=real),
-        of: around,
-        # in and out
-        m_bar: wp.array(dtype=real),
-        bar: bars,
-        # out
-        M_pull: wp.array(dtype=six),
-        Q_pull: wp.array(dtype=six),
-    ):
+    @typed.arrays
+    def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
         """Add to the adjoints of the moments from those of L, a, the weights and all else that follows."""
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
@@ -253,21 +222,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bar.whole_drift[i] = e * drift_bar
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
-    def sums_adjoint(
-        s: neighbourhood,
-        per_nearest: real,
-        per_apart: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        m: wp.array(dtype=real),
-        n_bar: wp.array(dtype=real),
-        M_pull: wp.array(dtype=six),
-        Q_pull: wp.array(dtype=six),
-        bar: bars,
-        # in and out
-        x_bar: wp.array(dtype=vector),
-        m_bar: wp.array(dtype=real),
-    ):
+    @typed.arrays
+    def sums_adjoint(s, per_nearest: real, per_apart: real, x, v, m, n_bar, M_pull, Q_pull, bar, x_bar, m_bar):
         i = s.first + wp.tid() // LANES
         x_part, m_part = moments_back(
             i, x, m, M_pull, Q_pull, bar.g, bar.crowd, bar.apart, n_bar, per_nearest, per_apart, s
