@@ -72,6 +72,14 @@ def assert_one_sentence(text: str) -> None:
     assert "\x00" not in text and ".." not in text.replace("...", "")
 
 
+def assert_refused(result: tuple[int, str, str], *words: str) -> None:
+    """Exit code 2, and one sentence on stderr, which holds these words."""
+    code, out, err = result
+    assert (code, out) == (2, ""), err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert all(word in err for word in words), err
+
+
 @contextmanager
 def one_sentence(words: str | None = None, error: type[Exception] = InputError):
     """What is refused within is told in one sentence, in which the expression ``words``, if any, is found."""

@@ -9,22 +9,16 @@ import cortado
 import scenes
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients
 from cortado.losses import CentreOfMass, FinalPositions, Frames
+from test_free_bodies import touching
+from test_moving_solids import ROTOR
+from test_moving_solids import plane as beside
 
 STEPS = 8
-FREE = {
-    "kind": "pcisph",
-    "time_step": 0.0021,
-    "minimum_iterations": 3,
-    "maximum_iterations": 12,
-    "density_tolerance": 1e-3,
-}
+FREE = {"kind": "pcisph", "time_step": 0.0021, "minimum_iterations": 3, "maximum_iterations": 12}
+FREE |= {"density_tolerance": 1e-3}
 """As many pressure iterations as a scene needs, which differ between the scenes of a batch."""
 RANDOM = np.random.default_rng(3)
-ESTIMATORS = [
-    gradients.Exact(),
-    gradients.AdjointViscosity(20.0, order=2),
-    gradients.Tape(),
-]
+ESTIMATORS = [gradients.Exact(), gradients.AdjointViscosity(20.0, order=2), gradients.Tape()]
 
 
 def random_gravity(size: float, batch: int, rows: int, dimension: int = 3) -> np.ndarray:
@@ -64,6 +58,12 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
     ),
     "tension": (tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {"gravity": [0.0, -9.0]}),
     "tension by curvature": (curved_tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
+    "bodies": (touching, {"raft.density": np.array([300.0, 700.0])}, {}),
+    "rotor": (
+        lambda: beside(ROTOR),
+        {"gravity": random_gravity(2.0, 2, 1, 2)},
+        {},
+    ),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),
 }
 
@@ -236,10 +236,7 @@ def test_gradients_have_an_entry_for_each_scene():
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        (
-            {"gravity": np.zeros((4, 2))},
-            r"gravity has shape \(4, 2\), which may be a row for each step or",
-        ),
+        ({"gravity": np.zeros((4, 2))}, r"gravity has shape \(4, 2\), which may be a row for each step or"),
         ({"gravity": np.zeros((3, 4, 2))}, r"gravity has shape \(3, 4, 2\), but must be .*\(4, 1, 2\) or \(4, 4, 2\)"),
         ({"viscosity": np.zeros(3)}, r"viscosity has shape \(3,\), but must be \(\) or \(4,\)"),
         ({"viscosity": -np.ones(4)}, "viscosity is -1.0, but must be at least 0"),

@@ -21,7 +21,7 @@ import pytest
 import cortado.cli.commands.optimise
 import cortado.cli.commands.run
 import cortado.files.vtkhdf
-from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
+from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence, assert_refused
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.disk import locked
@@ -37,6 +37,9 @@ BAD = [("run", "scene.toml", GOOD_SCENE, bad) for bad in BAD_SCENES[::8]]
 BAD += [("optimise", "task.toml", GOOD_TASK, bad) for bad in BAD_TASKS[::8]]
 """Some of the bad ones, all of which tests/test_scene.py and tests/test_task.py have."""
 RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoint"}
+COMMANDS = pytest.mark.parametrize(
+    "command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -51,22 +54,38 @@ def folder(tmp_path, monkeypatch, unrendered):
     return tmp_path
 
 
+@pytest.fixture
+def run(cortado_command):
+    """`cortado run` of the scene into a folder."""
+    return lambda *more, out="dam": cortado_command("run", "scene.toml", "--out", out, *more)
+
+
+@pytest.fixture
+def optimise(cortado_command):
+    """`cortado optimise` of the task into a folder."""
+    return lambda *more, out="found": cortado_command("optimise", "task.toml", "--out", out, *more)
+
+
+def sets(*overrides):
+    return [word for override in overrides for word in ("--set", override)]
+
+
 def start(*arguments):
     """A command in a process of its own."""
     command = [sys.executable, "-m", "cortado", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def assert_refused(result, *words):
-    """Exit code 2, and one sentence on stderr, which holds these words."""
-    code, out, err = result
-    assert (code, out) == (2, ""), err
-    assert_one_sentence(err.removesuffix("\n"))
-    assert all(word in err for word in words), err
-
-
 def assert_nothing_made(folder):
     assert {path.name for path in folder.iterdir()} == {"scene.toml", "task.toml"}
+
+
+def result_of(run):
+    return json.loads((Path(run) / "result.json").read_text())
+
+
+def stopped(*_, **__):
+    raise KeyboardInterrupt
 
 
 def metrics(run):
@@ -77,8 +96,8 @@ def metrics(run):
 
 
 @pytest.mark.usefixtures("rendered")
-def test_run_writes_its_folder(cortado_command, folder):
-    code, out, err = cortado_command("run", "scene.toml", "--steps", 4, "--out", "dam")
+def test_run_writes_its_folder(run, folder):
+    code, out, err = run("--steps", 4)
     assert (code, err) == (0, "")
     assert {path.name for path in Path("dam").iterdir()} == RUN_FILES
     assert out.splitlines()[-1].startswith(f"The results are in {folder / 'dam'}")
@@ -90,37 +109,31 @@ def test_run_writes_its_folder(cortado_command, folder):
     assert report.count("<img") == 2 and "third axis" not in report
 
 
-def test_the_scene_of_a_folder_gives_the_same_run(cortado_command):
-    cortado_command("run", "scene.toml", "--steps", 3, "--out", "dam", "--precision", "float64")
-    scene = Scene.from_json(Path("dam/scene.json").read_text())
-    again = cortado.Simulation(scene, precision="float64").run(3)
-    np.testing.assert_array_equal(again.positions, Trajectory.load("dam/trajectory.vtkhdf").positions)
-
-
-def test_options_of_run(cortado_command):
-    overrides = ["--set", "solver.time_step=0.002", "--set", "forces.gravity=[0,-5]"]
-    code, _, _ = cortado_command("run", "scene.toml", "--steps", 5, "--record-every", 2, "--out", "dam", *overrides)
+def test_options_of_run_and_the_scene_of_a_folder_give_the_same_run(run):
+    overrides = sets("solver.time_step=0.002", "forces.gravity=[0,-5]")
+    code, _, _ = run("--steps", 5, "--record-every", 2, "--precision", "float64", *overrides)
     scene = Scene.from_json(Path("dam/scene.json").read_text())
     assert code == 0 and (scene.solver.time_step, scene.forces.gravity) == (0.002, (0.0, -5.0))
     trajectory = Trajectory.load("dam/trajectory.vtkhdf")
     np.testing.assert_array_equal(trajectory.steps, [0, 2, 4, 5])
     np.testing.assert_allclose(trajectory.times, [0.0, 0.004, 0.008, 0.01])
     assert len(trajectory.iterations) == len(metrics("dam")) == 5
+    again = cortado.Simulation(scene, precision="float64").run(5)
+    np.testing.assert_array_equal(again.positions[[0, 2, 4, 5]], trajectory.positions)
 
 
-def test_an_earlier_run_is_kept_unless_overwritten(cortado_command):
-    short = ["run", "scene.toml", "--out", "dam", "--steps"]
-    cortado_command(*short, 2)
-    assert_refused(cortado_command(*short, 3), "already holds a run", "--overwrite")
+def test_an_earlier_run_is_kept_unless_overwritten(run):
+    run("--steps", 2)
+    assert_refused(run("--steps", 3), "already holds a run", "--overwrite")
     assert len(metrics("dam")) == 2
-    assert cortado_command(*short, 3, "--overwrite")[0] == 0
+    assert run("--steps", 3, "--overwrite")[0] == 0
     assert len(metrics("dam")) == 3 and len(Trajectory.load("dam/trajectory.vtkhdf").times) == 4
 
 
-def test_other_files_are_never_overwritten(cortado_command, folder):
+def test_other_files_are_never_overwritten(run, folder):
     (folder / "figures").mkdir()
-    assert_refused(cortado_command("run", "scene.toml", "--out", ".", "--overwrite"), "no run of Cortado")
-    assert_refused(cortado_command("run", "scene.toml", "--out", "task.toml"), "cannot be written")
+    assert_refused(run("--overwrite", out="."), "no run of Cortado")
+    assert_refused(run(out="task.toml"), "cannot be written")
     assert Path("task.toml").read_text() == GOOD_TASK
 
 
@@ -133,21 +146,19 @@ def test_a_path_need_not_be_utf_8(cortado_command, folder):
     assert set(os.listdir(f"{place}/dam")) == RUN_FILES
 
 
-def test_one_frame_at_either_end_is_recorded_if_no_other_is(cortado_command):
-    code, _, err = cortado_command("run", "scene.toml", "--steps", 3, "--record-every", 10**17, "--out", "dam")
+def test_one_frame_at_either_end_is_recorded_if_no_other_is(run):
+    code, _, err = run("--steps", 3, "--record-every", 10**17)
     assert (code, Trajectory.load("dam/trajectory.vtkhdf").steps.tolist()) == (0, [0, 3]), err
 
 
-def test_steps_that_did_not_converge_are_mentioned(cortado_command):
-    few = ["--set", "solver.maximum_iterations=4", "--set", "solver.density_tolerance=0"]
-    code, _, err = cortado_command("run", "scene.toml", "--steps", 30, "--out", "dam", *few)
+def test_steps_that_did_not_converge_are_mentioned(run):
+    code, _, err = run("--steps", 30, *sets("solver.maximum_iterations=4", "solver.density_tolerance=0"))
     assert code == 0 and err.startswith("Warning: the pressure did not converge in ") and len(err.splitlines()) == 1
 
 
 @pytest.mark.usefixtures("rendered")
-def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
-    fast = ["--set", "fluid.0.velocity=[10,25]"]
-    code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam", *fast)
+def test_a_run_that_diverges_says_where_and_keeps_its_frames(run):
+    code, out, err = run("--steps", 20, *sets("fluid.0.velocity=[10,25]"))
     warning, sentence = err.splitlines()
     assert (code, out) == (1, "") and "limit of stability" in warning
     assert_one_sentence(sentence)
@@ -178,9 +189,9 @@ def interrupting(after):
     return track
 
 
-def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatch):
+def test_an_interrupted_run_keeps_its_frames(run, monkeypatch):
     monkeypatch.setattr(cortado.cli.commands.run, "track", interrupting(after=3))
-    code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
+    code, out, err = run("--steps", 20)
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
     there = Path("dam/trajectory.vtkhdf").absolute()
@@ -191,22 +202,17 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
 @pytest.mark.parametrize(
     ("drawn", "missing"), [("run_pictures", set()), ("particles", {"report.html"})], ids=["pictures", "plain figures"]
 )
-def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(
-    cortado_command, folder, monkeypatch, drawn, missing
-):
-    def stopped(*_, **__):
-        raise KeyboardInterrupt
-
+def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(run, monkeypatch, drawn, missing):
     monkeypatch.setattr("cortado.cli.commands.run_report.lacking", lambda _: None)
     monkeypatch.setattr(f"cortado.cli.commands.run_report.{drawn}", stopped)
-    code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
+    code, _, err = run("--steps", 5)
     there = Path("dam").absolute()
     sentence = f"Interrupted; the run is whole, and in {there}; cortado picture {there} --film films it."
     assert (code, err.splitlines()[-1]) == (130, sentence)
     assert {path.name for path in there.iterdir()} == RUN_FILES - missing
 
 
-def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command, folder, monkeypatch):
+def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(run, monkeypatch):
     """As nobody knows how many steps it takes where these are chosen."""
     told = []
 
@@ -216,12 +222,11 @@ def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(cortado_command
         yield lambda n: told.append(n)
 
     monkeypatch.setattr(cortado.cli.commands.run, "track", track)
-    arguments = ["--time", 0.02, "--set", "solver.time_step=auto", "--no-pictures", "--out", "dam"]
-    assert cortado_command("run", "scene.toml", *arguments)[0] == 0
+    assert run("--time", 0.02, *sets("solver.time_step=auto"), "--no-pictures")[0] == 0
     assert told[0] == (100, "run, % of its time") and sum(told[1:]) == 100 and min(told[1:]) >= 0
 
 
-@pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
+@COMMANDS
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.cli.commands.run, cortado.cli.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
@@ -233,71 +238,59 @@ def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command,
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("line", "words"),
     [
-        (["--steps", "3"], "--steps is "),
-        (["walk"], "walk is unknown, but must be one of gradients, new, "),
-        (["rnu", "scene.toml"], "rnu is unknown; run may be meant"),
-        (["run", "scene"], "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
-        (
-            ["run", "secne.toml"],
-            "secne.toml: the scene cannot be read: No such file or directory; did you mean scene.toml?",
-        ),
-        (["run"], "SCENE.toml is missing; see cortado run --help."),
-        (["gradients"], "a command is missing, one of check; see cortado gradients --help."),
-        (["bench"], "cortado bench is now python -m benchmarks bench, in a clone of the repository."),
-        (["gradients", "study", "--reduced"], "cortado gradients study is now python -m experiments study"),
-        (["run", "scene.toml", "--steps", "0"], "steps is 0"),
-        (["run", "scene.toml", "--steps", "-3"], "steps is -3"),
-        (["run", "scene.toml", "--record-every", "0"], "--record-every is 0"),
-        (["run", "scene.toml", "--record-every", "-2"], "--record-every is -2"),
-        (["run", "scene.toml", "--device", "tpu"], "device is 'tpu'"),
-        (["run", "scene.toml", "--device", "cuda:99"], "device is 'cuda:99'"),
-        (["run", "scene.toml", "--device", 5000 * "a"], "aaa..., but must be one of"),
-        (["run", "scene.toml", "--precision", "float16"], "precision is 'float16'"),
-        (["run", "scene.toml", "--set", "solver.time_step"], "not an override"),
-        (["run", "scene.toml", "--set", "solver.timestep=0.1"], "did you mean time_step?"),
-        (["run", "absent.toml"], "absent.toml: the scene cannot be read"),
-        (["run", "."], "cannot be read"),
-        (["run", "scene.toml", "--steps", "many"], "--steps is 'many', but must be a whole number; see cortado run "),
-        (["run", "scene.toml", "--steps"], "--steps is given without a value"),
-        (["run", "scene.toml", "--stesp", "3"], "--stesp is unknown; --steps may be meant"),
-        (["run", "scene.toml", "--no"], "--no is unknown"),
-        (["run", "scene.toml", "other.toml"], "other.toml is unknown, or one too many"),
-        (["run", "scene.toml", "--seed", "3"], "--seed is no option here; see cortado run --help."),
-        (["gradients", "check", "scene.toml", "--perturbation", "x"], "--perturbation is 'x', but must be a number"),
-        (["run", "scene.toml", "--set", "name=\udcff"], "must be text in UTF-8"),
-        (["optimise", "absent.toml", "--out", "found"], "cannot be read"),
-        (["optimise", "task.toml", "--resume", "--out", "found"], "no run"),
-        (["optimise", "task.toml", "--resume", "--overwrite", "--out", "found"], "only one of them"),
-        (["optimise", "task.toml", "--precision", "double", "--out", "found"], "precision is 'double'"),
-        (["gradients", "check", "scene.toml", "--steps", "0"], "steps is 0"),
-        (["gradients", "check", "scene.toml", "--seed", "-1"], "--seed is -1"),
-        (["gradients", "check", "scene.toml", "--loss", "sum"], "--loss is 'sum', but must be one of positions, "),
-        (["gradients", "check", "scene.toml", "--parameters", "g"], "parameter 'g' is unknown, but must be one of"),
-        (["gradients", "check", "scene.toml", "--perturbation", "-1"], "perturbation is -1.0, but must be greater"),
-        (["gradients", "check", "scene.toml", "--out", "scene.toml"], "The folder scene.toml cannot be made"),
-        (["gradients", "check", "absent.toml"], "cannot be read"),
-        (["examples", "--to", "there"], "--to is given, but must be left out"),
-        (["picture", "run", "--film", "--frame", "1"], "--frame is given, but must be left out"),
-        (
-            ["picture", "run", "--set", "picture.film_speed=1"],
-            "--set picture.film_speed is given, but must be left out",
-        ),
-        (
-            ["picture", "run", "--lines", "90", "--set", "picture.width=90"],
-            "picture.width is given, but must be left out",
-        ),
-        (["export", "run", "--to", "ply", "--set", "picture.width=90"], "--set is picture.width=90, but must replace"),
-        (["run", "scene.toml", "--set", "optimise.iterations=5"], "optimise.iterations is given, but must be left out"),
-        (
-            ["describe", "scene.toml", "--set", "fit.starts=3"],
-            "fit.starts is given, but must be left out, as the table",
-        ),
+        ("--steps 3", "--steps is "),
+        ("walk", "walk is unknown, but must be one of gradients, new, "),
+        ("rnu scene.toml", "rnu is unknown; run may be meant"),
+        ("run scene", "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
+        ("run secne.toml", "secne.toml: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
+        ("run", "SCENE.toml is missing; see cortado run --help."),
+        ("gradients", "a command is missing, one of check; see cortado gradients --help."),
+        ("bench", "cortado bench is now python -m benchmarks bench, in a clone of the repository."),
+        ("gradients study --reduced", "cortado gradients study is now python -m experiments study"),
+        ("run scene.toml --steps 0", "steps is 0"),
+        ("run scene.toml --steps -3", "steps is -3"),
+        ("run scene.toml --record-every 0", "--record-every is 0"),
+        ("run scene.toml --record-every -2", "--record-every is -2"),
+        ("run scene.toml --device tpu", "device is 'tpu'"),
+        ("run scene.toml --device cuda:99", "device is 'cuda:99'"),
+        (f"run scene.toml --device {5000 * 'a'}", "aaa..., but must be one of"),
+        ("run scene.toml --precision float16", "precision is 'float16'"),
+        ("run scene.toml --set solver.time_step", "not an override"),
+        ("run scene.toml --set solver.timestep=0.1", "did you mean time_step?"),
+        ("run absent.toml", "absent.toml: the scene cannot be read"),
+        ("run .", "cannot be read"),
+        ("run scene.toml --steps many", "--steps is 'many', but must be a whole number; see cortado run "),
+        ("run scene.toml --steps", "--steps is given without a value"),
+        ("run scene.toml --stesp 3", "--stesp is unknown; --steps may be meant"),
+        ("run scene.toml --no", "--no is unknown"),
+        ("run scene.toml other.toml", "other.toml is unknown, or one too many"),
+        ("run scene.toml --seed 3", "--seed is no option here; see cortado run --help."),
+        ("gradients check scene.toml --perturbation x", "--perturbation is 'x', but must be a number"),
+        ("run scene.toml --set name=\udcff", "must be text in UTF-8"),
+        ("optimise absent.toml --out found", "cannot be read"),
+        ("optimise task.toml --resume --out found", "no run"),
+        ("optimise task.toml --resume --overwrite --out found", "only one of them"),
+        ("optimise task.toml --precision double --out found", "precision is 'double'"),
+        ("gradients check scene.toml --steps 0", "steps is 0"),
+        ("gradients check scene.toml --seed -1", "--seed is -1"),
+        ("gradients check scene.toml --loss sum", "--loss is 'sum', but must be one of positions, "),
+        ("gradients check scene.toml --parameters g", "parameter 'g' is unknown, but must be one of"),
+        ("gradients check scene.toml --perturbation -1", "perturbation is -1.0, but must be greater"),
+        ("gradients check scene.toml --out scene.toml", "The folder scene.toml cannot be made"),
+        ("gradients check absent.toml", "cannot be read"),
+        ("examples --to there", "--to is given, but must be left out"),
+        ("picture run --film --frame 1", "--frame is given, but must be left out"),
+        ("picture run --set picture.film_speed=1", "--set picture.film_speed is given, but must be left out"),
+        ("picture run --lines 90 --set picture.width=90", "picture.width is given, but must be left out"),
+        ("export run --to ply --set picture.width=90", "--set is picture.width=90, but must replace"),
+        ("run scene.toml --set optimise.iterations=5", "optimise.iterations is given, but must be left out"),
+        ("describe scene.toml --set fit.starts=3", "fit.starts is given, but must be left out, as the table"),
     ],
 )
-def test_wrong_usage_is_refused(cortado_command, folder, arguments, words):
-    assert_refused(cortado_command(*arguments), words)
+def test_wrong_usage_is_refused(cortado_command, folder, line, words):
+    assert_refused(cortado_command(*line.split(" ")), words)
     assert_nothing_made(folder)
 
 
@@ -322,8 +315,8 @@ def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
 
 
 @pytest.mark.usefixtures("rendered")
-def test_optimise_writes_its_folder(cortado_command, folder):
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+def test_optimise_writes_its_folder(optimise, folder):
+    code, out, err = optimise()
     assert (code, err) == (0, "")
     assert out.splitlines()[-1].endswith(f"The results are in {folder / 'found'}; open report.html.")
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
@@ -345,9 +338,6 @@ def test_optimise_writes_its_folder(cortado_command, folder):
     ids=["run", "optimise"],
 )
 def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, command, drawing, told):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(f"cortado.cli.commands.{drawing}", stopped)
     code, out, err = cortado_command(*command, "--out", "found")
     assert code == 130 and re.fullmatch(told, out), out
@@ -359,10 +349,9 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
 @pytest.mark.parametrize(
     ("steps", "estimator", "told"), [(100, "exact", True), (99, "exact", False), (100, "adjoint_viscosity", False)]
 )
-def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_command, steps, estimator, told):
-    short = [f"problem.steps={steps}", f"optimise.gradient.name={estimator}", "optimise.iterations=1"]
-    options = [word for one in (*short, "optimise.learning_rate=1e-9") for word in ("--set", one)]
-    code, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *options)
+def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(optimise, steps, estimator, told):
+    short = sets(f"problem.steps={steps}", f"optimise.gradient.name={estimator}", "optimise.iterations=1")
+    code, out, _ = optimise("--no-pictures", *short, *sets("optimise.learning_rate=1e-9"))
     assert code == 1 and ("The loss hardly fell. Over 100 steps the exact gradient may mean nothing" in out) is told
     report = Path("found/report.html").read_text()
     assert ("The loss hardly fell. Over 100 steps" in report) is told
@@ -378,12 +367,11 @@ def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_c
         ({}, [], None),
     ],
 )
-def test_a_search_that_cannot_be_trusted_says_what_to_try(cortado_command, monkeypatch, change, settings, told):
-    optimise = cortado.cli.commands.optimise.optimise
-    monkeypatch.setattr("cortado.cli.commands.optimise.optimise", lambda *a, **o: replace(optimise(*a, **o), **change))
-    options = [word for one in (*settings, "problem.steps=20") for word in ("--set", one)]
-    _, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *options)
-    report, found = Path("found/report.html").read_text(), json.loads(Path("found/result.json").read_text())
+def test_a_search_that_cannot_be_trusted_says_what_to_try(optimise, monkeypatch, change, settings, told):
+    own = cortado.cli.commands.optimise.optimise
+    monkeypatch.setattr("cortado.cli.commands.optimise.optimise", lambda *a, **o: replace(own(*a, **o), **change))
+    _, out, _ = optimise("--no-pictures", *sets(*settings, "problem.steps=20"))
+    report, found = Path("found/report.html").read_text(), result_of("found")
     assert {name: found[name] for name in ("misled", "stays")} == {"misled": False, "stays": False, **change}
     if told:
         assert told in out and told in unescape(report) and 'optimise.optimiser = "line_search"' in out
@@ -392,76 +380,79 @@ def test_a_search_that_cannot_be_trusted_says_what_to_try(cortado_command, monke
 
 
 @pytest.mark.usefixtures("rendered")
-def test_a_search_that_ends_on_its_bounds_says_so(cortado_command):
-    bounds = ["--set", "optimise.bounds.gravity=[[0.9,-9.9],[1.0,-9.7]]", "--set", "optimise.start.gravity=[0.95,-9.8]"]
-    _, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *bounds)
+def test_a_search_that_ends_on_its_bounds_says_so(optimise):
+    bounds = sets("optimise.bounds.gravity=[[0.9,-9.9],[1.0,-9.7]]", "optimise.start.gravity=[0.95,-9.8]")
+    _, out, _ = optimise("--no-pictures", *bounds)
     assert "The search of gravity ended on its bounds: what is best may lie beyond them." in out
 
 
-def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(cortado_command):
-    hard = ["--set", "optimise.check.loss_reduction=1e9", "--set", "optimise.check.parameter_error=1e-9"]
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *hard)
-    assert code == 1 and out.startswith("The loss fell ") and len(err.splitlines()) == 1
-    assert "asks for 1e+09 times. The parameter gravity is " in err and err.endswith("found.\n")
+@pytest.mark.parametrize(
+    ("text", "hard", "begin", "words"),
+    [
+        (
+            *(GOOD_TASK, sets("optimise.check.loss_reduction=1e9", "optimise.check.parameter_error=1e-9")),
+            *("", ["asks for 1e+09 times. The parameter gravity is "]),
+        ),
+        (
+            *(PLANE_PICTURE, sets("optimise.check.psnr=80")),
+            *("The image is matched to ", [" dB, but the task asks for 80 dB. "]),
+        ),
+    ],
+    ids=["parameters", "images"],
+)
+def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(optimise, text, hard, begin, words):
+    Path("task.toml").write_text(text)
+    code, out, err = optimise(*hard)
+    assert (code, len(err.splitlines())) == (1, 1) and out.startswith("The loss fell ")
+    assert err.startswith(begin) and all(word in err for word in words) and err.endswith("found.\n")
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
 
 
-def test_an_optimisation_that_diverges_says_so(cortado_command):
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.learning_rate=1e30")
+def test_an_optimisation_that_diverges_says_so(optimise):
+    code, out, err = optimise(*sets("optimise.learning_rate=1e30"))
     assert (code, out) == (1, "") and "a smaller learning rate" in err
     assert_one_sentence(err.removesuffix("\n"))
     assert len(metrics("found")) == 1
 
 
-def test_a_search_goes_on_past_runs_that_diverge_and_says_so(cortado_command):
+def test_a_search_goes_on_past_runs_that_diverge_and_says_so(optimise):
     """Also where it is resumed, with the same bits."""
-    far = ["--no-pictures", "--set", "optimise.learning_rate=1e4"]
-    code, out, _ = cortado_command("optimise", "task.toml", "--out", "found", *far)
-    cortado_command("optimise", "task.toml", "--out", "part", *far, "--set", "optimise.iterations=1")
-    cortado_command("optimise", "task.toml", "--out", "part", *far, "--resume")
-    refused = json.loads(Path("found/result.json").read_text())["refused"]
+    far = ["--no-pictures", *sets("optimise.learning_rate=1e4")]
+    code, out, _ = optimise(*far)
+    optimise(*far, *sets("optimise.iterations=1"), out="part")
+    optimise(*far, "--resume", out="part")
+    refused = result_of("found")["refused"]
     assert code == 1 and refused > 0  # as it did not find what the task asks for
     assert f" in 7 evaluations and {refused} more that were refused" in out
     assert "The loss hardly fell: try an optimise.learning_rate that is 10 times as small" in out
     assert [row["refused"] for row in metrics("found")] == [0, *[refused] * 6]
-    assert (
-        f"It refused {refused} steps, as runs diverged or parameters were out of their range."
-        in Path("found/report.html").read_text()
-    )
+    told = f"It refused {refused} steps, as runs diverged or parameters were out of their range."
+    assert told in Path("found/report.html").read_text()
     for file in ("metrics.jsonl", "result.json", "checkpoint/replay.log"):
         assert Path("part", file).read_bytes() == Path("found", file).read_bytes()
 
 
 @pytest.mark.parametrize("optimiser", ["lbfgs", "adam"])
-def test_progress_counts_updates_and_not_evaluations(cortado_command, monkeypatch, optimiser):
+def test_progress_counts_updates_and_not_evaluations(optimise, monkeypatch, optimiser):
     shown = []
 
     @contextmanager
     def track(total, description):
-        def advance(n=1, **fields):
-            shown.append((n, fields))
-
-        yield advance
+        yield lambda n=1, **fields: shown.append((n, fields))
         assert total == 8
 
     monkeypatch.setattr("cortado.cli.commands.optimise.track", track)
-    overrides = ["--set", f"optimise.optimiser={optimiser}", "--set", "optimise.iterations=8"]
-    assert cortado_command("optimise", "task.toml", "--out", "found", *overrides)[0] == 0
+    assert optimise(*sets(f"optimise.optimiser={optimiser}", "optimise.iterations=8"))[0] == 0
     assert all(n in (0, 1) for n, _ in shown) and sum(n for n, _ in shown) == 8
     last = [fields["evaluations"] for _, fields in shown if fields][-1]
     assert last == len(metrics("found")) and (last > 9 if optimiser == "lbfgs" else last == 9)
 
 
-def test_a_target_beyond_the_precision_is_named(cortado_command):
-    far = ["--set", "problem.target.gravity=[0,-1e30]"]
-    result = cortado_command("optimise", "task.toml", "--out", "found", *far)
+def test_a_bad_target_is_named(optimise, folder):
+    """One beyond the precision, and one that diverges."""
+    result = optimise(*sets("problem.target.gravity=[0,-1e30]"))
     assert_refused(result, "problem.target: parameter gravity has a value of size 1e+30")
-
-
-def test_a_target_that_diverges_is_named(cortado_command, folder):
-    code, out, err = cortado_command(
-        "optimise", "task.toml", "--out", "found", "--set", "problem.target.gravity=[0,-1e6]"
-    )
+    code, out, err = optimise(*sets("problem.target.gravity=[0,-1e6]"))
     assert (code, out) == (1, "") and "problem.target" in err and "learning rate" not in err
     assert_one_sentence(err.splitlines()[-1])
     assert_nothing_made(folder)
@@ -477,10 +468,9 @@ def test_a_target_that_diverges_is_named(cortado_command, folder):
     ids=["start over time", "target over time", "two parameters"],
 )
 @pytest.mark.usefixtures("rendered")
-def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
+def test_other_parameters_are_optimised_and_drawn(optimise, overrides):
     easy = ["optimise.check.loss_reduction=1", "optimise.check.parameter_error=100", "optimise.iterations=2"]
-    options = [word for override in [*overrides, *easy] for word in ("--set", override)]
-    code, _, err = cortado_command("optimise", "task.toml", "--out", "found", *options)
+    code, _, err = optimise(*sets(*overrides, *easy))
     assert (code, err) == (0, "")
     assert "gravity.png" in figures("found")
 
@@ -495,7 +485,7 @@ def test_a_bad_file_is_refused(cortado_command, folder, command, file, good, bad
 
 # ---- resume ------------------------------------------------------------------------------------------------------
 
-LONG = ["optimise", "task.toml", "--set", "optimise.iterations=60", "--set", "problem.steps=20", "--out"]
+LONG = sets("optimise.iterations=60", "problem.steps=20")
 
 
 def wait_for_metrics(run, lines, process):
@@ -511,18 +501,18 @@ def assert_same_optimisation(one, other):
         assert (Path(one) / name).read_bytes() == (Path(other) / name).read_bytes()
 
 
-def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
-    process = start(*LONG, "killed")
+def test_a_killed_optimisation_resumes_bit_for_bit(optimise):
+    process = start("optimise", "task.toml", *LONG, "--out", "killed")
     wait_for_metrics("killed", 10, process)
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL and 10 <= len(metrics("killed")) < 61
-    assert_refused(cortado_command(*LONG, "killed"), "--resume")
-    code, resumed, _ = cortado_command(*LONG, "killed", "--resume")
+    assert_refused(optimise(*LONG, out="killed"), "--resume")
+    code, resumed, _ = optimise(*LONG, "--resume", out="killed")
     assert code == 0
-    _, whole, _ = cortado_command(*LONG, "whole")
+    _, whole, _ = optimise(*LONG, out="whole")
     first, *found, _ = resumed.splitlines()
-    updates = json.loads(Path("killed/result.json").read_text())["evaluations"]
+    updates = result_of("killed")["evaluations"]
     assert re.fullmatch(r"The search goes on from iteration (9|\d\d) of 60, after \d\d evaluations\.", first), first
     assert found == whole.splitlines()[:-1] and updates == 61
     assert len(metrics("whole")) == 61
@@ -533,19 +523,23 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
 SMOOTHED = ["name=adjoint_viscosity", "coefficient=3.0", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
 
 
+def assert_goes_on(optimise, monkeypatch, after, *options):
+    """Interrupted after so many updates, a search ends where one does that is not."""
+    with monkeypatch.context() as patch:
+        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=after))
+        assert optimise(*options, out="stopped")[0] == 130
+    assert len(metrics("stopped")) == after + 1
+    assert optimise(*options, "--resume", out="stopped")[0] == 0
+    optimise(*options, out="whole")
+    assert_same_optimisation("stopped", "whole")
+
+
 @pytest.mark.parametrize(
     "estimator", [[], ["name=adjoint_viscosity"], SMOOTHED], ids=["exact", "smoothing", "averaged"]
 )
-def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch, estimator):
+def test_an_interrupted_optimisation_resumes_bit_for_bit(optimise, monkeypatch, estimator):
     options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"gradient.{one}" for one in estimator)]
-    task = ["optimise", "task.toml", *(word for one in options for word in ("--set", f"optimise.{one}"))]
-    with monkeypatch.context() as patch:
-        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=3))
-        assert cortado_command(*task, "--out", "stopped")[0] == 130
-    assert len(metrics("stopped")) == 4
-    assert cortado_command(*task, "--out", "stopped", "--resume")[0] == 0
-    cortado_command(*task, "--out", "whole")
-    assert_same_optimisation("stopped", "whole")
+    assert_goes_on(optimise, monkeypatch, 3, *sets(*(f"optimise.{one}" for one in options)))
 
 
 @pytest.mark.parametrize(
@@ -562,38 +556,36 @@ def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkey
     ],
     ids=["step", "rate", "optimiser", "start", "target", "steps", "picture", "knots"],
 )
-def test_a_changed_task_is_not_resumed(cortado_command, text, override, words):
+def test_a_changed_task_is_not_resumed(optimise, text, override, words):
     Path("task.toml").write_text(text)
-    cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
+    optimise(*sets("optimise.iterations=1"))
     before = metrics("found")
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
+    code, out, err = optimise("--resume", *sets(override))
     assert (code, out, len(err.splitlines())) == (2, "", 1) and words in err
     assert len(before) == 2 and metrics("found") == before
 
 
-def test_another_precision_or_picture_is_not_resumed(cortado_command):
-    cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
-    again = ["optimise", "task.toml", "--out", "found", "--resume", "--precision", "float64"]
-    assert_refused(cortado_command(*again), "precision = 'float32' and is now given precision = 'float64'")
-    picture = ["optimise", "plane.toml", "--out", "drawn", "--set", "problem.picture=a.png"]
-    Path("plane.toml").write_text(PLANE_PICTURE)
-    for draw, options, code in ((heart, ["--set", "optimise.check={}"], 0), (rosetta, ["--resume"], 2)):
+def test_another_precision_or_picture_is_not_resumed(optimise):
+    optimise(*sets("optimise.iterations=1"))
+    again = optimise("--resume", "--precision", "float64")
+    assert_refused(again, "precision = 'float32' and is now given precision = 'float64'")
+    Path("task.toml").write_text(PLANE_PICTURE)
+    for draw, options, code in ((heart, sets("optimise.check={}"), 0), (rosetta, ["--resume"], 2)):
         write_picture("a.png", draw((20, 16)))
-        result = cortado_command(*picture, "--set", "optimise.iterations=1", *options)
+        result = optimise(*sets("problem.picture=a.png", "optimise.iterations=1"), *options, out="drawn")
         assert result[0] == code, result
     assert_refused(result, "problem = target and loss ")
     assert "steps" not in result[2]
 
 
-def test_run_and_optimise_do_not_go_on_with_each_other(cortado_command):
-    cortado_command("run", "scene.toml", "--out", "dam", "--steps", 1)
-    refused = cortado_command("optimise", "task.toml", "--out", "dam", "--resume")
-    assert_refused(refused, "`cortado run` wrote", "`cortado optimise` cannot go on")
-    _, _, err = cortado_command("optimise", "task.toml", "--out", "dam")
+def test_run_and_optimise_do_not_go_on_with_each_other(run, optimise):
+    run("--steps", 1)
+    assert_refused(optimise("--resume", out="dam"), "`cortado run` wrote", "`cortado optimise` cannot go on")
+    _, _, err = optimise(out="dam")
     assert "--overwrite" in err and "--resume" not in err
 
 
-@pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
+@COMMANDS
 def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
     with locked(Path("busy")):
         result = cortado_command(*command, "--out", "busy")
@@ -604,18 +596,17 @@ def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
 
 @pytest.mark.parametrize("size", [400, 2000, 20_000])
 @pytest.mark.usefixtures("rendered")
-def test_a_run_on_a_full_disk_says_so(cortado_command, size):
-    again = ["run", "scene.toml", "--out", "dam", "--steps", 20, "--overwrite"]
+def test_a_run_on_a_full_disk_says_so(run, size):
     with largest_file(size):
-        code, out, err = cortado_command(*again)
+        code, out, err = run("--steps", 20, "--overwrite")
     assert (code, out) == (1, "")
     assert_one_sentence(err.removesuffix("\n"))
     assert "cannot be written: File too large" in err
-    assert cortado_command(*again)[0] == 0
+    assert run("--steps", 20, "--overwrite")[0] == 0
 
 
 @pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "particles.png", "run.mp4", "report.html"])
-def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
+def test_frames_stay_when_a_disk_fills_up(run, monkeypatch, full):
     Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
     replace, write = os.replace, cortado.files.vtkhdf.write_fully
     left = iter(range(20))
@@ -627,7 +618,7 @@ def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
         monkeypatch.setattr(cortado.files.vtkhdf, "write_fully", until_full)
     else:
         monkeypatch.setattr(os, "replace", lambda old, new: refuse() if Path(new).name == full else replace(old, new))
-    code, out, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 8)
+    code, out, err = run("--steps", 8)
     assert code == 1, err
     ended = full not in ("trajectory.vtkhdf", "metrics.jsonl")  # such a run is told before it is drawn
     assert out.startswith("8 steps of ") if ended else out == ""
@@ -642,24 +633,23 @@ def refuse():
 
 
 @pytest.mark.parametrize("size", [400, 2500, 3500])
-def test_a_search_on_a_full_disk_says_so_and_goes_on(cortado_command, size):
+def test_a_search_on_a_full_disk_says_so_and_goes_on(optimise, size):
     with largest_file(size):
-        code, out, err = cortado_command(*LONG, "full")
+        code, out, err = optimise(*LONG, out="full")
     assert (code, out) == (1, ""), err
     assert_one_sentence(err.removesuffix("\n"))
     assert "cannot be written" in err and "File too large" in err
     if not Path("full/environment.json").exists():
         assert os.listdir("full") == []
         return
-    assert cortado_command(*LONG, "full", "--resume")[0] == 0
-    cortado_command(*LONG, "whole")
+    assert optimise(*LONG, "--resume", out="full")[0] == 0
+    optimise(*LONG, out="whole")
     assert_same_optimisation("full", "whole")
 
 
-def test_a_finished_optimisation_goes_on(cortado_command):
-    code, _, _ = cortado_command("optimise", "task.toml", "--out", "found")
-    longer = ["--resume", "--set", "optimise.iterations=8"]
-    assert (code, cortado_command("optimise", "task.toml", "--out", "found", *longer)[0]) == (0, 0)
+def test_a_finished_optimisation_goes_on(optimise):
+    code, _, _ = optimise()
+    assert (code, optimise("--resume", *sets("optimise.iterations=8"))[0]) == (0, 0)
     assert [row["iteration"] for row in metrics("found")] == list(range(9))
 
 
@@ -673,9 +663,9 @@ def figures(run):
     return names
 
 
-def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
-    (folder / "latte.toml").write_text(TINY_LATTE)
-    code, _, err = cortado_command("run", "latte.toml", "--steps", 2, "--out", "a")
+def test_a_run_is_rendered_as_its_scene_asks(run, folder):
+    Path("scene.toml").write_text(TINY_LATTE)
+    code, _, err = run("--steps", 2, out="a")
     assert code == 0, err
     assert (folder / "a" / "figures" / "rendered.png").exists()
     assert (folder / "a" / "figures" / "run.mp4").exists() == bool(find_spec("av"))
@@ -683,9 +673,9 @@ def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
 
 
 @pytest.mark.usefixtures("rendered")
-def test_places_are_found_for_a_picture(cortado_command):
+def test_places_are_found_for_a_picture(optimise):
     Path("task.toml").write_text(PLANE_PICTURE)
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+    code, out, err = optimise()
     assert (code, err) == (0, "") and "the image is matched to " in out
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
     assert figures("found") == {"loss.png", "images.png", "progress.png"}
@@ -696,12 +686,12 @@ def test_places_are_found_for_a_picture(cortado_command):
 
 
 @pytest.mark.usefixtures("rendered")
-def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
+def test_a_cup_is_swung_until_it_looks_as_it_should(optimise):
     Path("task.toml").write_text(TINY_LATTE)
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+    code, out, err = optimise()
     assert (code, err) == (0, "")
     assert "gravity is found with an error of " in out and "the image is matched to " in out
-    found = json.loads(Path("found/result.json").read_text())
+    found = result_of("found")
     knots, rows = found["knots"]["gravity"], np.array(found["parameters"]["gravity"])
     task = load_task("task.toml")
     ends = (0.5 * task.scene.solver.time_step, (task.problem.steps - 0.5) * task.scene.solver.time_step)
@@ -735,37 +725,20 @@ def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
     ],
     ids=["frames", "colours", "factors", "a number", "a camera"],
 )
-def test_other_tasks_of_images(cortado_command, overrides):
+def test_other_tasks_of_images(optimise, overrides):
     has_rows = not any(override.startswith("optimise.start={") for override in overrides)
     Path("task.toml").write_text(TINY_LATTE if has_rows else TINY_LATTE.replace("knots = 3", ""))
-    easy = ["optimise.iterations=1", "optimise.check.parameter_error=1e9"]
-    options = [word for override in [*overrides, *easy] for word in ("--set", override)]
-    code, _, err = cortado_command("optimise", "task.toml", "--out", "found", *options)
+    code, _, err = optimise(*sets(*overrides, "optimise.iterations=1", "optimise.check.parameter_error=1e9"))
     assert (code, err) == (0, "") and figures("found") >= {"images.png", "progress.png"}
 
 
-def test_an_image_that_is_not_matched_fails_and_keeps_its_files(cortado_command):
-    Path("task.toml").write_text(PLANE_PICTURE)
-    strict = ["--set", "optimise.check.psnr=80"]
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *strict)
-    assert (code, len(err.splitlines())) == (1, 1) and out.startswith("The loss fell ")
-    assert err.startswith("The image is matched to ") and " dB, but the task asks for 80 dB. " in err
-    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
-
-
 @pytest.mark.usefixtures("rendered")
-def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypatch):
+def test_an_optimisation_of_images_resumes_bit_for_bit(optimise, monkeypatch):
     Path("task.toml").write_text(TINY_LATTE)
-    with monkeypatch.context() as patch:
-        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=1))
-        assert cortado_command("optimise", "task.toml", "--out", "stopped")[0] == 130
-    assert len(metrics("stopped")) == 2
-    assert cortado_command("optimise", "task.toml", "--out", "stopped", "--resume")[0] == 0
-    cortado_command("optimise", "task.toml", "--out", "whole")
-    assert_same_optimisation("stopped", "whole")
+    assert_goes_on(optimise, monkeypatch, 1)
     for name in ("images.png", "progress.png"):
-        stopped, whole = (Path(run) / "figures" / name for run in ("stopped", "whole"))
-        assert stopped.read_bytes() == whole.read_bytes()
+        one, whole = (Path(run) / "figures" / name for run in ("stopped", "whole"))
+        assert one.read_bytes() == whole.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -779,9 +752,9 @@ def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypa
         ('container={shape="none"}', "has no container to fill"),
     ],
 )
-def test_a_wrong_task_of_images_is_refused(cortado_command, folder, override, words):
+def test_a_wrong_task_of_images_is_refused(optimise, folder, override, words):
     Path("task.toml").write_text(PLANE_PICTURE)
-    assert_refused(cortado_command("optimise", "task.toml", "--out", "found", "--set", override), words)
+    assert_refused(optimise(*sets(override)), words)
     assert_nothing_made(folder)
 
 

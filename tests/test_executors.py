@@ -15,20 +15,11 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import (
-    ComputationError,
-    CortadoWarning,
-    DivergedError,
-    InputError,
-    Problem,
-    SceneError,
-    Simulation,
-    executors,
-)
+from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, Simulation, executors
 from cortado.cli.commands.options import Where
 from cortado.device import worker_calls as calls
 from cortado.device.threads import usable_cores
-from cortado.errors import CortadoError, OutOfRangeError
+from cortado.errors import OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers
 from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
 from dask_processes import PATIENCE, scheduler
@@ -62,31 +53,23 @@ def workers(processes):
 
 def bits(estimate):
     errors = estimate.standard_error or {}
-    return b"".join(np.asarray(value).tobytes() for one in (estimate.gradient, errors) for value in one.values()), (
-        estimate.loss,
-    )
+    return [np.asarray(value).tobytes() for one in (estimate.gradient, errors) for value in one.values()], estimate.loss
 
 
-MAIN = """
-class Loss:
-    def value(self, end):
-        return float(end.positions.sum())
-    def adjoint(self, end):
-        return 0 * end.positions + 1, 0 * end.positions
-"""
+def answer(function, number=0):
+    """What comes back from a worker that calls a function."""
+    return calls.call(calls.Payload.of(function), calls.pickled(number, "The item"))
 
 
 # ---- in this process ---------------------------------------------------------------------------------------------
 
 
-def test_in_process_one_after_the_other():
-    told = []
+def test_in_process_items_are_taken_one_after_the_other_as_they_are_needed_and_the_first_error_ends_it():
+    told, taken, seen = [], [], []
     assert InProcess().map(square, iter(range(4)), lambda *pair: told.append(pair)) == [0, 1, 4, 9]
     assert told == [(0, 0), (1, 1), (2, 4), (3, 9)]
-
-
-def test_in_process_the_first_error_ends_it():
-    seen = []
+    items = (taken.append(number) or number for number in range(3))
+    assert InProcess().map(lambda number: len(taken), items) == [1, 2, 3]
 
     def fails(number):
         seen.append(number)
@@ -97,17 +80,6 @@ def test_in_process_the_first_error_ends_it():
     assert (caught.value.particle, seen) == (0, [0])
 
 
-def test_items_are_taken_as_they_are_needed():
-    taken = []
-
-    def items():
-        for number in range(3):
-            taken.append(number)
-            yield number
-
-    assert InProcess().map(lambda number: len(taken), items()) == [1, 2, 3]
-
-
 # ---- errors and functions in transit -----------------------------------------------------------------------------
 
 
@@ -115,7 +87,7 @@ def test_items_are_taken_as_they_are_needed():
     "error",
     [
         DivergedError(5, 7, "try less", "went through a wall", 2),
-        SceneError("a.toml", "solver.time_step", -1.0, "greater than 0"),
+        cortado.SceneError("a.toml", "solver.time_step", -1.0, "greater than 0"),
         InputError("This is wrong."),
         ComputationError("This failed."),
     ],
@@ -125,9 +97,9 @@ def test_errors_arrive_as_themselves(error):
     def fail(_):
         raise error
 
-    answer = pickle.loads(pickle.dumps(calls.call(calls.Payload.of(fail), calls.pickled(0, "The item"))))
-    assert type(answer.error) is type(error) and str(answer.error) == str(error)
-    assert vars(answer.error) == vars(error) and answer.traceback == ""
+    back = pickle.loads(pickle.dumps(answer(fail)))
+    assert type(back.error) is type(error) and str(back.error) == str(error)
+    assert vars(back.error) == vars(error) and back.traceback == ""
 
 
 def test_an_error_that_cannot_travel_is_told_in_words():
@@ -138,21 +110,18 @@ def test_an_error_that_cannot_travel_is_told_in_words():
     def fail(_):
         raise Odd(1, 2)
 
-    answer = calls.call(calls.Payload.of(fail), calls.pickled(0, "The item"))
-    assert type(answer.error) is RuntimeError and str(answer.error) == "Odd: 1 and 2"
-    assert "in fail" in answer.traceback and "Odd: 1 and 2" in answer.traceback
+    back = answer(fail)
+    assert type(back.error) is RuntimeError and str(back.error) == "Odd: 1 and 2"
+    assert "in fail" in back.traceback and "Odd: 1 and 2" in back.traceback
 
 
-def test_what_cannot_be_sent_is_a_sentence():
+def test_what_cannot_be_sent_and_a_worker_with_other_versions_are_sentences(monkeypatch):
     with pytest.raises(InputError, match=r"^The function cannot be sent to another process: TypeError: .*\.$"):
         calls.Payload.of(threading.Lock().acquire)
-
-
-def test_a_worker_with_other_versions_is_refused(monkeypatch):
     payload = calls.Payload.of(square)
     monkeypatch.setattr(calls, "versions", lambda: "Cortado 0.0.1, Warp 1.0 and NumPy 2.0")
-    answer = calls.call(payload, calls.pickled(3, "The item"))
-    assert isinstance(answer.error, InputError) and "must have Cortado" in str(answer.error)
+    back = calls.call(payload, calls.pickled(3, "The item"))
+    assert isinstance(back.error, InputError) and "must have Cortado" in str(back.error)
 
 
 def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
@@ -162,45 +131,40 @@ def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
     assert calls.call(payload, item).result() == calls.call(payload.mention, item).result() == 9
 
 
+class Exits:
+    def __reduce__(self):
+        sys.exit(1)
+
+
 @pytest.mark.parametrize(
-    ("leave", "words"),
+    ("function", "error", "words"),
     [
-        (lambda _: sys.exit(3), r"^An item ended its process, by SystemExit: 3; what is computed may not do so\.$"),
-        (lambda _: sys.exit(), r"^An item ended its process, by SystemExit; what is"),
-        (lambda _: signal.default_int_handler(signal.SIGINT, None), "by KeyboardInterrupt; what is"),
+        (
+            lambda _: sys.exit(3),
+            ComputationError,
+            r"^An item ended .* SystemExit: 3; what is .* not do so\.$",
+        ),
+        (lambda _: sys.exit(), ComputationError, r"^An item ended its process, by SystemExit; what is"),
+        (lambda _: signal.default_int_handler(signal.SIGINT, None), ComputationError, "by KeyboardInterrupt; what is"),
+        (lambda _: Exits(), ComputationError, "by SystemExit: 1; what is computed"),
+        (
+            lambda _: threading.Lock(),
+            InputError,
+            "The result cannot be sent to another process: TypeError",
+        ),
     ],
 )
-def test_an_item_that_ends_its_process_is_an_error(leave, words):
-    answer = calls.call(calls.Payload.of(leave), calls.pickled(0, "The item"))
-    assert isinstance(answer.error, ComputationError)
-    with pytest.raises(ComputationError, match=words):
-        raise answer.error
+def test_an_item_that_ends_its_process_or_has_no_result_to_send_is_an_error(function, error, words):
+    with pytest.raises(error, match=words):
+        raise answer(function).error
 
 
-def test_a_result_that_cannot_be_sent_is_an_error():
-    class Exits:
-        def __reduce__(self):
-            sys.exit(1)
-
-    sent = "The result cannot be sent to another process: TypeError: cannot pickle"
-    for make, words in ((lambda _: threading.Lock(), sent), (lambda _: Exits(), "by SystemExit: 1; what is computed")):
-        answer = calls.call(calls.Payload.of(make), calls.pickled(0, "The item"))
-        with pytest.raises(CortadoError, match=words):
-            raise answer.error
-
-
-def test_an_executor_is_asked_for_by_its_type():
+def test_an_executor_is_asked_for_by_its_type_and_is_no_part_of_what_an_estimator_is():
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="executor is of the type ThreadPoolExecutor"):
         EnsembleMean(executor=pool)
     with pytest.raises(InputError, match="executor is the class InProcess"):
         RandomizedSmoothing(executor=InProcess)
-
-
-def test_an_executor_is_no_part_of_what_an_estimator_is():
-    class Other(InProcess):
-        pass
-
-    one, other = EnsembleMean(), EnsembleMean(executor=Other())
+    one, other = EnsembleMean(), EnsembleMean(executor=type("Other", (InProcess,), {})())
     assert one == other and hash(one) == hash(other) and repr(one) == repr(other)
 
 
@@ -219,9 +183,8 @@ def test_many_points_have_the_bits_that_they_have_alone(problem, workers):
     found = cortado.evaluate(problem, POINTS, executor=workers, on_result=lambda *pair: told.append(pair))
     assert [one.loss for one in found] == [problem.value(point) for point in POINTS]
     assert sorted(number for number, _ in told) == list(range(10)) and dict(told)[7] is found[7]
-    for gradient in (Exact(),):
-        found = cortado.evaluate(problem, POINTS, gradient, workers)
-        assert [bits(one) for one in found] == [bits(problem.estimate(point, gradient)) for point in POINTS]
+    found = cortado.evaluate(problem, POINTS, Exact(), workers)
+    assert [bits(one) for one in found] == [bits(problem.estimate(point, Exact())) for point in POINTS]
 
 
 def test_items_are_shared_out_and_a_function_is_made_once_a_process(workers):
@@ -233,6 +196,15 @@ def test_items_are_shared_out_and_a_function_is_made_once_a_process(workers):
     kept = Kept()
     found = {*workers.map(kept, range(12)), *workers.map(kept, range(12))}
     assert len({pid for pid, _ in found}) == 2 == len(found)
+
+
+MAIN = """
+class Loss:
+    def value(self, end):
+        return float(end.positions.sum())
+    def adjoint(self, end):
+        return 0 * end.positions + 1, 0 * end.positions
+"""
 
 
 def test_a_loss_of_the_main_module_travels(problem, workers):
@@ -304,17 +276,12 @@ def test_what_is_out_of_range_is_treated_as_what_diverges(problem, gradient):
 
 
 @pytest.mark.filterwarnings("ignore:time_step is")
-def test_where_no_point_has_a_run_the_first_error_is_raised(problem):
+def test_where_no_point_has_a_run_the_first_error_is_raised_and_what_diverges_may_have_a_loss(problem, workers):
     far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
     with pytest.raises(DivergedError, match=r"^The simulation diverged in step 1: "):
         cortado.evaluate(problem, [far, {"viscosity": -1.0}])
     with pytest.raises(InputError, match=r"^parameter viscosity is -1\.0, but must be at least 0\.$"):
         cortado.evaluate(problem, [{"viscosity": -1.0}, far])
-
-
-@pytest.mark.filterwarnings("ignore:time_step is")
-def test_what_diverges_may_have_a_loss(problem, workers):
-    far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "1 of 2 points diverged")
         one, other = cortado.evaluate(problem, [POINTS[0], far], Exact(), workers, loss_if_diverged=np.inf)
@@ -324,26 +291,18 @@ def test_what_diverges_may_have_a_loss(problem, workers):
         cortado.evaluate(problem, POINTS, loss_if_diverged="inf")
 
 
-def test_warnings_of_workers_are_heard(workers):
+def test_warnings_and_observers_of_workers_are_heard(problem, workers):
     def warn(number):
         warnings.warn(f"mind number {number}", CortadoWarning, stacklevel=1)
 
     with pytest.warns(CortadoWarning) as caught:
         workers.map(warn, range(3))
     assert sorted(str(one.message) for one in caught) == [f"mind number {k}" for k in range(3)]
-
-
-def test_an_executor_within_an_executor_is_refused(problem, workers):
-    nested = EnsembleMean(executor=workers)
-    with pytest.raises(InputError, match="An executor cannot be used within what an executor computes"):
-        cortado.evaluate(problem, POINTS[:2], nested, workers)
-
-
-def test_observers_hear_of_every_sample(problem, workers):
-    heard = []
-    alone = EnsembleMean(estimator=Exact(), executor=workers)
+    heard, alone = [], EnsembleMean(estimator=Exact(), executor=workers)
     found = problem.estimate(POINTS[0], alone, lambda step, bar: heard.append(step))
     assert heard == [4, 3, 2, 1, 0] * 4 and bits(found) == bits(problem.estimate(POINTS[0], alone))
+    with pytest.raises(InputError, match="An executor cannot be used within what an executor computes"):
+        cortado.evaluate(problem, POINTS[:2], alone, workers)
 
 
 # ---- what is lost ------------------------------------------------------------------------------------------------
@@ -466,17 +425,12 @@ def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
 
 def ended(way):
     """Each of the first two items ends its process in this way, all times that it is computed."""
-
-    def end(number):
-        if number < 2:
-            {
-                "exit": lambda: sys.exit(number),
-                "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
-                "asked to end": lambda: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(5.0)),
-            }[way]()
-        return number
-
-    return end
+    ends = {
+        "exit": lambda: sys.exit(1),
+        "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+        "asked to end": lambda: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(5.0)),
+    }
+    return lambda number: ends[way]() if number < 2 else number
 
 
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")

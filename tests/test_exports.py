@@ -22,6 +22,7 @@ from cortado.runs.run_folder import RunFolder
 from cortado.runs.solid_motion import SolidMotion, SolidMotions
 from cortado.scene.scene import scene_from_dict
 from full_disk import largest_file
+from scenes import box, pool
 
 SPACING = 0.05
 PHASES = [
@@ -35,23 +36,11 @@ STONE = {"name": "stone", "shape": "sphere", "centre": [0.8, 0.1, 0.1], "radius"
 @cache
 def scene():
     """Two fluids beside a box that turns and a ball at rest."""
-    boxes = [
-        {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.2, 0.2, 0.2], "phase": "water"},
-        {"shape": "box", "lower": [0.2, 0.0, 0.0], "upper": [0.4, 0.2, 0.2], "phase": "oil"},
-    ]
-    rotor = {**ROTOR, "velocity": [0.1, 0.0, 0.0], "angular_velocity": [0.0, 1.0, 0.0]}
-    return scene_from_dict(
-        {
-            "name": "two",
-            "dimension": 3,
-            "discretisation": {"spacing": SPACING},
-            "phase": PHASES,
-            "fluid": boxes,
-            "solid": [rotor, STONE],
-            "container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [1.0, 0.6, 0.2]},
-            "forces": {"gravity": [0.0, -9.81, 0.0]},
-            "solver": {"kind": "projection", "time_step": 0.001},
-        }
+    return pool(
+        **{"upper": [0.4, 0.2, 0.2], "room": [1.0, 0.6, 0.2], "spacing": SPACING, "name": "two", "phase": PHASES},
+        fluid=[box([x, 0.0, 0.0], [x + 0.2, 0.2, 0.2], phase=name) for x, name in ((0.0, "water"), (0.2, "oil"))],
+        solid=[{**ROTOR, "velocity": [0.1, 0.0, 0.0], "angular_velocity": [0.0, 1.0, 0.0]}, STONE],
+        forces={"gravity": [0.0, -9.81, 0.0]},
     )
 
 
@@ -209,17 +198,7 @@ def test_usd_has_the_rate_that_was_asked_for(tmp_path, rate, step, every):
     there = np.stack([np.interp(times, knots, way), *np.outer([0.15, 0.1], np.ones(len(times)))], axis=1)
     still, turns = np.tile([0.55, 0.15, 0.1], (len(times), 1)), np.outer(times, [0.0, 0.0, 25.0])
     motions = {"my rotor": SolidMotion(there, 0.0 * turns), "fan": SolidMotion(still, turns)}
-    run = replace(
-        trajectory(),
-        times=times,
-        steps=np.rint(times / step).astype(int),
-        positions=np.array([first + [0.0, 0.1 * t, 0.0] for t in times]),
-        velocities=np.broadcast_to([0.0, 0.1, 0.0], (len(times), *first.shape)),
-        mass_fractions=np.tile(trajectory().mass_fractions[:1], (len(times), 1, 1)),
-        quantities={},
-        solids=SolidMotions(motions),
-        marks=marks,
-    )
+    run = risen(times, np.rint(times / step).astype(int), motions, marks=marks)
     stage = usd.Stage.Open(str(run[::every].export(tmp_path / "usd", to="usd", scene=of)))
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate / every, rel=1e-15)
     points = geometry.Points.Get(stage, "/run/particles").GetPointsAttr()
@@ -262,23 +241,35 @@ def test_files_and_parts_of_a_run_know_its_rate(tmp_path):
     assert {float(time) for time in re.findall(r'timestep="([^"]+)"', path.read_text())} == {0.0, 0.5, 1.0}
 
 
-@pytest.mark.parametrize("start", [0.0, 0.123])
-def test_frames_are_due_at_marks(start):
-    marks = Marks(start, 25.0)
-    times = start + np.array([0.0, 0.0401, 0.08 - 1e-12, 0.1237, 0.13])
-    assert marks.passed(times).tolist() == [0, 1, 2, 3, 3]
-    np.testing.assert_allclose(marks.due(times) - start, [0.0, 0.04, 0.08, 0.12, 0.13], atol=1e-12)
-    sparse = start + 0.1 * np.arange(5)
-    np.testing.assert_array_equal(marks.due(sparse), sparse)
-
-
-def test_steps_that_grow_are_shown_at_even_times():
+def test_frames_are_due_at_marks_and_steps_that_grow_are_shown_at_even_times():
+    for start in (0.0, 0.123):
+        marks = Marks(start, 25.0)
+        times = start + np.array([0.0, 0.0401, 0.08 - 1e-12, 0.1237, 0.13])
+        assert marks.passed(times).tolist() == [0, 1, 2, 3, 3]
+        np.testing.assert_allclose(marks.due(times) - start, [0.0, 0.04, 0.08, 0.12, 0.13], atol=1e-12)
+        sparse = start + 0.1 * np.arange(5)
+        np.testing.assert_array_equal(marks.due(sparse), sparse)
     times = np.cumsum(np.linspace(0.002, 0.02, 200))
     found = WholeFrames.of(times)
     np.testing.assert_allclose(np.diff(found.times), 1.0 / found.rate)
     np.testing.assert_allclose(times[found.recorded] + found.shifts, found.times)
-    assert (
-        np.abs(found.shifts).max() <= 0.5 * np.diff(times).max() + 1e-12 and "along their velocities" in found.in_words
+    assert np.abs(found.shifts).max() <= 0.5 * np.diff(times).max() + 1e-12
+    assert "along their velocities" in found.in_words
+
+
+def risen(times, steps, motions, **more):
+    """The trajectory at other times: fluid rises by 0.1 m a second."""
+    first, count = lattice(), len(times)
+    return replace(
+        trajectory(),
+        times=times,
+        steps=steps,
+        positions=np.array([first + [0.0, 0.1 * t, 0.0] for t in times]),
+        velocities=np.broadcast_to([0.0, 0.1, 0.0], (count, *first.shape)),
+        mass_fractions=np.tile(trajectory().mass_fractions[:1], (count, 1, 1)),
+        quantities={},
+        solids=SolidMotions(motions),
+        **more,
     )
 
 
@@ -286,19 +277,8 @@ def test_usd_moves_late_states_to_whole_time_codes(tmp_path, capsys):
     """All that moves here does so evenly, so that it is where it should be at each code."""
     usd, geometry = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
     times, first = np.array([0.0, 0.042, 0.081, 0.12, 0.13]), lattice()
-    motion = SolidMotion(
-        np.array([[0.55 + t, 0.15, 0.1] for t in times]), np.array([[0.0, 10.0 * t, 0.0] for t in times])
-    )
-    late = replace(
-        trajectory(),
-        times=times,
-        steps=np.array([0, 14, 27, 40, 44]),
-        positions=np.array([first + [0.0, 0.1 * t, 0.0] for t in times]),
-        velocities=np.broadcast_to([0.0, 0.1, 0.0], (5, *first.shape)),
-        mass_fractions=np.tile(trajectory().mass_fractions[:1], (5, 1, 1)),
-        quantities={},
-        solids=SolidMotions({"my rotor": motion}),
-    )
+    motion = SolidMotion(np.outer(times, [1, 0, 0]) + [0.55, 0.15, 0.1], np.outer(times, [0.0, 10.0, 0.0]))
+    late = risen(times, np.array([0, 14, 27, 40, 44]), {"my rotor": motion})
     stage = usd.Stage.Open(str(late.export(tmp_path / "usd", to="usd")))
     assert (stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (3.0, 25.0)
     points = geometry.Points.Get(stage, "/run/particles").GetPointsAttr()
@@ -413,20 +393,10 @@ def test_gltf_has_everything_by_name_and_y_up(tmp_path):
 
 def flat():
     """Two particles beside a block, in the plane."""
-    found = scene_from_dict(
-        {
-            "name": "flat",
-            "dimension": 2,
-            "discretisation": {"spacing": 0.1},
-            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.1}],
-            "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.2, 0.2], "phase": "water"}],
-            "solid": [{"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.7, 0.2]}],
-            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
-            "solver": {"kind": "pcisph", "time_step": 0.001},
-        }
-    )
-    still = np.tile([[0.05, 0.05], [0.15, 0.05]], (3, 1, 1))
-    steps = np.arange(3)
+    block = box([0.5, 0.0], [0.7, 0.2], name="block")
+    solver = {"kind": "pcisph", "time_step": 0.001}
+    found = pool([0.2, 0.2], [1.0, 1.0], 0.1, 0.1, name="flat", solid=[block], solver=solver)
+    still, steps = np.tile([[0.05, 0.05], [0.15, 0.05]], (3, 1, 1)), np.arange(3)
     return Trajectory(0.1 * steps, steps, still, 0.0 * still, {"converged": np.ones(2, bool)}, scene=found)
 
 
@@ -481,22 +451,21 @@ def test_a_dataset_has_names_and_units(tmp_path):
 
 
 def test_wrong_calls_are_sentences(tmp_path):
-    with pytest.raises(InputError, match=r"to is 'stl', but must be one of ply, obj, glb, usd, vtp\."):
-        trajectory().export(tmp_path, to="stl")
+    new, run = tmp_path / "new", trajectory()
     (tmp_path / "mine.txt").write_text("kept")
-    with pytest.raises(InputError, match=r"is not empty; choose another folder"):
-        trajectory().export(tmp_path, to="ply")
-    with pytest.raises(InputError, match="scene is missing, but must be given, as a trajectory from a file"):
-        replace(trajectory(), scene=None).export(tmp_path / "new", to="ply")
-    with pytest.raises(
-        InputError, match=r"scene has 2 dimensions and 1 phases, but must be that of the trajectory, with 3 and 2"
-    ):
-        trajectory().export(tmp_path / "new", "ply", cortado.load_scene("docs/figures/dam_break_plane.toml"))
-    with pytest.raises(InputError, match="has no frame"):
-        trajectory()[:0].export(tmp_path / "new", to="ply")
-    with pytest.raises(InputError, match=r"folder is 3, but must be the path"):
-        trajectory().export(3, to="ply")
-    assert not (tmp_path / "new").exists()
+    plane = cortado.load_scene("docs/figures/dam_break_plane.toml")
+    other = "scene has 2 dimensions and 1 phases, but must be that of the trajectory, with 3 and 2"
+    for made, arguments, words in [
+        (run, (tmp_path, "stl"), r"to is 'stl', but must be one of ply, obj, glb, usd, vtp\."),
+        (run, (tmp_path, "ply"), "is not empty; choose another folder"),
+        (replace(run, scene=None), (new, "ply"), "scene is missing, but must be given, as a trajectory from a file"),
+        (run, (new, "ply", plane), other),
+        (run[:0], (new, "ply"), "has no frame"),
+        (run, (3, "ply"), "folder is 3, but must be the path"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            made.export(*arguments)
+    assert not new.exists()
 
 
 @pytest.mark.parametrize(("module", "to"), [("vtkmodules", "vtp"), ("pxr", "usd"), ("xarray", None)])
@@ -510,10 +479,8 @@ def test_a_missing_library_is_named(module, to, tmp_path, monkeypatch):
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_full_disk_is_a_sentence(to, tmp_path, monkeypatch):
     pytest.importorskip({"usd": "pxr", "vtp": "vtkmodules"}.get(to, "trimesh"))
-    with (
-        largest_file(200),
-        pytest.raises(ComputationError, match=r"cannot be written: .*free some space, or choose another"),
-    ):
+    full = pytest.raises(ComputationError, match=r"cannot be written: .*free some space, or choose another")
+    with largest_file(200), full:
         trajectory()[:1].export(tmp_path / "out", to)
     assert not list((tmp_path / "out").iterdir())
 

@@ -13,7 +13,7 @@ import jsonschema
 import pytest
 
 import cortado
-from bad_scenes import assert_one_sentence
+from bad_scenes import assert_refused
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
 from cortado.cli.commands.new import scene_text, templates
@@ -37,13 +37,6 @@ def folder(tmp_path, monkeypatch):
 def without_pictures(monkeypatch):
     """Runs draw none, which takes seconds: tests/test_shading.py is about them."""
     monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
-
-
-def assert_refused(result, *words):
-    code, out, err = result
-    assert (code, out) == (2, ""), err
-    assert_one_sentence(err.removesuffix("\n"))
-    assert all(word in err for word in words), err
 
 
 # ---- what there is -----------------------------------------------------------------------------------------------

@@ -23,11 +23,7 @@ from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
-from cortado.scene.parameter_values import (
-    reference_density,
-    reference_density_adjoint,
-    reference_density_tangent,
-)
+from cortado.scene.parameter_values import reference_density, reference_density_adjoint, reference_density_tangent
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.steps import begin_adjoint_kernel, density_ratio_kernels, wall_kernels
 from cortado.sph.density import density_kernels

@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,14 @@ def quietly_read(path: str) -> Mesh:
         return read(path, support=SPACING)
 
 
+@contextmanager
+def told_of(words: str):
+    """A warning of one sentence."""
+    with pytest.warns(CortadoWarning, match=words) as told:
+        yield
+    assert_one_sentence(str(told[0].message))
+
+
 def cloud(count: int = 4000, reach: float = 0.6) -> np.ndarray:
     return np.random.default_rng(5).uniform(-reach, reach, size=(count, 3))
 
@@ -120,9 +129,8 @@ def test_points_beside_corners_edges_and_columns_of_vertices_have_the_right_sign
     mesh = solid(joined(box([-0.2] * 3, [0.2] * 3), trimesh.creation.icosphere(3, 0.1).apply_translation([0.5, 0, 0])))
     axis = np.linspace(-0.4, 0.7, 45)
     points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    exact = np.minimum(
-        Box(np.full(3, 0.2)).distance(points), np.linalg.norm(points - np.array([0.5, 0, 0]), axis=1) - 0.1
-    )
+    ball = np.linalg.norm(points - np.array([0.5, 0, 0]), axis=1) - 0.1
+    exact = np.minimum(Box(np.full(3, 0.2)).distance(points), ball)
     clear = np.abs(exact) > 1e-3
     np.testing.assert_array_equal(mesh.holds(points)[clear], exact[clear] < 0.0)
 
@@ -165,16 +173,8 @@ def cup_with_a_handle() -> trimesh.Trimesh:
 
 def test_a_cup_with_a_handle_is_one_solid(tmp_path):
     cup = read(written(tmp_path, cup_with_a_handle()), support=SPACING)
-    points = np.array(
-        [
-            [0.0, 0.0, 0.2],  # in the cup
-            [0.17, 0.0, 0.1],  # in its wall, where the handle is too
-            [0.0, -0.17, 0.2],
-            [0.3, 0.0, 0.155],  # in the hole of the handle
-            [0.37, 0.0, 0.155],  # in the handle
-            [0.0, 0.0, 0.03],
-        ]
-    )
+    points = np.array([[0, 0, 0.2], [0.17, 0, 0.1], [0, -0.17, 0.2], [0.3, 0, 0.155], [0.37, 0, 0.155], [0, 0, 0.03]])
+    # in the cup; in its wall, where the handle is too, and elsewhere; in the hole of the handle; in it; in the bottom
     np.testing.assert_array_equal(cup.holds(points), [False, True, True, False, True, True])
     np.testing.assert_allclose(cup.distance(points[[0, 3, 4]]), [0.14, 0.04, -0.03], atol=2e-3)
     feet, _ = cup.own_feet(0.01)
@@ -221,9 +221,8 @@ def test_a_cavity_is_outside_and_what_is_in_it_inside(tmp_path):
 
 def test_a_body_within_another_is_told(tmp_path):
     path = written(tmp_path, joined(trimesh.creation.icosphere(3, 0.5), trimesh.creation.icosphere(3, 0.3)))
-    with pytest.warns(CortadoWarning, match="lies inside another one") as told:
+    with told_of("lies inside another one"):
         mesh = read(path)
-    assert_one_sentence(str(told[0].message))
     np.testing.assert_allclose(mesh.distance(np.zeros((1, 3))), -0.5, atol=5e-3)
 
 
@@ -284,11 +283,8 @@ def test_the_middle_of_a_plank_does_not_feel_a_box_inside_of_it(tmp_path):
 
 
 def test_balls_that_overlap_are_a_lens_lighter(tmp_path):
-    first, second = (
-        trimesh.creation.icosphere(4, 0.4),
-        trimesh.creation.icosphere(4, 0.4).apply_translation([0.3, 0, 0]),
-    )
-    mesh = mesh_in_file(written(tmp_path, joined(first, second))).mesh
+    first, second = (trimesh.creation.icosphere(4, 0.4) for _ in range(2))
+    mesh = mesh_in_file(written(tmp_path, joined(first, second.apply_translation([0.3, 0, 0])))).mesh
     height = 0.4 - 0.15
     lens = 2.0 * np.pi * height**2 * (1.2 - height) / 3.0
     assert mesh.moments().volume == pytest.approx(8.0 / 3.0 * np.pi * 0.4**3 - lens, rel=4e-3)
@@ -330,9 +326,16 @@ def test_a_file_of_float32_far_from_the_origin_is_a_sentence(tmp_path, name):
     ball = trimesh.creation.icosphere(3, 0.4)
     with one_sentence("far from the origin: move it before it is exported"):
         read(written(tmp_path, ball.copy().apply_translation(FAR["on a map"]), name))
-    with pytest.warns(CortadoWarning, match="far from the origin.*rounds its coordinates to 0.0078") as told:
+    with told_of("far from the origin.*rounds its coordinates to 0.0078"):
         read(written(tmp_path, ball.copy().apply_translation(FAR["1e5 m"]), name), support=SPACING)
-    assert_one_sentence(str(told[0].message))
+
+
+def quads(places: np.ndarray, flipped: bool = False) -> trimesh.Trimesh:
+    """A surface through (rows, columns, 3) points, closed along both."""
+    numbers, steps = np.arange(places.size // 3).reshape(places.shape[:2]), [(0, 0), (0, 1), (1, 1), (1, 0)]
+    corners = [np.roll(numbers, (-i, -j), axis=(0, 1)) for i, j in (steps[::-1] if flipped else steps)]
+    faces = np.stack(corners, axis=-1).reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    return trimesh.Trimesh(places.reshape(-1, 3), faces, process=False)
 
 
 def crossed_tube() -> trimesh.Trimesh:
@@ -341,21 +344,16 @@ def crossed_tube() -> trimesh.Trimesh:
     path = 0.4 * np.stack([np.sin(t), 0.5 * np.sin(2 * t), 0 * t], axis=1)
     along = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
     along /= np.linalg.norm(along, axis=1)[:, None]
-    aside = np.stack([-along[:, 1], along[:, 0], 0 * t], axis=1)
-    up = np.broadcast_to([0.0, 0.0, 1.0], aside.shape)
+    aside, up = np.stack([-along[:, 1], along[:, 0], 0 * t], axis=1), np.array([0.0, 0.0, 1.0])
     circle = np.cos(angle)[:, None, None] * aside + np.sin(angle)[:, None, None] * up
-    numbers = np.arange(circle.size // 3).reshape(24, 160)
-    corners = [np.roll(numbers, (-i, -j), axis=(0, 1)) for i, j in ((0, 0), (0, 1), (1, 1), (1, 0))]
-    quads = np.stack(corners, axis=-1).reshape(-1, 4)
-    mesh = trimesh.Trimesh((path + 0.07 * circle).reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    mesh = quads(path + 0.07 * circle)
     return mesh if mesh.volume > 0 else turned_over(mesh)
 
 
 def test_a_mesh_that_crosses_itself_is_told_and_holds_what_it_goes_around_twice(tmp_path):
     path = written(tmp_path, crossed_tube())
-    with pytest.warns(CortadoWarning, match="crosses itself, for example at") as told:
+    with told_of("crosses itself, for example at"):
         mesh = read(path)
-    assert_one_sentence(str(told[0].message))
     assert mesh.holds(np.zeros((1, 3))).all()
     feet, _ = mesh.own_feet(0.01)
     assert np.linalg.norm(feet, axis=1).min() > 0.06  # none in the middle, where the branches go through one another
@@ -479,10 +477,7 @@ def figure_of_eight() -> trimesh.Trimesh:
     radius, height = 0.4 + 0.1 * np.sin(t), 0.1 * np.sin(2 * t)
     ring = np.stack([np.cos(around), np.sin(around)], axis=1)
     places = np.concatenate([radius[None, :, None] * ring[:, None], np.tile(height[:, None], (80, 1, 1))], axis=2)
-    numbers = np.arange(4800).reshape(80, 60)
-    corners = [np.roll(numbers, (-i, -j), axis=(0, 1)) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    quads = np.stack(corners, axis=-1).reshape(-1, 4)
-    return trimesh.Trimesh(places.reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), process=False)
+    return quads(places, flipped=True)
 
 
 def not_a_number() -> trimesh.Trimesh:
@@ -547,19 +542,12 @@ def test_without_a_container_a_mesh_is_held_against_the_spacing(tmp_path):
     read(path, scale=0.001, container=None)
 
 
-def test_what_is_thinner_than_the_support_is_told(tmp_path):
-    with pytest.warns(CortadoWarning, match=r"thinner than the support, 0.1 m, at 81% .* 0.06 m at") as told:
+def test_what_is_thinner_than_the_support_and_sharp_edges_are_told_and_kept(tmp_path):
+    with told_of(r"thinner than the support, 0.1 m, at 81% .* 0.06 m at"):
         read(written(tmp_path, box([0, 0, 0], [0.5, 0.5, 0.06])))
-    assert_one_sentence(str(told[0].message))
-
-
-def test_sharp_edges_are_told_and_kept(tmp_path):
-    wedge = trimesh.convex.convex_hull(
-        [[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0.3], [0, 0.5, 0], [0.5, 0.5, 0], [0.5, 0.5, 0.3]]
-    )
-    with pytest.warns(CortadoWarning, match="edges so sharp that it is thinner than half a spacing") as told:
-        read(written(tmp_path, wedge))
-    assert_one_sentence(str(told[0].message))
+    wedge = [[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0.3], [0, 0.5, 0], [0.5, 0.5, 0], [0.5, 0.5, 0.3]]
+    with told_of("edges so sharp that it is thinner than half a spacing"):
+        read(written(tmp_path, trimesh.convex.convex_hull(wedge)))
 
 
 def test_thickness_is_that_of_the_thinnest_sheet():
